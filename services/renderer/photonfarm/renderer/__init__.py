@@ -1,0 +1,1 @@
+"""The render service: workers that turn plan slots into committed samples."""

@@ -1,0 +1,1 @@
+"""The trainer service: neural light transport learned from a store that grows."""

@@ -1,0 +1,70 @@
+"""The arrays that make up a scene and its samples, as they pass between renderer, store and trainer.
+
+Shape letters: H W image, P points of the base cloud, K photon slots, V vertices, F faces, S shapes, G movable groups.
+Lengths are in scene units and world coordinates; radiance is linear RGB, scene-referred, never clipped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32: TypeAlias = NDArray[np.float32]
+
+STATIC = -1
+"""The group index of what never moves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Geometry:
+    """The triangles of a scene at rest: stored once per scene."""
+
+    vertices: F32  # (V, 3)
+    faces: NDArray[np.uint32]  # (F, 3) vertex indices
+    face_shape: NDArray[np.int32]  # (F,) shape index
+    shape_group: NDArray[np.int16]  # (S,) movable group of each shape, or STATIC
+
+    def areas(self) -> NDArray[np.float64]:
+        """Area of each triangle, (F,)."""
+        a, b, c = (self.vertices[self.faces[:, i]].astype(np.float64) for i in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BasePointCloud:
+    """The point cloud sampled once per scene; every sample's cloud is this one, modified [supplement 2.1]."""
+
+    position: F32  # (P, 3)
+    normal: F32  # (P, 3) unit, geometric
+    albedo: F32  # (P, 3) diffuse reflectance
+    emission: F32  # (P, 3) radiance leaving along the normal
+    group: NDArray[np.int16]  # (P,) movable group, or STATIC
+    face: NDArray[np.uint32]  # (P,) triangle of `Geometry` that the point lies in
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewBuffers:
+    """What one ray through each pixel centre meets; free of noise. Zero everywhere where it meets nothing."""
+
+    depth: F32  # (H, W) along the camera's forward axis; hit point = origin + ray · depth / (ray · forward)
+    albedo: F32  # (H, W, 3) diffuse reflectance
+    normal: F32  # (H, W, 3) unit, shading normal in world coordinates, as modelled (not turned to the camera)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photons:
+    """Surface hits of light sub-paths in one configuration; empty slots have bounce −1 and zeros."""
+
+    position: F32  # (K, 3)
+    direction: F32  # (K, 3) unit, the way the light travels
+    normal: F32  # (K, 3) unit, geometric
+    power: F32  # (K, 3) RGB flux; the sum does not depend on the number emitted
+    bounce: NDArray[np.int8]  # (K,) 0 for the first hit, −1 for an empty slot
+
+
+def arrays_of(record: Geometry | BasePointCloud | ViewBuffers | Photons) -> dict[str, NDArray[np.generic]]:
+    """The record's arrays by name, in the order of its fields."""
+    return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -1,0 +1,299 @@
+"""The scene spec: what to render and what may change, as frozen models read from a `scene.toml`.
+
+Lengths are in scene units, angles in degrees. The spec's content digest, with the bytes of every file the scene is made
+of, is the scene id: equal content gives equal ids on every machine, wherever the files lie.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from photonfarm.shared import scene_files
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.keys import make_key
+
+Vector = tuple[float, float, float]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+BUILTIN_ROOMS = ("cornell", "room")
+SCENES_VARIABLE = "PHOTONFARM_SCENES"
+
+
+class Frozen(BaseModel):
+    """A model that cannot change and knows no keys but its own."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Box(Frozen):
+    """An axis-aligned box; it may be flat in any axis."""
+
+    min: Vector
+    max: Vector
+
+    @model_validator(mode="after")
+    def _is_not_inverted(self) -> Self:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low > high:
+                raise ValueError(f"is inverted along {axis}: min {low} is above max {high}; min ≤ max is required")
+        return self
+
+    @property
+    def low(self) -> NDArray[np.float64]:
+        """The lower corner, (3,)."""
+        return np.array(self.min)
+
+    @property
+    def high(self) -> NDArray[np.float64]:
+        """The upper corner, (3,)."""
+        return np.array(self.max)
+
+
+class Movable(Frozen):
+    """Shapes that move and vanish as one: `at` is a fixed point of them, placed uniformly in `box`."""
+
+    name: Name
+    shapes: tuple[str, ...] = Field(min_length=1)
+    at: Vector  # where the reference point stands in the scene as modelled
+    box: Box  # where the reference point may stand
+    removal_probability: Probability = 0.2
+
+
+class Rectangle(Frozen):
+    """A rectangular ceiling light that the spec adds to the scene, facing down the world's up axis."""
+
+    size: tuple[Positive, Positive]  # along the two horizontal axes, in their order
+    radiance: tuple[float, float, float]
+
+    @model_validator(mode="after")
+    def _emits(self) -> Self:
+        if min(self.radiance) < 0 or max(self.radiance) == 0:
+            raise ValueError(f"has radiance {self.radiance}; all ≥ 0 and one > 0 are required")
+        return self
+
+
+class Light(Movable):
+    """A movable light: emitting shapes of the scene, or a rectangle that the spec adds."""
+
+    shapes: tuple[str, ...] = ()
+    rectangle: Rectangle | None = None
+    removal_probability: Probability = 0.0
+
+    @model_validator(mode="after")
+    def _is_one_or_the_other(self) -> Self:
+        if bool(self.shapes) == (self.rectangle is not None):
+            raise ValueError("needs either shapes (of the scene) or a rectangle (to add), and not both")
+        return self
+
+    @property
+    def shape_ids(self) -> tuple[str, ...]:
+        """The ids of its shapes in the loaded scene."""
+        return self.shapes or (self.name,)
+
+
+class Source(Frozen):
+    """Where the scene comes from: a Mitsuba scene file, or a built-in room."""
+
+    file: str | None = None  # beside the spec, or under a folder of PHOTONFARM_SCENES
+    builtin: Literal["cornell", "room"] | None = None
+    parameters: dict[str, str] = {}  # values for the scene file's own <default> names
+
+    @model_validator(mode="after")
+    def _is_one_or_the_other(self) -> Self:
+        if (self.file is None) == (self.builtin is None):
+            raise ValueError(f"needs either file (a Mitsuba scene) or builtin (one of {', '.join(BUILTIN_ROOMS)})")
+        return self
+
+
+class ViewSpec(Frozen):
+    """The boxes that views are drawn from, and the camera's constants."""
+
+    origin: Box
+    look_at: Box
+    fov_deg: Annotated[float, Field(ge=1, le=170)] = 60.0  # along the image's width
+    up: Vector = (0.0, 1.0, 0.0)
+    near: Positive = 0.01  # also the near plane of window depth
+    far: Positive = 1000.0
+
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> Self:
+        if self.near >= self.far:
+            raise ValueError(f"has near {self.near} ≥ far {self.far}; near < far is required")
+        if sorted(map(abs, self.up)) != [0, 0, 1]:
+            raise ValueError(f"has up {self.up}; a unit vector along one axis is required")
+        if self.origin == self.look_at and self.origin.min == self.origin.max:
+            raise ValueError("has origin and look_at in one and the same point; no direction can be drawn")
+        return self
+
+
+class Film(Frozen):
+    """The image's size in pixels; divisible by 8, as the image synthesis layer halves it three times."""
+
+    width: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 128
+    height: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 128
+
+
+class Transport(Frozen):
+    """Light transport: the settings of the `bdpt` integrator."""
+
+    max_depth: Annotated[int, Field(ge=-1, le=64)] = 8  # edges of a path; 1: only emitters seen directly; -1: no limit
+    rr_depth: Annotated[int, Field(ge=1)] = 5  # path length from which Russian roulette may end it
+    connections: Annotated[int, Field(ge=0, le=64)] = 1  # light vertices joined to each eye vertex
+    light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
+    half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
+
+
+class PhotonSpec(Frozen):
+    """Light sub-paths stored per modification: `paths` × `depth` slots; 0 paths: none."""
+
+    paths: Annotated[int, Field(ge=0, le=1 << 20)] = 1024
+    depth: Annotated[int, Field(ge=1, le=16)] = 4
+
+
+class SceneSpec(Frozen):
+    """A scene and everything that shapes its samples. No movable group: a static scene."""
+
+    name: Name
+    scene: Source
+    objects: tuple[Movable, ...] = ()
+    lights: tuple[Light, ...] = ()
+    view: ViewSpec
+    film: Film = Film()
+    transport: Transport = Transport()
+    photons: PhotonSpec = PhotonSpec()
+    points: Annotated[int, Field(ge=1, le=1 << 22)] = 16384  # size of the base point cloud
+    exposure: Positive = 1.0  # fixed factor on linear radiance, for losses and pictures
+    content: str = ""  # digest of the scene's files; set when loaded
+
+    @model_validator(mode="after")
+    def _groups_are_distinct(self) -> Self:
+        names = [group.name for group in self.groups]
+        shapes = [shape for group in self.groups for shape in shape_ids(group)]
+        for what, found in (("group name", names), ("shape id", shapes)):
+            twice = sorted({x for x in found if found.count(x) > 1})
+            if twice:
+                raise ValueError(f"uses {what} {twice[0]!r} twice; each may belong to one movable group")
+        return self
+
+    @property
+    def groups(self) -> tuple[Movable, ...]:
+        """Every movable group, objects before lights: the order of the modification vector."""
+        return self.objects + self.lights
+
+    @cached_property
+    def scene_id(self) -> str:
+        """32 hexadecimal digits: the digest of all that a sample depends on."""
+        described = self.model_dump(mode="json", exclude={"scene": {"file"}, "name": True})
+        return make_key("scene", _canonical(described)).hex()
+
+    @property
+    def radiance_exponent(self) -> int:
+        """The power of two that stored radiance is multiplied by, so that exposed values lie near 1."""
+        return int(np.round(np.log2(self.exposure)))
+
+
+def shape_ids(group: Movable) -> tuple[str, ...]:
+    """The ids of a group's shapes in the loaded scene."""
+    return group.shape_ids if isinstance(group, Light) else group.shapes
+
+
+def _canonical(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_canonical(value[k])}" for k in sorted(value)) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(map(_canonical, value)) + "]"
+    return repr(value)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def load_spec(path: str | Path) -> SceneSpec:
+    """The checked spec in a file; a bare name such as `room` is looked up among the built-in and ready specs.
+
+    Raises SpecError with one sentence that names the key, the value and the rule.
+    """
+    file = _find_spec(str(path))
+    try:
+        described = tomllib.loads(file.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{file}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SpecError(f"{file}: is not valid TOML: {error}") from error
+    return parse_spec(described, where=str(file), beside=file.parent)
+
+
+def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = None) -> SceneSpec:
+    """The checked spec in a parsed TOML or JSON document, its scene file found and digested."""
+    spec = _validate({**described, "content": ""}, where)
+    if spec.scene.file is None:
+        content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
+        known = None
+    else:
+        scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
+        content, known = scene.digest, scene.shape_ids
+    if known is not None:
+        _check_shapes(spec, known, where)
+    return spec.model_copy(update={"content": content})
+
+
+def _validate(described: dict[str, Any], where: str) -> SceneSpec:
+    try:
+        return SceneSpec.model_validate(described)
+    except ValidationError as error:
+        raise SpecError(f"{where}: {'; '.join(_sentences(error))}") from error
+
+
+def _sentences(error: ValidationError) -> Iterator[str]:
+    for fault in error.errors():
+        key = ".".join(map(str, fault["loc"])) or "the spec"
+        rule = fault["msg"].removeprefix("Value error, ")
+        if fault["type"] in ("value_error", "missing"):
+            yield f"{key}: {rule}"
+        else:
+            yield f"{key} = {fault['input']!r}: {rule}"
+
+
+def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
+    for group in spec.groups:
+        for shape in group.shapes:
+            if shape not in known:
+                near = scene_files.nearest(shape, known)
+                raise SpecError(f"{where}: group {group.name!r}: shape id {shape!r} is not in the scene; nearest: {near}")
+        if isinstance(group, Light) and group.rectangle and group.name in known:
+            raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
+
+
+def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
+    """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
+    folders = [beside] if beside else []
+    folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
+    for folder in folders:
+        if (folder / file).is_file():
+            return folder / file
+    looked = ", ".join(map(str, folders)) or "nowhere"
+    raise SpecError(
+        f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
+        f"set {SCENES_VARIABLE} to the folder that holds it"
+    )
+
+
+def _find_spec(name: str) -> Path:
+    path = Path(name)
+    if path.suffix == ".toml" or path.exists():
+        return path
+    for folder in (Path("scenes"), Path(__file__).parent / "specs"):
+        if (folder / f"{name}.toml").is_file():
+            return folder / f"{name}.toml"
+    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(BUILTIN_ROOMS)}")

@@ -1,0 +1,87 @@
+"""What can be known of a Mitsuba scene file without Mitsuba: its shape ids, its files, and what we cannot render."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.shared.errors import SpecError
+
+BUILTIN_REVISION = 1
+"""Raised whenever a built-in room changes, as its content is code and not a file."""
+
+_UNSUPPORTED = {
+    "medium": "participating media are not supported; only surfaces are",
+    "phase": "participating media are not supported; only surfaces are",
+    "volume": "volumes are not supported; only surfaces are",
+}
+_UNSUPPORTED_BSDFS = {
+    "measured_polarized": "polarisation is not supported",
+    "polarizer": "polarisation is not supported",
+    "retarder": "polarisation is not supported",
+    "circular": "polarisation is not supported",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFile:
+    """The facts of one scene file."""
+
+    path: Path
+    shape_ids: frozenset[str]
+    digest: str  # of the file and of every file it names
+
+    @classmethod
+    def read(cls, path: Path) -> SceneFile:
+        """Read and check a scene; raises SpecError for a missing file or an unsupported feature."""
+        root = _parse(path)
+        _refuse_unsupported(root, path)
+        ids = {node.get("id", "") for node in root.iter("shape")} - {""}
+        return cls(path, frozenset(ids), _digest(path, _named_files(root, path)))
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Up to three known names like a wrong one, for a message."""
+    return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.3)) or "none"
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()  # noqa: S314 - the user's own scene, and expat bounds entities
+    except (OSError, ElementTree.ParseError) as error:
+        raise SpecError(f"{path}: is not a readable Mitsuba scene file: {error}") from error
+
+
+def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
+    for node in root.iter():
+        reason = _UNSUPPORTED.get(node.tag)
+        if node.tag == "bsdf":
+            reason = _UNSUPPORTED_BSDFS.get(node.get("type", ""))
+        if node.tag == "include":
+            reason = "included scene files are not supported; join them into one file"
+        if reason:
+            name = node.get("id") or node.get("name") or node.get("type")
+            raise SpecError(f"{path}: <{node.tag}> {name!r}: {reason}")
+
+
+def _named_files(root: ElementTree.Element, path: Path) -> list[Path]:
+    files = []
+    for node in root.iter("string"):
+        if node.get("name") == "filename":
+            file = path.parent / node.get("value", "")
+            if not file.is_file():
+                raise SpecError(f"{path}: filename = {node.get('value')!r} is not there")
+            files.append(file)
+    return sorted(set(files))
+
+
+def _digest(path: Path, files: list[Path]) -> str:
+    digest = hashlib.sha256(path.read_bytes())
+    for file in files:
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()

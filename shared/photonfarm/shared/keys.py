@@ -63,7 +63,7 @@ class Stream:
     def uniform(self, *shape: int) -> NDArray[np.float64]:
         """Numbers in [0, 1) of the given shape; a multiple of 2^-53 each."""
         raw = self._bits.random_raw(int(np.prod(shape)))
-        return (raw >> np.uint64(11)).reshape(shape) * 2.0**-53
+        return (raw >> np.uint64(11)).astype(np.float64).reshape(shape) * 2.0**-53
 
     def uniform_in(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
         """One point uniform in the axis-aligned box [low, high]; a flat axis gives its one value exactly."""

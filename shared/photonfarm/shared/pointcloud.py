@@ -13,9 +13,7 @@ from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, STATIC, BasePointCloud, Geometry
 
 
-def sample_surface(
-    geometry: Geometry, count: int, stream: Stream
-) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
+def sample_surface(geometry: Geometry, count: int, stream: Stream) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
     """`count` points uniform over all triangles: their triangle (P,) and barycentric coordinates (P, 3).
 
     First a shape by its area, then a triangle of it by its area, then a point in it [supplement 2.3, Eq. 1].
@@ -23,7 +21,8 @@ def sample_surface(
     """
     areas = geometry.areas()
     order = np.argsort(geometry.face_shape, kind="stable")  # triangles, shape by shape
-    shape_area = np.bincount(geometry.face_shape, weights=areas, minlength=len(geometry.shape_group))
+    shape_area = np.zeros(len(geometry.shape_group))
+    np.add.at(shape_area, geometry.face_shape, areas)
     shape = draw(shape_area, stream.uniform(count))
 
     first = np.concatenate([[0.0], np.cumsum(areas[order])])  # area before each triangle, in that order

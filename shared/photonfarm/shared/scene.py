@@ -252,10 +252,11 @@ def _validate(described: dict[str, Any], where: str) -> SceneSpec:
     try:
         return SceneSpec.model_validate(described)
     except ValidationError as error:
-        raise SpecError(f"{where}: {'; '.join(_sentences(error))}") from error
+        raise SpecError(f"{where}: {'; '.join(sentences(error))}") from error
 
 
-def _sentences(error: ValidationError) -> Iterator[str]:
+def sentences(error: ValidationError) -> Iterator[str]:
+    """One sentence for each fault that a model found: its key, the value and the rule."""
     for fault in error.errors():
         key = ".".join(map(str, fault["loc"])) or "the spec"
         rule = fault["msg"].removeprefix("Value error, ")
@@ -270,7 +271,9 @@ def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
         for shape in group.shapes:
             if shape not in known:
                 near = scene_files.nearest(shape, known)
-                raise SpecError(f"{where}: group {group.name!r}: shape id {shape!r} is not in the scene; nearest: {near}")
+                raise SpecError(
+                    f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene; nearest: {near}"
+                )
         if isinstance(group, Light) and group.rectangle and group.name in known:
             raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
 

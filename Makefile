@@ -1,0 +1,42 @@
+# make demo   the main job, on embedded defaults      make test   the tests
+# make check  style, types, layers                    make setup  the virtual environment alone
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.ready
+PROJECTS := shared services/renderer services/trainer
+
+.PHONY: setup demo test test-compose check lock clean
+.DELETE_ON_ERROR:
+
+setup: $(STAMP)
+
+$(STAMP): constraints.txt $(PROJECTS:%=%/pyproject.toml)
+	PYTHON="$(PYTHON)" ./scripts/setup.sh "$(VENV)"
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/photonfarm up room --samples 256 --workers 2 --train-steps 4000 --store demo/store --run demo/run --out demo
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+# The compose file, run for real; needs a Docker engine.
+test-compose: $(STAMP)
+	PHOTONFARM_TEST_COMPOSE=1 $(BIN)/python -m pytest -s tests/end_to_end/test_compose.py
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench-%: $(STAMP)
+	$(BIN)/python bench/$(subst -,_,$*).py
+
+# The exact versions in constraints.txt, made from a fresh environment.
+lock:
+	PYTHON="$(PYTHON)" ./scripts/lock.sh
+
+clean:
+	rm -rf $(VENV) demo

@@ -1,0 +1,97 @@
+"""What works on this machine, and what to do about what does not; each check is a real use, not a look at versions."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from photonfarm.shared.errors import PhotonfarmError, QueueError, StoreError
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check."""
+
+    name: str
+    works: bool
+    detail: str
+    exit_code: int = 0  # of the command, if this does not work and is needed
+
+
+def examine(store: Path, redis_url: str) -> Iterator[Finding]:
+    """Every check in turn; optional parts that are absent are reported and give exit code 0."""
+    yield _packages()
+    yield _tried("renderer", _renders)
+    yield _tried("store", lambda: _writes(store))
+    yield _tried("embedded Redis", _starts_redis)
+    yield _optional(_tried("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
+    yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
+
+
+def _packages() -> Finding:
+    names = ("photonfarm-shared", "mitsuba", "drjit", "zarr", "rq", "redis")
+    return Finding("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
+
+
+def _tried(name: str, check: Callable[[], str]) -> Finding:
+    try:
+        return Finding(name, True, check())
+    except PhotonfarmError as error:
+        return Finding(name, False, str(error), error.exit_code)
+
+
+def _optional(finding: Finding, note: str) -> Finding:
+    return finding if finding.works else Finding(finding.name, False, f"{finding.detail} ({note})")
+
+
+def _renders() -> str:
+    from photonfarm.renderer import backend
+
+    mi = backend.load(threads=1)
+    start = time.perf_counter()
+    image = mi.render(mi.load_dict(mi.cornell_box()), integrator=mi.load_dict({"type": "bdpt"}), spp=1)
+    mean = float(image.array.numpy().mean())
+    return f"{mi.variant()}, bdpt rendered a Cornell box in {time.perf_counter() - start:.1f} s, mean {mean:.3f}"
+
+
+def _writes(store: Path) -> str:
+    try:
+        folder = next(p for p in (store.absolute(), *store.absolute().parents) if p.exists())
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".doctor-"):
+            free_gb = os.statvfs(folder).f_bavail * os.statvfs(folder).f_frsize / 1e9
+    except OSError as error:
+        raise StoreError(f"{store}: cannot be written: {error.strerror}") from error
+    return f"{store} can be written, {free_gb:.0f} GB free"
+
+
+def _starts_redis() -> str:
+    from photonfarm.shared.queue import connect
+    from photonfarm.shared.redis_server import EmbeddedRedis
+
+    with tempfile.TemporaryDirectory() as folder, EmbeddedRedis(Path(folder)) as server:
+        return f"version {connect(server.url).info('server')['redis_version']}"
+
+
+def _reaches(url: str) -> str:
+    from photonfarm.shared.queue import connect
+
+    try:
+        return f"version {connect(url).info('server')['redis_version']}"
+    except QueueError:
+        raise
+    except OSError as error:
+        raise QueueError(str(error)) from error
+
+
+def _scenes() -> Finding:
+    from photonfarm.shared.scene import SCENES_VARIABLE
+
+    folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
+    found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
+    detail = ", ".join(found) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
+    return Finding("scenes", bool(found), detail)

@@ -1,0 +1,55 @@
+"""The verbs of the trainer service: train, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photonfarm.shared.cli import store_option
+
+run_option = click.option(
+    "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
+    show_default=True, help="Folder of the training run: checkpoints, metrics.",
+)  # fmt: skip
+
+
+@click.command()
+@click.argument("spec", required=False)
+@store_option
+@run_option
+@click.option(
+    "--preset",
+    type=click.Choice(["small", "paper"]),
+    default="small",
+    show_default=True,
+    help="Sizes of network and batch.",
+)
+@click.option("--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
+@click.option("--seconds", "max_seconds", type=click.FloatRange(0, min_open=True), help="Stop after so much time.")
+@click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
+@click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
+@click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")
+@click.option("--threads", type=click.IntRange(1), help="Processor threads of torch.  [default: 1]")
+@click.option("--device", help="cpu or cuda.  [default: cpu]")
+@click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
+def train(spec: str | None, store: Path, run: Path, preset: str, check: bool, **settings: Any) -> None:
+    """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene."""
+    from photonfarm.trainer import service
+
+    if check:
+        service.check(run)
+    else:
+        service.run(spec, store, run, preset, {k: v for k, v in settings.items() if v is not None})
+
+
+@click.command()
+@store_option
+@run_option
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
+def report(store: Path, run: Path, out: Path) -> None:
+    """Write report.html and report.json: what was learned, at which cost, with pictures."""
+    from photonfarm.trainer.report import write_report
+
+    click.echo(write_report(store, run, out))

@@ -1,0 +1,110 @@
+"""The trainer as a service: it waits for a store and a scene, trains as the samples come, and says that it lives."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from pydantic import ValidationError
+
+from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.scene import load_spec, sentences
+from photonfarm.shared.store import Store
+from photonfarm.trainer.settings import TrainSettings, small
+
+T = TypeVar("T")
+
+PRESETS: dict[str, Callable[..., TrainSettings]] = {"small": small, "paper": TrainSettings}
+
+POLL_S = 1.0
+ALIVE_FILE = "alive"
+ALIVE_S = 60.0  # a run whose sign of life is older is taken for dead
+
+
+def run(spec: str | None, store: Path, folder: Path, preset: str, changes: dict[str, Any]) -> None:
+    """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint."""
+    from photonfarm.trainer.loop import stop_on_signals, train
+    from photonfarm.trainer.store_source import StoreSource
+
+    settings = _settings(preset, changes)
+    scene_id = load_spec(spec).scene_id if spec else None
+    with stop_on_signals() as stop, _sign_of_life(folder):
+        scene_id = scene_id or _wait(lambda: _only_scene(store), stop)
+        source = StoreSource(store, scene_id) if scene_id else None
+        if source is None or not _wait(source.ready, stop):
+            return
+        outcome = train(source, settings, folder, stop=stop, listen=_tell)
+    click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
+
+
+def check(folder: Path) -> None:
+    """Raise IncompleteError unless a trainer has given a sign of life in this run's folder lately."""
+    try:
+        age_s = time.time() - (folder / ALIVE_FILE).stat().st_mtime
+    except OSError as error:
+        raise IncompleteError(f"{folder}: no trainer has run here") from error
+    if age_s > ALIVE_S:
+        raise IncompleteError(
+            f"{folder}: the trainer's last sign of life is {age_s:.0f} s old; {ALIVE_S:.0f} s are allowed"
+        )
+
+
+def _settings(name: str, changes: dict[str, Any]) -> TrainSettings:
+    try:
+        return PRESETS[name](**changes)
+    except ValidationError as error:
+        raise SpecError(f"the settings of the training: {'; '.join(sentences(error))}") from error
+
+
+def _only_scene(store: Path) -> str | None:
+    """The scene of a store that has one; None while there is no store or no scene; SpecError if there are several."""
+    try:
+        ids = Store(store).scene_ids()
+    except StoreError:
+        if store.exists() and any(store.iterdir()):
+            raise
+        return None
+    if len(ids) > 1:
+        raise SpecError(f"{store}: holds {len(ids)} scenes; name the spec of the one to train on")
+    return ids[0] if ids else None
+
+
+def _wait(look: Callable[[], T], stop: threading.Event) -> T | None:
+    while not (found := look()):
+        if stop.wait(POLL_S):
+            return None
+    return found
+
+
+@contextmanager
+def _sign_of_life(folder: Path) -> Iterator[None]:
+    """Touch a file now and then, from a thread of its own, for `check`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ended = threading.Event()
+
+    def touch() -> None:
+        while not ended.is_set():
+            (folder / ALIVE_FILE).touch()
+            ended.wait(ALIVE_S / 4)
+
+    thread = threading.Thread(target=touch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _tell(record: dict[str, Any]) -> None:
+    if record["kind"] == "validation":
+        click.echo(
+            f"step {record['step']}: held-out error {record['error']:.5f} ± {record['standard_error']:.5f}, "
+            f"{record['samples']} samples",
+            err=True,
+        )

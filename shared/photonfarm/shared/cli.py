@@ -1,0 +1,169 @@
+"""The command `photonfarm`, and those of its verbs that need neither Mitsuba nor torch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+
+from photonfarm.shared.errors import PhotonfarmError
+from photonfarm.shared.settings import file_defaults
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@cache
+def _verbs() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group="photonfarm.commands")}
+
+
+class Umbrella(click.Group):
+    """A group whose verbs are those of the services that are installed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """The installed verbs."""
+        return sorted(_verbs())
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """The verb, imported only now."""
+        entry = _verbs().get(cmd_name)
+        return None if entry is None else entry.load()
+
+
+@click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="photonfarm-shared", prog_name="photonfarm")
+@click.option("--config", type=click.Path(path_type=Path), envvar="PHOTONFARM_CONFIG", default="photonfarm.toml",
+              show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
+@click.pass_context
+def umbrella(ctx: click.Context, config: Path) -> None:
+    """Unbiased training data for neural light transport, and training on it while it grows.
+
+    Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
+    to stdout, talk goes to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec, 4 store, 5 Redis, 6 Mitsuba or LLVM,
+    7 incomplete, 1 anything else.
+    """
+    ctx.default_map = file_defaults(config)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the command line; an error of ours becomes one sentence and its exit code."""
+    try:
+        umbrella(args, prog_name="photonfarm")
+    except PhotonfarmError as error:
+        Console(stderr=True, soft_wrap=True).print(f"[bold red]photonfarm:[/] {error}", highlight=False)
+        sys.exit(error.exit_code)
+
+
+# --------------------------------------------------------------------------------------------------- options they share
+
+
+def store_option(command: Command) -> Command:
+    """`--store DIR`, the sample store."""
+    return click.option(
+        "--store", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_STORE", default="store",
+        show_default=True, help="Folder of the sample store.",
+    )(command)  # fmt: skip
+
+
+def redis_option(command: Command) -> Command:
+    """`--redis URL`, the queue's server."""
+    return click.option(
+        "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
+        help="The queue's Redis; a URL with a password belongs into the variable, not here.", show_envvar=True,
+    )(command)  # fmt: skip
+
+
+def json_option(command: Command) -> Command:
+    """`--json`: machine-readable results."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
+
+
+def request_options(command: Command) -> Command:
+    """The options that make a request."""
+    options = (
+        click.option("--modifications", type=click.IntRange(1), default=128, show_default=True,
+                     help="Random configurations (one is all there is of a static scene)."),
+        click.option("--views", type=click.IntRange(1), default=2, show_default=True, help="Views per configuration."),
+        click.option("--passes", type=click.IntRange(1), default=1, show_default=True, help="Noisy passes per view."),
+        click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
+        click.option("--shard-rows", type=click.IntRange(1, 4096), default=None,
+                     help="Samples per job, fixed for a scene by its first plan.  [default: 16]"),
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+# ---------------------------------------------------------------------------------------------------------------- verbs
+
+
+@click.group()
+def scene() -> None:
+    """Scene specs."""
+
+
+@scene.command("show")
+@click.argument("spec")
+@json_option
+def scene_show(spec: str, as_json: bool) -> None:
+    """Check SPEC (a scene.toml, or the name of a ready one) and show what it says."""
+    from photonfarm.shared import show
+    from photonfarm.shared.scene import load_spec
+
+    show.scene(load_spec(spec), as_json)
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
+@json_option
+def submit(
+    spec: str, store: Path, redis_url: str, no_queue: bool, dry_run: bool, as_json: bool, **request: Any
+) -> None:
+    """Plan samples of SPEC and queue them; what is planned already is not planned again."""
+    from photonfarm.shared import show, submission
+
+    if dry_run:
+        show.submission(submission.preview(spec, store, **request), as_json)
+    else:
+        show.submission(submission.submit(spec, store, None if no_queue else redis_url, **request), as_json)
+
+
+@click.command()
+@store_option
+@redis_option
+@json_option
+def status(store: Path, redis_url: str, as_json: bool) -> None:
+    """Show what is planned, committed, queued and failed."""
+    from photonfarm.shared import show
+
+    show.status(store, redis_url, as_json)
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
+@click.option("--run", type=click.Path(path_type=Path), default="run", show_default=True, help="The trainer's folder.")
+@click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
+@click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
+def up(spec: str, store: Path, workers: int, run: Path, train_steps: int, out: Path, **request: Any) -> None:
+    """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done."""
+    from photonfarm.shared.up import run_farm
+
+    run_farm(spec, store, workers=workers, run=run, train_steps=train_steps, out=out, **request)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""What the command line prints: tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from photonfarm.shared.scene import SceneSpec, shape_ids
+
+if TYPE_CHECKING:
+    from photonfarm.shared.submission import Submission
+
+
+class Finding(Protocol):
+    """The result of one check of `photonfarm doctor`."""
+
+    @property
+    def name(self) -> str:
+        """What was checked."""
+
+    @property
+    def works(self) -> bool:
+        """Whether it works."""
+
+    @property
+    def detail(self) -> str:
+        """What was found, or what to do."""
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command, where this does not work; 0 if it can be done without."""
+
+
+def _json(document: Any) -> None:
+    click.echo(json.dumps(document, indent=2))
+
+
+def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
+    table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
+    for row in rows:
+        table.add_row(*row)
+    Console(soft_wrap=True).print(table, highlight=False)
+
+
+# ----------------------------------------------------------------------------------------------------------- scene show
+
+
+def scene(spec: SceneSpec, as_json: bool) -> None:
+    """A checked spec: its id, its settings, its movable groups."""
+    if as_json:
+        _json({"scene_id": spec.scene_id, "bytes_per_sample": bytes_per_sample(spec), **spec.model_dump(mode="json")})
+        return
+    t, source = spec.transport, spec.scene
+    _table(
+        (
+            ("name", spec.name),
+            ("scene id", spec.scene_id),
+            ("source", source.file or f"built-in {source.builtin}"),
+            ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
+            ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
+            ("light transport", f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"),
+            ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
+            ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
+            ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),
+            ("point cloud", f"{spec.points} points"),
+            ("photons", f"{spec.photons.paths} paths, {spec.photons.depth} hits each"),
+            ("exposure", f"{spec.exposure:g}"),
+            ("bytes per sample", f"≤ {bytes_per_sample(spec):,} with its own view and modification"),
+        )
+    )  # fmt: skip
+    if spec.groups:
+        click.echo()
+        _table(
+            (
+                (g.name, str(len(shape_ids(g))), f"{g.removal_probability:g}", _box(g.box.min, g.box.max))
+                for g in spec.groups
+            ),
+            ("movable", "shapes", "removed", "positions"),
+        )  # fmt: skip
+
+
+def bytes_per_sample(spec: SceneSpec) -> int:
+    """Stored bytes of one sample that has a view and a modification of its own, before compression."""
+    from photonfarm.shared.store.schema import output_arrays
+
+    arrays = [array for name, array in output_arrays(spec).items() if name != "radiance_wide"]
+    outputs = sum(int(np.prod(array.row_shape)) * array.dtype.itemsize for array in arrays)
+    return outputs + 16 * len(spec.groups) + 24  # and the modification vector and the view
+
+
+def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
+    return " × ".join(f"{a:g}" if a == b else f"{a:g}…{b:g}" for a, b in zip(low, high, strict=True))
+
+
+# --------------------------------------------------------------------------------------------------------------- submit
+
+
+def submission(result: Submission, as_json: bool) -> None:
+    """What became of a request."""
+    if as_json:
+        _json(asdict(result))
+        return
+    queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
+    click.echo(
+        f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
+    )
+
+
+# --------------------------------------------------------------------------------------------------------------- status
+
+
+def status(store: Path, redis_url: str, as_json: bool) -> None:
+    """The store's scenes, and the queue where there is one."""
+    from photonfarm.shared import queue
+    from photonfarm.shared.errors import QueueError
+    from photonfarm.shared.store import Store, store_status
+
+    scenes = [asdict(scene) for scene in store_status(Store(store))]
+    try:
+        queued: dict[str, Any] | None = asdict(queue.queue_status(queue.connect(redis_url)))
+        absent = ""
+    except QueueError as error:
+        queued, absent = None, str(error)
+    if as_json:
+        _json({"scenes": scenes, "queue": queued})
+        return
+    _table(
+        (
+            (
+                s["name"], s["scene_id"], f"{s['samples_complete']}/{s['samples_planned']}",
+                f"{s['jobs_committed']}/{s['jobs_planned']}", f"{s['size_bytes'] / 1e6:.1f} MB", f"{s['core_s']:.0f} s",
+                str(s["redrawn"]),
+            )
+            for s in scenes
+        ),
+        ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
+    )  # fmt: skip
+    click.echo()
+    if queued is None:
+        click.echo(f"queue: {absent}")
+    else:
+        click.echo("queue: " + ", ".join(f"{v} {k}" for k, v in queued.items()))
+
+
+# --------------------------------------------------------------------------------------------------------------- doctor
+
+
+def findings(found: Iterable[Finding], as_json: bool) -> int:
+    """The results of checks as they come; the exit code is that of the first needed one that failed, else 0."""
+    console, code, seen = Console(soft_wrap=True), 0, []
+    for finding in found:
+        if not finding.works and not code:
+            code = finding.exit_code
+        seen.append(finding)
+        if not as_json:
+            mark = "[green]ok[/]  " if finding.works else ("[red]FAIL[/]" if finding.exit_code else "[yellow]none[/]")
+            console.print(f"{mark} [bold]{finding.name}[/]: {finding.detail}", highlight=False)
+    if as_json:
+        _json([{"name": f.name, "works": f.works, "detail": f.detail} for f in seen])
+    return code

@@ -1,0 +1,53 @@
+"""From a spec's name and a few numbers to planned and queued samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.shared import queue
+from photonfarm.shared.plan import Request
+from photonfarm.shared.scene import load_spec
+from photonfarm.shared.store import PlanResult, Store
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """What became of a request."""
+
+    scene_id: str
+    plan: int | None  # number of the new plan; None if nothing was new or nothing was written
+    planned: int  # samples planned by this request
+    planned_before: int  # samples of the request that older plans hold
+    queued: int | None  # jobs queued, also those of older plans that were missing; None: not queued
+
+
+def preview(spec: str, store: Path, *, shard_rows: int | None = None, **request: int) -> Submission:
+    """What `submit` would plan; nothing is written."""
+    loaded, wanted = load_spec(spec), _request(**request)
+    if not store.exists():
+        return Submission(loaded.scene_id, None, wanted.samples, 0, None)
+    planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
+    return _submission(planned, None)
+
+
+def submit(
+    spec: str, store: Path, redis_url: str | None, *, shard_rows: int | None = None, **request: int
+) -> Submission:
+    """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
+
+    Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
+    """
+    loaded, wanted = load_spec(spec), _request(**request)
+    opened = Store(store, create=True)
+    planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
+    queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url))
+    return _submission(planned, queued)
+
+
+def _request(*, modifications: int, views: int, passes: int, seed: int) -> Request:
+    return Request.of(modifications=modifications, views_per_modification=views, passes=passes, seed=seed)
+
+
+def _submission(planned: PlanResult, queued: int | None) -> Submission:
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)

@@ -1,0 +1,144 @@
+"""The whole farm on one machine: an embedded Redis, render workers and the trainer, as processes of one terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from photonfarm.shared.errors import IncompleteError
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import Store
+from photonfarm.shared.submission import submit
+
+POLL_S = 0.5
+PLAIN_LINE_S = 15.0  # between lines where there is no terminal to draw bars on
+STOP_S = 120.0  # for a process to finish its job or to write its checkpoint
+
+Process = subprocess.Popen[bytes]
+
+
+def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: int, out: Path, **request: int) -> None:
+    """Submit, render, train, and write the preview and the report; raises IncompleteError if a part fails.
+
+    Started again after any interruption it goes on where it was, as the store and the trainer's checkpoints last.
+    """
+    console = Console(stderr=True, highlight=False)
+    run.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        redis = stack.enter_context(EmbeddedRedis(run / "redis"))
+        planned = submit(spec, store, redis.url, **request)
+        console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis.url}
+        verbs = {f"worker-{i + 1}": ["work", "--until-complete", "--name", f"worker-{i + 1}"] for i in range(workers)}
+        if train_steps:
+            verbs["trainer"] = ["train", spec, "--run", str(run), "--steps", str(train_steps)]
+        running = {
+            name: stack.enter_context(_process(verb, environment, run / f"{name}.log")) for name, verb in verbs.items()
+        }
+        _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), console)
+        _call(["preview", spec, "--out", str(out / "preview.html")], environment)
+        if train_steps:
+            _call(["report", "--run", str(run), "--out", str(out)], environment)
+
+
+def _verb(arguments: list[str]) -> list[str]:
+    return [sys.executable, "-m", "photonfarm.shared.cli", *arguments]
+
+
+def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
+    code = subprocess.run(_verb(arguments), env=environment, check=False).returncode
+    if code:
+        raise IncompleteError(f"photonfarm {arguments[0]} ended with exit code {code}; what it said stands above")
+
+
+@contextmanager
+def _process(arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
+    """One verb as a process of its own; on the way out it is asked to stop, and waited for."""
+    with log.open("ab") as output:
+        process = subprocess.Popen(
+            _verb(arguments), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+        )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+class _Farm:
+    """Where rendering and training are, as their files say."""
+
+    def __init__(self, store: Store, scene_id: str, run: Path, steps: int) -> None:
+        self.scene = store.scene(scene_id)
+        self.run = run
+        self.steps = steps
+        self.step = 0
+        self.note = ""
+        self._metrics_read = 0
+
+    def look(self) -> tuple[int, int]:
+        """Samples committed and planned, by now; `step` and `note` follow the trainer's log."""
+        path = self.run / "metrics.jsonl"
+        if path.exists():
+            with path.open() as lines:
+                lines.seek(self._metrics_read)
+                while (line := lines.readline()).endswith("\n"):
+                    self._metrics_read = lines.tell()
+                    self._take(json.loads(line))
+        progress = self.scene.progress()
+        return progress.committed_samples, progress.planned_samples
+
+    def _take(self, record: dict[str, object]) -> None:
+        self.step = int(str(record.get("step", self.step)))
+        if record.get("kind") == "validation":
+            self.note = f", held-out error {record['error']:.5f} ± {record['standard_error']:.5f}"
+
+
+def _watch(running: Mapping[str, Process], farm: _Farm, console: Console) -> None:
+    """Show progress until every process has ended; raises IncompleteError as soon as one has failed."""
+    last_line = started = time.monotonic()
+    with _bars(console) as bars:
+        samples = bars.add_task("samples", total=None)
+        steps = bars.add_task("training steps", total=farm.steps, visible=farm.steps > 0)
+        while True:
+            alive = any(process.poll() is None for process in running.values())
+            committed, planned = farm.look()
+            bars.update(samples, completed=committed, total=planned)
+            bars.update(steps, completed=farm.step, description=f"training steps{farm.note}")
+            now = time.monotonic()
+            if not console.is_terminal and (now - last_line > PLAIN_LINE_S or not alive):
+                last_line = now
+                console.print(
+                    f"{now - started:4.0f} s  samples {committed}/{planned}  steps {farm.step}/{farm.steps}{farm.note}"
+                )
+            for name, process in running.items():
+                if process.poll():
+                    log = farm.run / f"{name}.log"
+                    raise IncompleteError(f"{name} ended with exit code {process.returncode}; {log} says: {_tail(log)}")
+            if not alive:
+                return
+            time.sleep(POLL_S)
+
+
+def _tail(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "nothing"
+
+
+def _bars(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, disable=not console.is_terminal)

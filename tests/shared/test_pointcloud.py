@@ -1,0 +1,103 @@
+"""Point cloud sampling, supplement 2.3 and 2.1. Significance of the statistical tests: 1e-4 each, seeds fixed."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from photonfarm.shared.keys import Stream, make_key
+from photonfarm.shared.modification import sample_modification
+from photonfarm.shared.pointcloud import draw, rebuild, sample_surface
+from photonfarm.shared.records import STATIC, BasePointCloud, Geometry
+from photonfarm.shared.scene import SceneSpec
+
+COUNT = 40_000
+
+
+@pytest.fixture()
+def geometry() -> Geometry:
+    """Four shapes of 1, 0 (degenerate), 2 and 3 triangles with interleaved faces and different areas."""
+    vertices = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 2, 0], [5, 0, 3], [9, 0, 0], [9, 0, 4], [9, 1, 1]], np.float32
+    )
+    faces = np.array([[3, 4, 5], [0, 1, 2], [6, 7, 8], [6, 6, 7], [5, 4, 3], [0, 2, 8], [1, 2, 3]], np.uint32)
+    face_shape = np.array([2, 0, 3, 1, 2, 3, 3], np.int32)
+    return Geometry(vertices, faces, face_shape, np.array([0, 1, STATIC, 2], np.int16))
+
+
+def sampled(geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    return sample_surface(geometry, COUNT, Stream(make_key("cloud"), "surface"))
+
+
+def test_shapes_are_drawn_in_proportion_to_their_area(geometry: Geometry) -> None:
+    face, _ = sampled(geometry)
+    area = np.bincount(geometry.face_shape, weights=geometry.areas())
+    count = np.bincount(geometry.face_shape[face], minlength=4)
+    assert count[1] == 0
+    alive = area > 0
+    assert stats.chisquare(count[alive], COUNT * area[alive] / area.sum()).pvalue > 1e-4
+
+
+def test_triangles_are_drawn_in_proportion_to_their_area(geometry: Geometry) -> None:
+    face, _ = sampled(geometry)
+    area = geometry.areas()
+    count = np.bincount(face, minlength=len(area))
+    alive = area > 0
+    assert not count[~alive].any()
+    assert stats.chisquare(count[alive], COUNT * area[alive] / area.sum()).pvalue > 1e-4
+
+
+def test_points_are_uniform_over_the_four_middle_triangles(geometry: Geometry) -> None:
+    _, weights = sampled(geometry)
+    assert np.allclose(weights.sum(axis=1), 1)
+    assert weights.min() >= 0
+    part = np.where(weights.max(axis=1) > 0.5, weights.argmax(axis=1), 3)
+    assert stats.chisquare(np.bincount(part, minlength=4)).pvalue > 1e-4
+
+
+def test_the_index_drawn_is_the_first_whose_cdf_reaches_u() -> None:
+    weights = np.array([0.0, 1.0, 0.0, 2.0, 1.0, 0.0])  # cdf 0 .25 .25 .75 1 1
+    u = np.array([0.0, 0.1, 0.25, 0.2500001, 0.75, 0.76, 1 - 2**-53])
+    assert draw(weights, u).tolist() == [1, 1, 1, 3, 3, 4, 4]
+
+
+def test_first_and_last_shape_are_reachable() -> None:
+    found = draw(np.array([1.0, 5.0, 1.0]), np.linspace(0, 1 - 1e-9, 1000))
+    assert set(found) == {0, 1, 2}
+
+
+@pytest.fixture()
+def base() -> BasePointCloud:
+    rng = np.random.default_rng(0)
+    position = rng.normal(size=(500, 3)).astype(np.float32)
+    group = rng.integers(-1, 4, 500).astype(np.int16)
+    return BasePointCloud(position, position, position, position, group, np.zeros(500, np.uint32))
+
+
+def test_points_move_with_their_group_and_no_others_do(base: BasePointCloud, dynamic_spec: SceneSpec) -> None:
+    for index in range(20):
+        modification = sample_modification(dynamic_spec, 0, index)
+        position, visible = rebuild(base, modification)
+        static = base.group == STATIC
+        assert np.array_equal(position[static], base.position[static])
+        assert visible[static].all()
+        for g in range(4):
+            of_group = base.group == g
+            moved = position[of_group] - base.position[of_group]
+            assert np.abs(moved - modification.translation[g]).max() < 1e-6
+            assert (visible[of_group] == modification.present[g]).all()
+
+
+def test_the_number_of_points_is_constant_and_rebuilding_repeats_bit_by_bit(
+    base: BasePointCloud, dynamic_spec: SceneSpec
+) -> None:
+    modification = sample_modification(dynamic_spec, 0, 1)
+    first, second = rebuild(base, modification), rebuild(base, modification)
+    assert first[0].shape == base.position.shape
+    assert first[0].dtype == np.float32
+    assert first[0].tobytes() == second[0].tobytes()
+
+
+def test_a_static_scene_has_its_base_cloud(base: BasePointCloud, static_spec: SceneSpec) -> None:
+    position, visible = rebuild(base, sample_modification(static_spec, 0, 0))
+    assert np.array_equal(position, base.position)
+    assert visible.all()

@@ -1,0 +1,135 @@
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.scene import SCENES_VARIABLE, load_spec, parse_spec
+
+SCENE = """<scene version="3.0.0">
+  <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>
+  <shape type="sphere" id="Ball"/>
+</scene>"""
+
+SPEC = """
+name = "small"
+scene.file = "small/scene.xml"
+[[objects]]
+name = "ball"
+shapes = ["Ball"]
+at = [0, 0, 0]
+box = { min = [-1, 0, -1], max = [1, 0, 1] }
+[view]
+origin = { min = [0, 0, 0], max = [1, 1, 1] }
+look_at = { min = [0, 0, 0], max = [1, 1, 1] }
+"""
+
+
+@pytest.fixture()
+def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "scenes"
+    (folder / "small/meshes").mkdir(parents=True)
+    (folder / "small/scene.xml").write_text(SCENE)
+    (folder / "small/meshes/floor.ply").write_bytes(b"ply")
+    monkeypatch.setenv(SCENES_VARIABLE, str(folder))
+    return folder
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    return {**tomllib.loads(SPEC), **changes}
+
+
+def ball(**changes: Any) -> dict[str, Any]:
+    return changed(objects=[{**tomllib.loads(SPEC)["objects"][0], **changes}])
+
+
+def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "spec.toml").write_text(SPEC)
+    spec = load_spec(tmp_path / "spec.toml")
+    assert spec.objects[0].removal_probability == 0.2
+    assert spec.film.width == 128
+    assert [group.name for group in spec.groups] == ["ball"]
+
+
+@pytest.mark.parametrize(
+    ("described", "sentence"),
+    [
+        (ball(shapes=["Bal"]), r"ball.shapes: 'Bal' is not a shape id of the scene; nearest: Ball"),
+        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"objects.0.box: is inverted along y: min 1.0 is above max 0.0"),
+        (ball(removal_probability=1.5), r"objects.0.removal_probability = 1.5: .* less than or equal to 1"),
+        (ball(removal_probability=-0.1), r"objects.0.removal_probability = -0.1: .* greater than or equal to 0"),
+        (changed(scene={"file": "none/scene.xml"}), r"scene.file = 'none/scene.xml' is not there .* PHOTONFARM_SCENES"),
+        (changed(scene={}), r"scene: needs either file .* or builtin"),
+        (changed(scene={"builtin": "castle"}), r"scene.builtin = 'castle': .*'cornell' or 'room'"),
+        (changed(exposure=0), r"exposure = 0: .* greater than 0"),
+        (changed(film={"width": 100, "height": 64}), r"film.width = 100: .* multiple of 8"),
+        (changed(typo=1), r"typo = 1: Extra inputs are not permitted"),
+        (changed(objects=tomllib.loads(SPEC)["objects"] * 2), r"group name 'ball' twice"),
+        ({k: v for k, v in changed().items() if k != "view"}, r"view: Field required"),
+        (ball(at=[0, float("nan"), 0]), r"objects.0.at.1 = nan"),
+    ],
+)
+def test_an_invalid_spec_is_refused_with_key_value_and_rule(
+    scenes: Path, described: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(SpecError, match=sentence):
+        parse_spec(described, where="spec")
+
+
+@pytest.mark.parametrize(
+    ("added", "sentence"),
+    [
+        ('<medium type="homogeneous" id="fog"/>', "participating media are not supported"),
+        ('<bsdf type="polarizer" id="foil"/>', "polarisation is not supported"),
+        ('<shape type="obj" id="x"><string name="filename" value="gone.obj"/></shape>', "'gone.obj' is not there"),
+        ("<shape>", "not a readable Mitsuba scene file"),
+    ],
+)
+def test_a_scene_that_cannot_be_rendered_is_refused(scenes: Path, added: str, sentence: str) -> None:
+    (scenes / "small/scene.xml").write_text(SCENE.replace("</scene>", added + "</scene>"))
+    with pytest.raises(SpecError, match=sentence):
+        parse_spec(changed(), where="spec")
+
+
+def test_invalid_toml_and_an_unknown_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "spec.toml").write_text("name = ")
+    with pytest.raises(SpecError, match="not valid TOML"):
+        load_spec(tmp_path / "spec.toml")
+    with pytest.raises(SpecError, match=r"castle: no such spec; give a \.toml file or one of"):
+        load_spec("castle")
+
+
+def test_the_scene_id_follows_the_content_and_not_the_place(scenes: Path, tmp_path: Path) -> None:
+    here = parse_spec(changed(), where="spec").scene_id
+    moved = tmp_path / "elsewhere"
+    scenes.rename(moved)
+    assert parse_spec(changed(), where="spec", beside=moved).scene_id == here
+    (moved / "small/meshes/floor.ply").write_bytes(b"another")
+    assert parse_spec(changed(), where="spec", beside=moved).scene_id != here
+
+
+def test_the_scene_id_follows_every_setting_but_the_name(scenes: Path) -> None:
+    changes = [{}, {"exposure": 2.0}, {"points": 7}, {"transport": {"max_depth": 3}}, {"film": {"width": 64}}]
+    ids = [parse_spec(changed(**change), where="spec").scene_id for change in changes]
+    ids.append(parse_spec(ball(removal_probability=0.3), where="spec").scene_id)
+    assert len(set(ids)) == len(ids)
+    assert parse_spec(changed(name="other"), where="spec").scene_id == ids[0]
+
+
+def test_a_light_is_shapes_or_a_rectangle_and_not_both(scenes: Path) -> None:
+    light = {"name": "lamp", "at": [0, 2, 0], "box": {"min": [0, 2, 0], "max": [1, 2, 1]}}
+    with pytest.raises(SpecError, match="needs either shapes"):
+        parse_spec(changed(lights=[light]), where="spec")
+    lit = {**light, "rectangle": {"size": [1, 1], "radiance": [3, 3, 3]}}
+    assert parse_spec(changed(lights=[lit]), where="spec").lights[0].removal_probability == 0
+    dark = {**light, "rectangle": {"size": [1, 1], "radiance": [0, 0, 0]}}
+    with pytest.raises(SpecError, match="all ≥ 0 and one > 0"):
+        parse_spec(changed(lights=[dark]), where="spec")
+
+
+def test_a_spec_survives_json(scenes: Path) -> None:
+    spec = parse_spec(changed(), where="spec")
+    again = parse_spec(spec.model_dump(mode="json", exclude={"content"}), where="spec")
+    assert again == spec
+    assert again.scene_id == spec.scene_id

@@ -47,11 +47,11 @@ def test_a_plan_submitted_from_the_host_is_rendered_by_three_workers_and_trained
         subprocess.run(["chown", "-R", str(CONTAINER_UID), str(data)], check=True)
 
     deadline = time.monotonic() + 600
-    scene = {"committed_samples": 0}
-    while scene["committed_samples"] < 60 and time.monotonic() < deadline:
+    scene = {"samples_complete": 0}
+    while scene["samples_complete"] < 60 and time.monotonic() < deadline:
         time.sleep(3)
         (scene,) = json.loads(photonfarm("status", "--store", store, "--json").stdout)["scenes"]
-    assert scene["committed_samples"] == 60
+    assert scene["samples_complete"] == 60
 
     markers = [json.loads(p.read_text()) for p in store.glob("scenes/*/committed/*.json")]
     assert len({marker["figures"]["worker"] for marker in markers}) == 3

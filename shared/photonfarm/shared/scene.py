@@ -239,12 +239,11 @@ def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = N
     spec = _validate({**described, "content": ""}, where)
     if spec.scene.file is None:
         content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
-        known = None
+        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
     else:
         scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
         content, known = scene.digest, scene.shape_ids
-    if known is not None:
-        _check_shapes(spec, known, where)
+    _check_shapes(spec, known, where)
     return spec.model_copy(update={"content": content})
 
 
@@ -280,6 +279,8 @@ def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
 
 def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
     """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
+    if Path(file).is_absolute() and Path(file).is_file():
+        return Path(file)
     folders = [beside] if beside else []
     folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
     for folder in folders:

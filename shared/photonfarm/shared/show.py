@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -146,8 +147,11 @@ def status(store: Path, redis_url: str, as_json: bool) -> None:
     click.echo()
     if queued is None:
         click.echo(f"queue: {absent}")
-    else:
-        click.echo("queue: " + ", ".join(f"{v} {k}" for k, v in queued.items()))
+        return
+    failed = queued.pop("failed")
+    click.echo("queue: " + ", ".join(f"{count} {what}" for what, count in queued.items()) + f", {len(failed)} failed")
+    for reason, count in Counter(failed.values()).most_common():
+        click.echo(f"  {count} × {reason}")
 
 
 # --------------------------------------------------------------------------------------------------------------- doctor

@@ -36,12 +36,13 @@ def submit(
 ) -> Submission:
     """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
 
+    Jobs that have failed are tried again.
     Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
     """
     loaded, wanted = load_spec(spec), _request(**request)
     opened = Store(store, create=True)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
-    queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url))
+    queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url), retry_failed=True)
     return _submission(planned, queued)
 
 

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.scene import SCENES_VARIABLE
 from photonfarm.shared.store import Store
 from photonfarm.shared.submission import submit
 
@@ -38,6 +39,8 @@ def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: in
         planned = submit(spec, store, redis.url, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis.url}
+        beside = str(Path(spec).parent)  # where the spec may have found its scene file, and the workers must too
+        environment[SCENES_VARIABLE] = os.pathsep.join(filter(None, (environment.get(SCENES_VARIABLE), beside)))
         verbs = {f"worker-{i + 1}": ["work", "--until-complete", "--name", f"worker-{i + 1}"] for i in range(workers)}
         if train_steps:
             verbs["trainer"] = ["train", spec, "--run", str(run), "--steps", str(train_steps)]

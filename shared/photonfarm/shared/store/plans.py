@@ -1,0 +1,224 @@
+"""Plans as they lie in the store: written once aside and renamed into place, then only read.
+
+Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job r // J.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.keys import Key
+from photonfarm.shared.modification import Modification
+from photonfarm.shared.plan import UNUSED, PlannedRows, Request
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import schema
+from photonfarm.shared.view import View
+
+NAME_DIGITS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredPlan:
+    """One plan of a scene with its inputs in memory."""
+
+    number: int
+    folder: Path
+    request: Request
+    first_job: int
+    jobs: int
+    shard_rows: int
+    rows: PlannedRows
+
+    @property
+    def first_row(self) -> int:
+        """Number of its first row, in the scene."""
+        return self.first_job * self.shard_rows
+
+    @property
+    def end_row(self) -> int:
+        """Number of the row after its last."""
+        return (self.first_job + self.jobs) * self.shard_rows
+
+    @property
+    def samples(self) -> int:
+        """How many samples it holds; the rest of its last job's rows is unused."""
+        return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRow:
+    """The inputs of one sample."""
+
+    row: int
+    modification_row: int
+    view_row: int
+    pass_: int
+    key: Key
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobRows:
+    """What one job must produce, and every input that it refers to, also in older plans."""
+
+    job: int
+    samples: tuple[SampleRow, ...]  # by modification, view and pass
+    modifications: dict[int, Modification]  # by row: all that the samples refer to
+    views: dict[int, View]  # by row: all that the samples refer to
+    new_modifications: frozenset[int]  # rows whose photons this job produces
+    new_views: frozenset[int]  # rows whose buffers this job produces
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def folder_name(number: int) -> str:
+    """The folder of a plan under `plans/`."""
+    return f"{number:0{NAME_DIGITS}d}"
+
+
+def numbers(plans: Path) -> list[int]:
+    """The plans that are there, in order; none if the folder is missing."""
+    if not plans.is_dir():
+        return []
+    return sorted(int(path.name) for path in plans.iterdir() if path.name.isdecimal())
+
+
+def build(
+    folder: Path, spec: SceneSpec, request: Request, rows: PlannedRows, *, first_job: int, shard_rows: int
+) -> None:
+    """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
+    import zarr
+    from zarr.storage import LocalStore
+
+    count = len(rows.sample_modification)
+    attributes: Any = {
+        "scene": spec.scene_id,
+        "request": request.model_dump(mode="json"),
+        "first_job": first_job,
+        "jobs": count // shard_rows,
+        "shard_rows": shard_rows,
+    }
+    group = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3, attributes=attributes)
+    for name, (dimensions, about) in schema.PLAN_INPUTS.items():
+        schema.create_input(group, name, getattr(rows, name), dimensions, about)
+    schema.create_outputs(group, spec, count, shard_rows)
+
+
+def load(plans: Path, number: int) -> StoredPlan:
+    """A plan with its inputs; raises CorruptError if it is not as it was written."""
+    import zarr
+    from zarr.storage import LocalStore
+
+    folder = plans / folder_name(number)
+    try:
+        group = zarr.open_group(LocalStore(folder, read_only=True), mode="r", zarr_format=3, use_consolidated=False)
+        rows = PlannedRows(**{field.name: _whole(group, field.name) for field in fields(PlannedRows)})
+        about: dict[str, Any] = dict(group.attrs)
+        request = Request.model_validate(about["request"])
+        first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
+    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
+        raise CorruptError(f"{folder}: is not a readable plan: {error}") from error
+    return StoredPlan(number, folder, request, first_job, jobs, shard_rows, rows)
+
+
+def _whole(group: Any, name: str) -> Any:
+    return np.asarray(group[name][...])
+
+
+def shard_rows_of(plans: Path) -> int | None:
+    """The samples per job that the scene's first plan fixed; None if there is no plan."""
+    found = numbers(plans)
+    if not found:
+        return None
+    document = plans / folder_name(found[0]) / "zarr.json"
+    try:
+        return int(json.loads(document.read_text())["attributes"]["shard_rows"])
+    except (OSError, ValueError, KeyError) as error:
+        raise CorruptError(f"{document}: is not the document of a plan: {error}") from error
+
+
+def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
+    """The plan that a row belongs to."""
+    for plan in reversed(plans):
+        if plan.first_row <= row < plan.end_row:
+            return plan
+    raise IndexError(f"row {row} belongs to no plan of this scene")
+
+
+def modification_at(plans: list[StoredPlan], row: int) -> Modification:
+    """The modification in a modification row."""
+    plan = plan_of(plans, row)
+    return Modification.from_vector(plan.rows.modification[row - plan.first_row])
+
+
+def view_at(plans: list[StoredPlan], row: int) -> View:
+    """The view in a view row."""
+    plan = plan_of(plans, row)
+    return View.from_vector(plan.rows.view[row - plan.first_row])
+
+
+def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
+    """The inputs of the sample in a row; None for an unused row."""
+    plan = plan_of(plans, row)
+    inputs, i = plan.rows, row - plan.first_row
+    if inputs.sample_modification[i] == UNUSED:
+        return None
+    return SampleRow(
+        row,
+        int(inputs.sample_modification[i]),
+        int(inputs.sample_view[i]),
+        int(inputs.sample_pass[i]),
+        inputs.sample_key[i].tobytes(),
+    )
+
+
+def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
+    """Everything that one job needs; raises IndexError for a job of no plan."""
+    for plan in plans:
+        if plan.first_job <= job < plan.first_job + plan.jobs:
+            break
+    else:
+        raise IndexError(f"job {job} belongs to no plan of this scene")
+    own = range(job * plan.shard_rows, (job + 1) * plan.shard_rows)
+    samples = [sample for row in own if (sample := sample_at(plans, row))]
+    samples.sort(key=lambda s: (s.modification_row, s.view_row, s.pass_))
+    modifications = {s.modification_row: modification_at(plans, s.modification_row) for s in samples}
+    views = {s.view_row: view_at(plans, s.view_row) for s in samples}
+    return JobRows(
+        job,
+        tuple(samples),
+        modifications,
+        views,
+        frozenset(row for row in modifications if row in own),
+        frozenset(row for row in views if row in own),
+    )
+
+
+def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:
+    """Whether each row of the scene holds a complete sample, (rows of all plans,).
+
+    That is one whose own job, whose view's job and whose modification's job are committed.
+    """
+    if not plans:
+        return np.zeros(0, np.bool_)
+    shard_rows = plans[0].shard_rows
+    done = np.zeros(plans[-1].first_job + plans[-1].jobs, np.bool_)
+    done[[job for job in committed if job < len(done)]] = True
+    complete = np.zeros(plans[-1].end_row, np.bool_)
+    for plan in plans:
+        modification, view = plan.rows.sample_modification, plan.rows.sample_view
+        own = np.arange(plan.first_row, plan.end_row)
+        complete[plan.first_row : plan.end_row] = (
+            (modification != UNUSED)
+            & done[own // shard_rows]
+            & done[view // shard_rows]
+            & done[modification // shard_rows]
+        )
+    return complete

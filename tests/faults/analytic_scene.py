@@ -1,0 +1,135 @@
+"""A scene that is rendered by formulas in microseconds, behind the interface that jobs use; run as a script, a
+worker's child that renders it. Arguments: seconds that each half takes, and a purpose ("broken": never finite,
+"no backend": does not load).
+"""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from photonfarm.shared.errors import BackendError
+from photonfarm.shared.modification import Modification, rest
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.view import View
+
+
+def small_spec(**changes: Any) -> SceneSpec:
+    """A dynamic scene of one object at 8 × 8 pixels."""
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0}
+    described = {
+        "name": "analytic", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
+        "view": {"origin": unit, "look_at": unit}, "film": {"width": 8, "height": 8},
+        "photons": {"paths": 4, "depth": 2},
+    }  # fmt: skip
+    return parse_spec({**described, **changes}, where="test")
+
+
+class AnalyticScene:
+    """Radiance, buffers and photons that depend on the configuration, the view and the seed, and on nothing else."""
+
+    pause_s: ClassVar[float] = 0.0
+    broken: ClassVar[bool] = False
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self.spec = spec
+        self.modification = rest(spec)
+        self.renders = 0
+
+    @classmethod
+    def load(cls, spec: SceneSpec) -> "AnalyticScene":
+        return cls(spec)
+
+    def apply(self, modification: Modification) -> None:
+        self.modification = modification
+
+    def _level(self, view: View) -> float:
+        return float(np.abs(self.modification.vector).sum() + np.abs(view.vector).sum())
+
+    def render_half(self, view: View, seed: int) -> F32:
+        time.sleep(self.pause_s)
+        self.renders += 1
+        size = (self.spec.film.height, self.spec.film.width, 3)
+        noise = np.random.default_rng(seed).gamma(1.0, 1.0, size)
+        return np.full(size, np.nan, np.float32) if self.broken else (self._level(view) * noise).astype(np.float32)
+
+    def buffers(self, view: View) -> ViewBuffers:
+        size = (self.spec.film.height, self.spec.film.width)
+        depth = np.full(size, self._level(view), np.float32)
+        return ViewBuffers(depth, np.full((*size, 3), 0.5, np.float32), np.full((*size, 3), 0.6, np.float32))
+
+    def photons(self, seed: int) -> Photons | None:
+        count = self.spec.photons.paths * self.spec.photons.depth
+        if not count:
+            return None
+        values = np.random.default_rng(seed).random((4, count, 3), dtype=np.float32)
+        values[0] += np.float32(np.abs(self.modification.vector).sum())
+        return Photons(*values, bounce=np.zeros(count, np.int8))
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        corners = np.eye(3, dtype=np.float32)
+        geometry = Geometry(corners, np.array([[0, 1, 2]], np.uint32), np.zeros(1, np.int32), np.array([-1], np.int16))
+        points = np.tile(corners, (self.spec.points, 1))[: self.spec.points]
+        index = np.zeros(self.spec.points)
+        return geometry, BasePointCloud(points, points, points, points, index.astype(np.int16), index.astype(np.uint32))
+
+
+def command(pause_s: float = 0.0, purpose: str = "") -> tuple[str, ...]:
+    """The child's command for `run_worker`."""
+    return (sys.executable, str(Path(__file__)), str(pause_s), purpose)
+
+
+def start_worker(store: Path, url: str, child: tuple[str, ...], **settings: Any) -> subprocess.Popen[bytes]:
+    """A supervisor in a process of its own; its exit code is that of the command line."""
+    code = """
+import json, sys
+from photonfarm.renderer.worker import run_worker
+from photonfarm.shared.errors import PhotonfarmError
+store, url, child, settings = json.loads(sys.argv[1])
+try:
+    run_worker(store, url, child=child, **settings)
+except PhotonfarmError as error:
+    sys.exit(error.exit_code)
+"""
+    settings = {"heartbeat_ttl_s": 2.0, "idle_s": 1, **settings}
+    arguments = json.dumps([str(store), url, child, settings])
+    return subprocess.Popen([sys.executable, "-c", code, arguments], stderr=subprocess.PIPE)
+
+
+def child_of(supervisor: subprocess.Popen[bytes]) -> int | None:
+    """The process that a supervisor supervises now."""
+    children = Path(f"/proc/{supervisor.pid}/task/{supervisor.pid}/children")
+    found = children.read_text().split() if children.exists() else []
+    return int(found[0]) if found else None
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+    """Return as soon as the condition holds; fail if it does not come to hold."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.02)
+
+
+def refuse_to_load(spec: SceneSpec) -> AnalyticScene:
+    raise BackendError("no libLLVM was found; install LLVM 19")
+
+
+def main() -> int:
+    from photonfarm.renderer import worker
+
+    pause_s, purpose = sys.argv[1:]
+    AnalyticScene.pause_s = float(pause_s)
+    AnalyticScene.broken = purpose == "broken"
+    return worker.child(refuse_to_load if purpose == "no backend" else AnalyticScene.load)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,64 @@
+import importlib.util
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from photonfarm.shared.plan import Request
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import SceneStore, Store
+
+
+@pytest.fixture(scope="session")
+def analytic() -> ModuleType:
+    """The module `analytic_scene`."""
+    spec = importlib.util.spec_from_file_location("analytic_scene", Path(__file__).with_name("analytic_scene.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[EmbeddedRedis]:
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        yield server
+
+
+@pytest.fixture
+def planned(tmp_path: Path, analytic: ModuleType) -> Callable[..., SceneStore]:
+    """A scene with a plan of `jobs` jobs, of two samples each."""
+
+    def plan(jobs: int, name: str = "store") -> SceneStore:
+        store = Store(tmp_path / name, create=True)
+        request = Request(modifications=-(-jobs // 2), views_per_modification=2, passes=2)
+        return store.scene(store.plan(analytic.small_spec(), request, shard_rows=2).scene_id)
+
+    return plan
+
+
+@pytest.fixture
+def clean_bytes(planned: Callable[..., SceneStore], analytic: ModuleType) -> Callable[[int], dict[str, bytes]]:
+    """What one process leaves that renders all jobs in order, undisturbed: bytes by path within the scene."""
+    from photonfarm.renderer.jobs import ShardRenderer
+
+    def render(jobs: int) -> dict[str, bytes]:
+        scene = planned(jobs, "clean")
+        renderer = ShardRenderer(Store(scene.folder.parent.parent), worker="clean", load=analytic.AnalyticScene.load)
+        for job in scene.missing_jobs():
+            renderer.render(scene.scene_id, job)
+        return data_of(scene)
+
+    return render
+
+
+def data_of(scene: SceneStore) -> dict[str, bytes]:
+    """Every data file of a scene, without the markers."""
+    files = [p for part in ("plans", "base") for p in (scene.folder / part).rglob("*") if p.is_file()]
+    return {str(p.relative_to(scene.folder)): p.read_bytes() for p in files}
+
+
+@pytest.fixture
+def stored_bytes() -> Callable[[SceneStore], dict[str, bytes]]:
+    """The function `data_of`."""
+    return data_of

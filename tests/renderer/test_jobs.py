@@ -1,0 +1,203 @@
+"""One job: the scene edited least, every half with its own seed, bad luck drawn again, wrong scenes refused."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.renderer import jobs
+from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.keys import seed_of
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+
+
+@pytest.fixture(scope="module")
+def analytic() -> ModuleType:
+    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
+    spec = importlib.util.spec_from_file_location("analytic_scene_of_jobs", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store", create=True)
+
+
+@pytest.fixture
+def scene(analytic: ModuleType, store: Store) -> SceneStore:
+    """Two jobs: 3 modifications × 2 views × 2 passes, 8 samples a job."""
+    request = Request(modifications=3, views_per_modification=2, passes=2)
+    return store.scene(store.plan(analytic.small_spec(), request, shard_rows=8).scene_id)
+
+
+@pytest.fixture
+def recorded(analytic: ModuleType) -> type:
+    """An analytic scene that writes down what is asked of it, and whose first `bad` renders are not finite."""
+
+    class Recorded(analytic.AnalyticScene):  # type: ignore[name-defined, misc]
+        calls: list[tuple[str, Any]] = []  # noqa: RUF012
+        loads = 0
+        bad = 0
+
+        @classmethod
+        def load(cls, spec: Any) -> Any:
+            cls.loads += 1
+            return cls(spec)
+
+        def apply(self, modification: Any) -> None:
+            self.calls.append(("apply", modification.vector.tobytes()))
+            super().apply(modification)
+
+        def buffers(self, view: Any) -> Any:
+            self.calls.append(("buffers", view.vector.tobytes()))
+            return super().buffers(view)
+
+        def photons(self, seed: int) -> Any:
+            self.calls.append(("photons", seed))
+            return super().photons(seed)
+
+        def render_half(self, view: Any, seed: int) -> Any:
+            self.calls.append(("half", seed))
+            image = super().render_half(view, seed)
+            if type(self).bad > 0:
+                type(self).bad -= 1
+                image[0, 0, 0] = np.inf
+            return image
+
+    return Recorded
+
+
+def asked(recorded: type, what: str) -> list[Any]:
+    return [value for name, value in recorded.calls if name == what]
+
+
+def render_all(scene: SceneStore, store: Store, kind: type) -> None:
+    renderer = ShardRenderer(store, worker="test", load=kind.load)
+    for job in scene.missing_jobs():
+        assert renderer.render(scene.scene_id, job)
+
+
+def test_each_modification_is_applied_once_a_job_and_each_view_seen_once_in_all(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    render_all(scene, store, recorded)
+    assert len(asked(recorded, "apply")) == 3
+    assert len(asked(recorded, "buffers")) == len(set(asked(recorded, "buffers"))) == 6
+    assert len(asked(recorded, "photons")) == 3
+    assert recorded.loads == 1
+
+
+def test_passes_added_later_render_neither_buffers_nor_photons_again(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    render_all(scene, store, recorded)
+    scene.plan(Request(modifications=3, views_per_modification=2, passes=3))
+    recorded.calls.clear()
+    render_all(scene, store, recorded)
+    assert len(asked(recorded, "half")) == 12
+    assert asked(recorded, "buffers") == asked(recorded, "photons") == []
+
+
+def test_every_half_has_its_own_seed_which_follows_from_the_samples_key(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    render_all(scene, store, recorded)
+    seeds = asked(recorded, "half")
+    samples = [s for job in range(2) for s in scene.job_rows(job).samples]
+    assert seeds == [seed_of(s.key, half) for s in samples for half in ("half A", "half B")]
+    assert len(set(seeds)) == 24
+    reader = SceneReader(store.root, scene.scene_id)
+    for row in reader.refresh():
+        a, b = reader.read(int(row)).radiance
+        assert not np.array_equal(a, b)
+
+
+def test_a_half_never_takes_the_seed_of_the_other() -> None:
+    taken = seed_of(b"k" * 16, "half B")
+    tried = list(jobs._seeds(b"k" * 16, "half B", taken))
+    assert len(tried) == len(set(tried)) == jobs.ATTEMPTS
+    assert taken not in tried
+
+
+def test_a_render_that_is_not_finite_is_drawn_again_and_counted(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    recorded.bad = 2
+    render_all(scene, store, recorded)
+    assert [scene.marker(job)["figures"]["redrawn"] for job in range(2)] == [2, 0]
+    reader = SceneReader(store.root, scene.scene_id)
+    assert all(np.isfinite(reader.read(int(row)).radiance).all() for row in reader.refresh())
+    assert len(set(asked(recorded, "half")[:3])) == 3
+
+
+def test_after_three_renders_that_are_not_finite_the_job_fails_and_nothing_is_stored(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    recorded.bad = 3
+    with pytest.raises(IncompleteError, match=r"half A of sample [0-9a-f]{32} came out non-finite 3 times"):
+        render_all(scene, store, recorded)
+    assert scene.missing_jobs() == [0, 1]
+
+
+def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, recorded: type) -> None:
+    render_all(scene, store, recorded)
+    recorded.calls.clear()
+    assert not ShardRenderer(store, worker="late", load=recorded.load).render(scene.scene_id, 0)
+    assert recorded.calls == []
+    assert scene.marker(0)["figures"]["worker"] == "test"
+
+
+def test_the_marker_tells_what_the_job_cost_and_which_versions_rendered_it(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    render_all(scene, store, recorded)
+    figures = scene.marker(0)["figures"]
+    assert figures["core_s"] > 0
+    assert figures["wall_s"] > 0
+    assert {"mitsuba", "drjit", "numpy", "zarr"} <= figures["versions"].keys()
+
+
+def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded: type) -> None:
+    renderer = ShardRenderer(store, worker="test", load=recorded.load)
+    ids = [
+        store.plan(analytic.small_spec(points=n), Request(modifications=2), shard_rows=1).scene_id for n in (1, 2, 3)
+    ]
+    for scene_id, job in [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1)]:
+        renderer.render(ids[scene_id], job)
+    assert recorded.loads == 4
+
+
+def test_a_scene_file_that_is_not_the_planned_one_is_refused(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: type
+) -> None:
+    from photonfarm.shared.scene import SceneSpec, parse_spec
+
+    folders = [tmp_path / "planned", tmp_path / "here"]
+    for i, folder in enumerate(folders):
+        folder.mkdir()
+        (folder / "scene.xml").write_text(f'<scene version="3.0.0"><integer name="n" value="{i}"/></scene>')
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    described = {"name": "file", "scene": {"file": "scene.xml"}, "view": {"origin": unit, "look_at": unit}}
+    spec: SceneSpec = parse_spec(described, where="test", beside=folders[0])
+    result = store.plan(spec, Request())
+    renderer = ShardRenderer(store, worker="test", load=recorded.load)
+    with pytest.raises(SpecError, match="set PHOTONFARM_SCENES to the folder that holds it"):
+        renderer.render(result.scene_id, 0)
+    monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[1]))
+    with pytest.raises(SpecError, match="the scene file here is another one than was planned"):
+        renderer.render(result.scene_id, 0)
+    monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[0]))
+    assert jobs.located(spec) == spec
+
+
+def test_the_queues_function_does_nothing_outside_a_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jobs, "_serving", None)
+    with pytest.raises(IncompleteError, match="photonfarm work"):
+        jobs.render_shard("0" * 32, 0)

@@ -1,0 +1,67 @@
+"""A small scene and made-up outputs for the tests of plan and store."""
+
+from typing import Any
+
+import numpy as np
+
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.store import Figures, JobOutputs, SceneStore
+
+FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
+
+
+def small_spec(**changes: Any) -> SceneSpec:
+    """One movable object, 8 × 8 pixels; content is not looked for on disk."""
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0.3}
+    described = {
+        "name": "small", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
+        "view": {"origin": unit, "look_at": unit}, "film": {"width": 8, "height": 8},
+        "photons": {"paths": 4, "depth": 2},
+    }  # fmt: skip
+    return parse_spec({**described, **changes}, where="test")
+
+
+def outputs(scene: SceneStore, job: int) -> JobOutputs:
+    """Outputs of the right rows and shapes, a function of the row numbers."""
+    rows, spec = scene.job_rows(job), scene.spec
+    size = (spec.film.height, spec.film.width)
+    return JobOutputs(
+        {s.row: values(s.row, (2, *size, 3)) for s in rows.samples},
+        {
+            row: ViewBuffers(values(row, size), values(row + 1, (*size, 3)), values(row + 2, (*size, 3)))
+            for row in rows.new_views
+        },
+        {row: photons(spec, row) for row in rows.new_modifications if spec.photons.paths},
+    )
+
+
+def values(seed: int, shape: tuple[int, ...]) -> F32:
+    """Random numbers in [0, 1), multiples of 2^-8, which float16 holds exactly."""
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.float32) / np.float32(256)
+
+
+def photons(spec: SceneSpec, row: int) -> Photons:
+    """Photons of which the last slot is empty."""
+    count = spec.photons.paths * spec.photons.depth
+    position, direction, normal, power = (values(row + i, (count, 3)) for i in range(4))
+    bounce = np.zeros(count, np.int8)
+    for array in (position, direction, normal, power):
+        array[-1] = 0
+    bounce[-1] = -1
+    return Photons(position, direction, normal, power, bounce)
+
+
+def base() -> tuple[Geometry, BasePointCloud]:
+    """One triangle with three points."""
+    corners = np.eye(3, dtype=np.float32)
+    geometry = Geometry(corners, np.array([[0, 1, 2]], np.uint32), np.zeros(1, np.int32), np.array([-1], np.int16))
+    group, face = np.array([-1, 0, 0], np.int16), np.zeros(3, np.uint32)
+    return geometry, BasePointCloud(corners, corners, corners, corners, group, face)
+
+
+def commit_all(scene: SceneStore) -> None:
+    """Commit every job that is missing."""
+    for job in scene.missing_jobs():
+        assert scene.commit(job, outputs(scene, job), FIGURES)

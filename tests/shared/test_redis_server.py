@@ -1,0 +1,121 @@
+"""The embedded Redis: ours alone, without a port, and with a memory."""
+
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from photonfarm.shared.errors import QueueError
+from photonfarm.shared.queue import connect
+from photonfarm.shared.redis_server import EmbeddedRedis
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that waits to be reaped does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_it_answers_on_a_socket_of_this_user_and_on_no_port(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        connection = connect(server.url)
+        assert connection.config_get("port")["port"] == "0"
+        assert connection.config_get("appendonly")["appendonly"] == "yes"
+        assert connection.config_get("appendfsync")["appendfsync"] == "everysec"
+        assert connection.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
+        assert stat.S_IMODE(server.socket.parent.stat().st_mode) == 0o700
+        assert stat.S_IMODE((tmp_path / "redis").stat().st_mode) == 0o700
+
+
+def test_what_was_written_is_there_after_a_restart_under_the_same_url(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path) as server:
+        first = server.url
+        connect(first).set("key", "value")
+    with EmbeddedRedis(tmp_path) as server:
+        assert server.url == first
+        assert connect(first).get("key") == b"value"
+
+
+def test_it_survives_its_own_sudden_death(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path) as server:
+        connect(server.url).set("key", "value")
+        time.sleep(1.2)  # the append-only file is synced every second
+        os.kill(server.pid, signal.SIGKILL)
+    with EmbeddedRedis(tmp_path) as server:
+        assert connect(server.url).get("key") == b"value"
+
+
+def test_it_ends_its_own_server_and_leaves_no_socket(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path) as server:
+        pid, path = server.pid, server.socket
+        assert alive(pid)
+    assert not alive(pid)
+    assert not path.parent.exists()
+    assert server.pid is None
+
+
+def test_a_second_server_on_the_folder_is_refused_and_the_first_goes_on(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path) as server:
+        with pytest.raises(QueueError, match="another Redis runs on this folder"), EmbeddedRedis(tmp_path):
+            pass
+        assert connect(server.url).ping()
+
+
+def test_a_long_path_is_no_trouble_for_the_socket(tmp_path: Path) -> None:
+    deep = tmp_path / ("d" * 100) / ("e" * 100)
+    with EmbeddedRedis(deep) as server:
+        assert len(str(server.socket)) < 108
+        assert connect(server.url).ping()
+
+
+def test_a_folder_that_cannot_be_made_is_a_queue_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(QueueError, match="cannot start a Redis here"), EmbeddedRedis(tmp_path / "file/redis"):
+        pass
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a child with its parent")
+def test_it_does_not_outlive_a_killed_parent_and_its_folder_can_be_used_again(tmp_path: Path) -> None:
+    code = """
+import sys, time
+from photonfarm.shared.redis_server import EmbeddedRedis
+with EmbeddedRedis(sys.argv[1]) as server:
+    print(server.pid, flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE) as parent:
+        pid = int(parent.stdout.readline())
+        parent.kill()
+    deadline = time.monotonic() + 10
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(pid)
+    with EmbeddedRedis(tmp_path) as server:
+        assert connect(server.url).ping()
+
+
+@pytest.mark.parametrize("url", ["redis://127.0.0.1:1/0", "unix:///nowhere/redis.sock", "http://localhost", "nonsense"])
+def test_no_redis_is_a_queue_error_that_names_the_url(url: str) -> None:
+    with pytest.raises(QueueError, match="no Redis at"):
+        connect(url)
+
+
+def test_a_password_is_not_repeated_in_an_error() -> None:
+    with pytest.raises(QueueError) as caught:
+        connect("redis://user:hunter2@127.0.0.1:1/0")
+    assert "hunter2" not in str(caught.value)
+
+
+def test_what_listens_but_is_no_redis_is_a_queue_error() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"redis://127.0.0.1:{server.getsockname()[1]}/0?socket_timeout=0.2"
+        with pytest.raises(QueueError, match="no Redis at"):
+            connect(url)

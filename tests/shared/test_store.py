@@ -1,0 +1,268 @@
+"""What is committed comes back, whole or not at all, while the store grows."""
+
+import importlib.util
+import json
+import resource
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import ViewBuffers, arrays_of
+from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store", create=True)
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """Three jobs of 4, 4 and 2 samples: 5 modifications, 2 views each."""
+    request = Request(modifications=5, views_per_modification=2)
+    return store.scene(store.plan(samples.small_spec(), request, shard_rows=4).scene_id)
+
+
+def reader_of(scene: SceneStore) -> SceneReader:
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    reader.refresh()
+    return reader
+
+
+def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore) -> None:
+    samples.commit_all(scene)
+    reader = reader_of(scene)
+    assert reader.rows.tolist() == list(range(10))
+    for job in range(3):
+        given, rows = samples.outputs(scene, job), scene.job_rows(job)
+        for s in rows.samples:
+            read = reader.read(s.row)
+            np.testing.assert_array_equal(read.radiance, given.radiance[s.row])
+            assert read.radiance.dtype == np.float32
+            np.testing.assert_array_equal(read.modification.vector, rows.modifications[s.modification_row].vector)
+            np.testing.assert_array_equal(read.view.vector, rows.views[s.view_row].vector)
+            assert reader.modification_key(s.row) == read.modification.key(scene.scene_id)
+            for name, array in arrays_of(given.buffers[s.view_row]).items():
+                np.testing.assert_array_equal(getattr(read.buffers, name), array)
+            expected = samples.photons(scene.spec, s.modification_row)
+            for name, array in arrays_of(reader.read_photons(s.row)).items():
+                np.testing.assert_array_equal(array, getattr(expected, name))
+
+
+def test_radiance_is_scaled_by_the_power_of_two_nearest_to_the_exposure(store: Store) -> None:
+    """2^-20 is subnormal in float16 and would lose bits; times 2^10 it is exact."""
+    spec = samples.small_spec(exposure=1000.0)
+    scene = store.scene(store.plan(spec, Request()).scene_id)
+    given = samples.outputs(scene, 0)
+    given.radiance[0] *= np.float32(2.0**-12)
+    scene.commit(0, given, samples.FIGURES)
+    np.testing.assert_array_equal(reader_of(scene).read(0).radiance, given.radiance[0])
+
+
+@pytest.mark.parametrize("bright", [1e9, 3e38, 65520.0, 65519.998, 65504.0, 65503.0, -70000.0])
+def test_no_value_is_clamped_and_none_becomes_infinite(scene: SceneStore, bright: float) -> None:
+    """float16 ends at 65504; from 65520 on it rounds to infinity, and the sample is kept in float32."""
+    given = samples.outputs(scene, 0)
+    given.radiance[2][1, 3, 4, 0] = bright
+    scene.commit(0, given, samples.FIGURES)
+    read = reader_of(scene).read(2).radiance
+    fits = abs(np.float32(bright)) < 65520
+    assert read[1, 3, 4, 0] == (65504.0 if fits else np.float32(bright))
+    rest = np.ones(read.shape, bool)
+    rest[1, 3, 4, 0] = False
+    np.testing.assert_array_equal(read[rest], given.radiance[2][rest])
+    assert (scene.folder / "plans/000000/radiance_wide/c.0.0.0.0.0").exists() == (not fits)
+    np.testing.assert_array_equal(reader_of(scene).read(3).radiance, given.radiance[3])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["radiance", "depth"])
+def test_a_value_that_is_not_finite_is_refused_and_nothing_is_committed(
+    scene: SceneStore, where: str, value: float
+) -> None:
+    given = samples.outputs(scene, 0)
+    target = given.radiance[1] if where == "radiance" else given.buffers[1].depth
+    target.flat[5] = value
+    with pytest.raises(StoreError, match=f"{where}.* of row 1"):
+        scene.commit(0, given, samples.FIGURES)
+    assert scene.missing_jobs() == [0, 1, 2]
+
+
+def test_outputs_that_are_not_exactly_the_jobs_are_refused(scene: SceneStore) -> None:
+    given = samples.outputs(scene, 0)
+    with pytest.raises(StoreError, match="radiance of job 0: row 3 is missing"):
+        scene.commit(0, replace(given, radiance={r: v for r, v in given.radiance.items() if r != 3}), samples.FIGURES)
+    wrong = {**given.buffers, 0: ViewBuffers(*(np.zeros((4, 4), np.float32),) * 3)}
+    with pytest.raises(StoreError, match=r"depth of row 0 has shape \(4, 4\); \(8, 8\) is required"):
+        scene.commit(0, replace(given, buffers=wrong), samples.FIGURES)
+
+
+def test_a_job_is_committed_once_and_the_first_one_stays(scene: SceneStore) -> None:
+    first = samples.outputs(scene, 0)
+    assert scene.commit(0, first, samples.FIGURES)
+    before = {p: p.read_bytes() for p in scene.folder.rglob("*") if p.is_file()}
+    other = replace(first, radiance={row: values + 1 for row, values in first.radiance.items()})
+    assert not scene.commit(0, other, samples.FIGURES)
+    assert {p: p.read_bytes() for p in scene.folder.rglob("*") if p.is_file()} == before
+
+
+def test_two_writers_of_one_job_leave_one_complete_job(scene: SceneStore) -> None:
+    """The second starts after the first has linked its files, but before its marker."""
+    assert scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+    marker = scene.folder / "committed/000000000000.json"
+    described = json.loads(marker.read_text())["files"]
+    marker.unlink()
+    assert scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+    assert json.loads(marker.read_text())["files"] == described
+
+
+def test_a_marker_tells_the_files_and_the_figures(scene: SceneStore) -> None:
+    import hashlib
+
+    scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+    marker = scene.marker(0)
+    assert marker["figures"]["core_s"] == 2.0
+    assert set(marker["figures"]) == {"core_s", "wall_s", "redrawn", "worker", "versions"}
+    for name, about in marker["files"].items():
+        data = (scene.folder / name).read_bytes()
+        assert (len(data), hashlib.sha256(data).hexdigest()) == (about["size"], about["sha256"])
+    assert {Path(name).parent.name for name in marker["files"]} >= {"radiance", "depth", "photon_power"}
+
+
+def test_a_sample_is_complete_only_with_its_views_and_modifications_job(scene: SceneStore) -> None:
+    """Passes of a second plan refer to rows of the first plan's jobs."""
+    scene.plan(Request(modifications=5, views_per_modification=2, passes=2))
+    later = [job for job in scene.missing_jobs() if job >= 3]
+    for job in later:
+        scene.commit(job, samples.outputs(scene, job), samples.FIGURES)
+    reader = reader_of(scene)
+    assert reader.rows.size == 0
+    scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+    seen = reader.refresh()
+    assert {reader.read(int(row)).pass_ for row in seen} == {0, 1}
+    assert all(reader.modification_row(int(row)) < 4 for row in seen)
+    assert reader.refresh().size == 0
+    samples.commit_all(scene)
+    assert sorted([*seen, *reader.refresh()]) == reader.rows.tolist()
+    assert reader.rows.size == 20
+
+
+def test_a_reader_may_wait_for_store_scene_plan_and_samples(tmp_path: Path) -> None:
+    spec = samples.small_spec()
+    reader = SceneReader(tmp_path / "later", spec.scene_id)
+    assert reader.refresh().size == 0
+    with pytest.raises(StoreError, match="later"):
+        _ = reader.spec
+    store = Store(tmp_path / "later", create=True)
+    assert reader.refresh().size == 0
+    with pytest.raises(StoreError, match="holds no scene"):
+        _ = reader.spec
+    store.add(spec)
+    assert reader.refresh().size == 0
+    assert reader.spec == spec
+    with pytest.raises(StoreError, match="base is not there yet"):
+        reader.base()
+    scene = store.scene(store.plan(spec, Request()).scene_id)
+    assert reader.refresh().size == 0
+    with pytest.raises(StoreError, match=r"row 0 .* is not complete"):
+        reader.read(0)
+    samples.commit_all(scene)
+    assert reader.refresh().tolist() == [0]
+
+
+def test_the_base_is_written_once_and_reads_back(scene: SceneStore) -> None:
+    geometry, cloud = samples.base()
+    scene.write_base(geometry, cloud)
+    scene.write_base(replace(geometry, vertices=geometry.vertices + 1), cloud)
+    for given, read in zip((geometry, cloud), reader_of(scene).base(), strict=True):
+        for name, array in arrays_of(given).items():
+            np.testing.assert_array_equal(getattr(read, name), array)
+            assert getattr(read, name).dtype == array.dtype
+
+
+def test_a_scene_without_photons_stores_none(store: Store) -> None:
+    scene = store.scene(store.plan(samples.small_spec(photons={"paths": 0}), Request()).scene_id)
+    samples.commit_all(scene)
+    assert not list(scene.folder.rglob("photon_*"))
+    with pytest.raises(StoreError, match=r"photons\.paths = 0"):
+        reader_of(scene).read_photons(0)
+
+
+def test_photons_that_all_are_empty_slots_are_stored_as_such(scene: SceneStore) -> None:
+    given = samples.outputs(scene, 0)
+    for photons in given.photons.values():
+        for array in arrays_of(photons).values():
+            array[...] = 0
+        photons.bounce[...] = -1
+    scene.commit(0, given, samples.FIGURES)
+    read = reader_of(scene).read_photons(0)
+    assert (read.bounce == -1).all()
+    assert (read.power == 0).all()
+
+
+def test_the_status_counts_samples_jobs_bytes_and_core_seconds(store: Store, scene: SceneStore) -> None:
+    scene.commit(1, samples.outputs(scene, 1), samples.FIGURES)
+    (status,) = store_status(store)
+    assert (status.samples_planned, status.samples_complete) == (10, 4)
+    assert (status.jobs_planned, status.jobs_committed) == (3, 1)
+    assert (status.core_s, status.redrawn) == (2.0, 1)
+    assert status.size_bytes == sum(p.stat().st_size for p in scene.folder.rglob("c.1.*"))
+    assert scene.progress().committed_samples == 4
+
+
+# --------------------------------------------------------------------------------------- stores that cannot be used
+
+
+def test_a_missing_store_and_a_folder_that_is_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="is not a store"):
+        Store(tmp_path)
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(StoreError, match=r"neither empty nor a store .*thesis\.tex"):
+        Store(tmp_path, create=True)
+
+
+def test_a_store_of_another_version_is_refused_and_says_which(store: Store) -> None:
+    (store.root / "photonfarm.json").write_text('{"format": "photonfarm store", "version": 99}')
+    with pytest.raises(StoreError, match=r"version 99; this program reads and writes .* version 1"):
+        Store(store.root, create=True)
+
+
+def test_a_store_under_a_file_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot make a store here: Not a directory"):
+        Store(tmp_path / "file" / "store", create=True)
+
+
+def test_a_disk_that_is_full_in_the_middle_is_a_store_error_and_leaves_no_trace(scene: SceneStore) -> None:
+    """A limit on the size of files stands for the full disk: the shard of radiance does not fit."""
+    given = samples.outputs(scene, 0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        with pytest.raises(StoreError, match="cannot commit job 0: File too large"):
+            scene.commit(0, given, samples.FIGURES)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert list((scene.folder / "tmp").iterdir()) == []
+    assert scene.commit(0, given, samples.FIGURES)
+    assert reader_of(scene).read(0).radiance.shape == (2, 8, 8, 3)
+
+
+def test_a_commit_that_the_disk_refuses_is_a_store_error_and_leaves_the_job_missing(scene: SceneStore) -> None:
+    given = samples.outputs(scene, 0)
+    (scene.folder / "tmp").rename(scene.folder / "elsewhere")
+    (scene.folder / "tmp").write_text("a file where the folder should be")
+    with pytest.raises(StoreError, match="cannot commit job 0"):
+        scene.commit(0, given, samples.FIGURES)
+    (scene.folder / "tmp").unlink()
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert scene.commit(0, given, samples.FIGURES)

@@ -1,0 +1,116 @@
+"""Bytes that are not what was committed are never returned, and the error names the file."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneStore:
+    store = Store(tmp_path / "store", create=True)
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=4), shard_rows=4).scene_id)
+    given = samples.outputs(scene, 0)
+    given.radiance[3][0, 0, 0, 0] = 1e9  # one row in radiance_wide
+    scene.commit(0, given, samples.FIGURES)
+    scene.write_base(*samples.base())
+    return scene
+
+
+def read_everything(scene: SceneStore) -> None:
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    for row in reader.refresh():
+        reader.read(int(row))
+        reader.read_photons(int(row))
+    reader.base()
+
+
+def shard(scene: SceneStore, name: str) -> Path:
+    (path,) = (scene.folder / "plans/000000" / name).glob("c.0*")
+    return path
+
+
+OUTPUTS = ("radiance", "radiance_wide", "depth", "albedo", "normal", "photon_position", "photon_power", "photon_bounce")
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_any_flipped_bit_of_a_shard_is_found(scene: SceneStore, name: str) -> None:
+    path = shard(scene, name)
+    whole = path.read_bytes()
+    for place in range(0, len(whole), max(1, len(whole) // 40)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        with pytest.raises(CorruptError, match=f"{name}/c.0"):
+            read_everything(scene)
+    path.write_bytes(whole)
+    read_everything(scene)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 0.5, -1])
+def test_a_cut_shard_is_found(scene: SceneStore, keep: float) -> None:
+    path = shard(scene, "radiance")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(keep * len(whole)) if keep == 0.5 else int(keep)])
+    with pytest.raises(CorruptError, match=str(path)):
+        read_everything(scene)
+
+
+@pytest.mark.parametrize("name", ["radiance", "depth", "photon_power"])
+def test_a_missing_shard_of_a_committed_job_is_found(scene: SceneStore, name: str) -> None:
+    shard(scene, name).unlink()
+    with pytest.raises(CorruptError, match=name):
+        read_everything(scene)
+
+
+@pytest.mark.parametrize("name", ["modification", "view", "sample_modification", "sample_view", "sample_key"])
+def test_a_flipped_bit_in_a_plans_inputs_is_found(scene: SceneStore, name: str) -> None:
+    path = shard(scene, name)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(CorruptError, match="000000"):
+        read_everything(scene)
+
+
+def test_a_flipped_bit_in_the_base_is_found(scene: SceneStore) -> None:
+    path = next((scene.folder / "base/cloud/position").glob("c.*"))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:20] + bytes([whole[20] ^ 1]) + whole[21:])
+    with pytest.raises(CorruptError, match="base"):
+        read_everything(scene)
+
+
+def test_a_spec_that_was_changed_in_place_is_found(scene: SceneStore) -> None:
+    file = scene.folder / "spec.json"
+    file.write_text(file.read_text().replace('"half_spp": 4', '"half_spp": 5'))
+    with pytest.raises(CorruptError, match=r"spec\.json: has scene id"):
+        read_everything(scene)
+
+
+def test_a_marker_of_a_job_that_no_plan_has_makes_nothing_complete(scene: SceneStore) -> None:
+    (scene.folder / "committed/000000000007.json").write_text("{}")
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    assert reader.refresh().tolist() == [0, 1, 2, 3]
+    assert scene.missing_jobs() == []
+
+
+def test_files_without_a_marker_are_not_samples_and_damaged_ones_are_replaced_by_the_next_commit(
+    scene: SceneStore,
+) -> None:
+    marker = scene.folder / "committed/000000000000.json"
+    marker.unlink()
+    assert SceneReader(scene.folder.parent.parent, scene.scene_id).refresh().size == 0
+    path = shard(scene, "depth")
+    whole = path.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:5] + b"?" + whole[6:]):
+        path.write_bytes(damaged)
+        scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+        assert path.read_bytes() == whole
+        read_everything(scene)
+        marker.unlink()

@@ -14,6 +14,17 @@ from photonfarm.shared.errors import SpecError
 BUILTIN_REVISION = 1
 """Raised whenever a built-in room changes, as its content is code and not a file."""
 
+_CORNELL = "floor ceiling back-wall left-wall right-wall tall-block short-block ceiling-light"
+_ROOM = """
+    floor ceiling wall-back wall-front wall-left wall-right skirting door painting-frame painting rug
+    table-wood table-bowl chair-1-wood chair-1-cushion chair-2-wood chair-2-cushion sofa-fabric sofa-pillows sofa-feet
+    shelf-wood shelf-books-red shelf-books-blue shelf-books-cream lamp-stand lamp-shade
+    pedestal-stone pedestal-ball mirror-frame mirror-glass vase-copper ceiling-light-1 ceiling-light-2
+"""
+
+BUILTIN_SHAPES = {"cornell": frozenset(_CORNELL.split()), "room": frozenset(_ROOM.split())}
+"""The shape ids of the built-in rooms, said here so that a spec can be checked without Mitsuba."""
+
 _UNSUPPORTED = {
     "medium": "participating media are not supported; only surfaces are",
     "phase": "participating media are not supported; only surfaces are",
@@ -25,6 +36,8 @@ _UNSUPPORTED_BSDFS = {
     "retarder": "polarisation is not supported",
     "circular": "polarisation is not supported",
 }
+_SHAPES = ("obj", "ply", "serialized", "rectangle", "cube", "sphere", "disk", "cylinder")
+"""Shapes with a base point cloud; instances and curves have none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +74,8 @@ def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
         reason = _UNSUPPORTED.get(node.tag)
         if node.tag == "bsdf":
             reason = _UNSUPPORTED_BSDFS.get(node.get("type", ""))
+        if node.tag == "shape" and node.get("type") not in _SHAPES:
+            reason = f"shapes of type {node.get('type')!r} are not supported; only {', '.join(_SHAPES)}"
         if node.tag == "include":
             reason = "included scene files are not supported; join them into one file"
         if reason:

@@ -93,7 +93,7 @@ def bytes_per_sample(spec: SceneSpec) -> int:
     from photonfarm.shared.store.schema import output_arrays
 
     arrays = [array for name, array in output_arrays(spec).items() if name != "radiance_wide"]
-    outputs = sum(int(np.prod(array.row_shape)) * array.dtype.itemsize for array in arrays)
+    outputs = sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in arrays)
     return outputs + 16 * len(spec.groups) + 24  # and the modification vector and the view
 
 

@@ -53,9 +53,7 @@ class Camera:
         right = np.cross(forward, upright(view, spec.view))
         right = _unit(right)
         focal_px = 0.5 * spec.film.width / np.tan(0.5 * np.radians(spec.view.fov_deg))
-        return cls(
-            origin, right, np.cross(forward, right), forward, float(focal_px), spec.film.width, spec.film.height
-        )
+        return cls(origin, right, np.cross(forward, right), forward, float(focal_px), spec.film.width, spec.film.height)
 
     @property
     def world_to_camera(self) -> NDArray[np.float64]:

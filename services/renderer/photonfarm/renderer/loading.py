@@ -1,0 +1,88 @@
+"""From a scene spec to a Mitsuba scene: the file or built-in room, with the lights that the spec adds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from photonfarm.renderer import rooms
+from photonfarm.renderer.bdpt.scenes import check_scene
+from photonfarm.renderer.rooms.shapes import rectangle_light
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.scene import SceneSpec, find_scene
+from photonfarm.shared.scene_files import SceneFile
+
+
+def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
+    """The Mitsuba scene of a spec; its cameras, films and integrators are left aside, as the spec has its own.
+
+    Shapes stay apart (`optimize=False`), as single objects could not be moved otherwise. Raises SpecError for a file
+    that is not there, that changed since the spec was read, or that Mitsuba or the integrator cannot take.
+    """
+    scene = _builtin(spec) if spec.scene.builtin else _from_file(spec, beside)
+    try:
+        check_scene(scene)
+    except ValueError as error:
+        raise SpecError(f"{spec.name}: {error}") from error
+    return scene
+
+
+def _builtin(spec: SceneSpec) -> Any:
+    shapes = rooms.describe(str(spec.scene.builtin))
+    return mi.load_dict({"type": "scene", **shapes, **_added_lights(spec)}, optimize=False)
+
+
+def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
+    file = SceneFile.read(find_scene(str(spec.scene.file), spec.name, beside))
+    if file.digest != spec.content:
+        raise SpecError(
+            f"{spec.name}: {file.path} or a file it names is not what the spec was made from; load the spec anew"
+        )
+    try:
+        with _threads_to_read_with():
+            scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
+    except (RuntimeError, ValueError) as error:
+        raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
+    added = _added_lights(spec)
+    return mi.load_dict({"type": "scene", **_parts(scene), **added}, optimize=False) if added else scene
+
+
+@contextmanager
+def _threads_to_read_with() -> Iterator[None]:
+    """Two threads at least: the decoder of OpenEXR files waits for ever in a pool of one."""
+    count = dr.thread_count()
+    dr.set_thread_count(max(count, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
+
+
+def _parts(scene: Any) -> dict[str, Any]:
+    """The loaded shapes of a scene, and its lights that are no shapes."""
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    lights = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    return {**shapes, **{f"light-without-shape-{i}": light for i, light in enumerate(lights)}}
+
+
+def _added_lights(spec: SceneSpec) -> dict[str, Any]:
+    return {
+        light.name: rectangle_light(light.at, light.rectangle.size, spec.view.up, light.rectangle.radiance)
+        for light in spec.lights
+        if light.rectangle is not None
+    }
+
+
+def _sentence(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def lower_corner(shapes: list[Any]) -> Any:
+    """The lower corner (3,) of the shapes' common bounding box."""
+    return np.min([[shape.bbox().min[i] for i in range(3)] for shape in shapes], axis=0).astype(np.float32)

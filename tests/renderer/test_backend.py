@@ -1,0 +1,78 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from photonfarm.renderer import backend
+from photonfarm.shared.errors import BackendError
+
+LOAD = "from photonfarm.renderer import backend; print(backend.load(1).variant())"
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **environment}
+    )
+
+
+def library(root: Path, name: str) -> Path:
+    path = root / "lib" / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"no library")
+    return path
+
+
+def test_mitsuba_is_loaded_with_the_plugin_registered() -> None:
+    mi = backend.load(1)
+    assert mi.variant() == backend.DEFAULT_VARIANT
+    assert mi.load_dict({"type": "bdpt"}).class_name()
+    assert backend.load() is mi
+
+
+def test_a_libllvm_that_is_not_there_is_one_sentence_that_says_what_to_install() -> None:
+    done = run(LOAD, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM.so")
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert "BackendError: DRJIT_LIBLLVM_PATH = '/nowhere/libLLVM.so' cannot be opened" in last
+    assert "libllvm19" in last
+
+
+def test_an_unknown_variant_is_refused_with_those_that_exist() -> None:
+    done = run(LOAD, PHOTONFARM_VARIANT="llvm_rgb")
+    assert "BackendError: PHOTONFARM_VARIANT = 'llvm_rgb' is not a variant" in done.stderr
+    assert "llvm_ad_rgb" in done.stderr
+
+
+def test_a_variant_that_the_integrator_cannot_use_is_refused() -> None:
+    done = run(LOAD, PHOTONFARM_VARIANT="scalar_rgb")
+    assert "BackendError: photonfarm.renderer.bdpt cannot be imported" in done.stderr
+
+
+def test_versions_that_crash_are_not_chosen_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(backend.LLVM_VARIABLE, raising=False)
+    for name in ("libLLVM-15.so", "libLLVM-16.so", "libLLVM.so.16.0", "libLLVM.so.190"):
+        library(tmp_path, name)
+    with pytest.raises(BackendError, match=r"no libLLVM of version 19 or 22 is installed; install LLVM 19 .*libllvm19"):
+        backend.find_llvm([tmp_path])
+
+
+@pytest.mark.parametrize(
+    "name", ["libLLVM-19.so", "libLLVM.so.19.1", "libLLVM-19.so.1", "libLLVM-22.so", "libLLVM.so.22.1"]
+)
+def test_versions_that_work_are_found_by_each_of_their_names(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(backend.LLVM_VARIABLE, raising=False)
+    found = library(tmp_path, name)
+    with pytest.raises(BackendError, match=f"{found} cannot be opened"):  # as it is no library, but it was looked at
+        backend.find_llvm([tmp_path])
+
+
+def test_dr_jit_without_libatomic_is_explained(tmp_path: Path) -> None:
+    (tmp_path / "drjit").mkdir()
+    (tmp_path / "drjit/__init__.py").write_text("detail.missing\n")  # what `import drjit` comes to without libatomic
+    done = run(f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {LOAD}")
+    assert "BackendError" in done.stderr
+    assert "libatomic1" in done.stderr

@@ -1,0 +1,109 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.renderer import backend
+from photonfarm.renderer.gbuffer import view_buffers
+from photonfarm.shared.records import ViewBuffers
+from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.view import Camera, View
+
+COLOUR = (0.2, 0.4, 0.6)
+DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(COLOUR)}}
+RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.1, 0.1]}}
+AHEAD = View(np.array([0, 0, 3], np.float32), np.array([0, 0, 0], np.float32))
+BEHIND = View(np.array([0, 0, -3], np.float32), np.array([0, 0, 0], np.float32))
+
+
+def spec(near: float = 0.01, far: float = 100) -> SceneSpec:
+    point = {"min": [-1, -1, -1], "max": [1, 1, 1]}
+    return parse_spec(
+        {
+            "name": "buffers",
+            "scene": {"builtin": "cornell"},
+            "view": {"origin": point, "look_at": point, "fov_deg": 60, "near": near, "far": far},
+            "film": {"width": 24, "height": 16},
+        },
+        where="test",
+    )
+
+
+def of(bsdf: dict[str, Any], view: View = AHEAD, shape: str = "rectangle", **limits: float) -> ViewBuffers:
+    """A shape at the origin, ±1 across, facing +z."""
+    mi = backend.load(1)
+    scene = mi.load_dict({"type": "scene", "shape": {"type": shape, "bsdf": bsdf}}, optimize=False)
+    return view_buffers(scene, view, spec(**limits))
+
+
+def centre(image: np.ndarray) -> np.ndarray:
+    return image[8, 12]
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "albedo"),
+    [
+        (DIFFUSE, COLOUR),
+        ({"type": "roughplastic", "diffuse_reflectance": DIFFUSE["reflectance"]}, COLOUR),
+        ({"type": "plastic", "diffuse_reflectance": DIFFUSE["reflectance"]}, COLOUR),
+        ({"type": "twosided", "bsdf": DIFFUSE}, COLOUR),
+        ({"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.1}}, (0, 0, 0)),
+        ({"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}, COLOUR),
+        ({"type": "principled", "base_color": DIFFUSE["reflectance"], "metallic": 0.5}, COLOUR),
+        ({"type": "bumpmap", "texture": {"type": "checkerboard"}, "bsdf": DIFFUSE}, COLOUR),
+        ({"type": "dielectric"}, (0, 0, 0)),
+        ({"type": "roughdielectric"}, (0, 0, 0)),
+        ({"type": "thindielectric"}, (0, 0, 0)),
+        ({"type": "conductor"}, (0, 0, 0)),
+        ({"type": "roughconductor", "alpha": 0.05}, (0, 0, 0)),
+        ({"type": "null"}, (0, 0, 0)),
+    ],
+    ids=lambda value: value["type"] if isinstance(value, dict) else "",
+)
+def test_albedo_is_the_diffuse_reflectance(bsdf: dict[str, Any], albedo: tuple[float, ...]) -> None:
+    buffers = of(bsdf)
+    np.testing.assert_allclose(centre(buffers.albedo), albedo, atol=1e-6)
+    assert centre(buffers.depth) == pytest.approx(3, abs=1e-5)
+
+
+def test_a_texture_is_looked_up_where_the_ray_hits() -> None:
+    black, white = {"type": "rgb", "value": [0, 0, 0]}, {"type": "rgb", "value": [1, 1, 1]}
+    checks = {"type": "checkerboard", "color0": black, "color1": white}
+    albedo = of({"type": "diffuse", "reflectance": checks}).albedo
+    assert set(np.unique(albedo[6:10, 10:14])) == {0, 1}
+
+
+def test_a_two_sided_surface_shows_its_back_and_the_normal_as_modelled() -> None:
+    bsdf = {"type": "twosided", "front": DIFFUSE, "back": RED}
+    front, back = of(bsdf), of(bsdf, BEHIND)
+    np.testing.assert_allclose(centre(front.albedo), COLOUR, atol=1e-6)
+    np.testing.assert_allclose(centre(back.albedo), (0.9, 0.1, 0.1), atol=1e-6)
+    np.testing.assert_array_equal(centre(front.normal), (0, 0, 1))
+    np.testing.assert_array_equal(centre(back.normal), (0, 0, 1))
+
+
+def test_a_ray_that_hits_nothing_gives_zeros() -> None:
+    buffers = of(DIFFUSE, View(np.array([0, 0, 3], np.float32), np.array([0, 0, 9], np.float32)))
+    for image in (buffers.depth, buffers.albedo, buffers.normal):
+        assert not image.any()
+
+
+@pytest.mark.parametrize("limits", [{"near": 3.5}, {"far": 2.5}])
+def test_what_lies_outside_the_clip_planes_is_not_seen(limits: dict[str, float]) -> None:
+    assert not of(DIFFUSE, **limits).depth.any()
+
+
+def test_depth_is_along_the_axis_and_leads_back_to_the_surface() -> None:
+    """A plane across the axis has one depth; on a sphere, origin + ray · depth / (ray · forward) has radius 1."""
+    flat = of(DIFFUSE).depth
+    np.testing.assert_allclose(flat[flat > 0], 3, atol=1e-5)
+    view = View(np.array([1.5, 1.2, 2.0], np.float32), np.array([0.1, 0, 0], np.float32))
+    ball = of(DIFFUSE, view, "sphere")
+    camera = Camera.of(view, spec())
+    rays = camera.rays().astype(np.float64)
+    hit = camera.origin + rays * (ball.depth / (rays @ camera.forward))[..., None]
+    seen = ball.depth > 0
+    assert 0.1 < seen.mean() < 0.9
+    np.testing.assert_allclose(np.linalg.norm(hit[seen], axis=-1), 1, atol=1e-4)
+    np.testing.assert_allclose(ball.normal[seen], hit[seen], atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(ball.normal[seen], axis=-1), 1, atol=1e-3)

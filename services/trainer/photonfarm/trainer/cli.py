@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from photonfarm.shared.cli import store_option
+from photonfarm.shared.cli import json_option, store_option
 
 run_option = click.option(
     "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
@@ -48,8 +49,10 @@ def train(spec: str | None, store: Path, run: Path, preset: str, check: bool, **
 @store_option
 @run_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
-def report(store: Path, run: Path, out: Path) -> None:
+@json_option
+def report(store: Path, run: Path, out: Path, as_json: bool) -> None:
     """Write report.html and report.json: what was learned, at which cost, with pictures."""
     from photonfarm.trainer.report import write_report
 
-    click.echo(write_report(store, run, out))
+    figures = write_report(store, run, out)
+    click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")

@@ -1,0 +1,70 @@
+"""Held-out error with the noise removed, and the predictors it is measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from photonfarm.shared.estimate import Estimate, clean_error, noise_floor
+from photonfarm.shared.records import F32
+from photonfarm.trainer.dataset import Batch
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.model import Cnn
+
+Predictor = Callable[[Batch], F32]
+"""A batch's images, (B, H, W, 3), linear radiance × exposure."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Errors over held-out samples, in squared exposed radiance per channel."""
+
+    error: Estimate  # against the clean image
+    floor: float  # noise of the target: what the error against it would show on top
+    per_sample: NDArray[np.float64]  # (n,) clean error of each
+
+
+def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
+    """The rows as batches, read through the feed, in their order."""
+    for start in range(0, len(rows), size):
+        feed.ask(rows[start : start + size])
+        yield feed.take()
+
+
+def network_predictor(network: Cnn) -> Predictor:
+    """The network's images."""
+    device = next(network.parameters()).device
+
+    @torch.no_grad()
+    def predict(batch: Batch) -> F32:
+        images: F32 = network(batch.to(device).inputs).cpu().numpy()
+        return images
+
+    return predict
+
+
+def mean_colour(found: Iterator[Batch]) -> F32:
+    """The mean exposed colour over samples and pixels, (3,): what one predicts who knows nothing of the view."""
+    means = [batch.target.double().mean(dim=(1, 2, 3)).numpy() for batch in found]
+    colour: F32 = np.concatenate(means).mean(axis=0).astype(np.float32)
+    return colour
+
+
+def constant_predictor(colour: F32) -> Predictor:
+    """The same colour everywhere."""
+    return lambda batch: np.broadcast_to(colour, batch.inputs.albedo.shape)
+
+
+def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
+    """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate]."""
+    errors, floors = [], []
+    for batch in found:
+        for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
+            errors.append(clean_error(image, half_a, half_b))
+            floors.append(noise_floor(half_a, half_b))
+    per_sample = np.array(errors)
+    return HeldOut(Estimate.of(per_sample), float(np.mean(floors)), per_sample)

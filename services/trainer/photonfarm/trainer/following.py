@@ -1,0 +1,138 @@
+"""The stream of training batches from a store that grows, at a pace that its growth allows."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from photonfarm.trainer.dataset import Batch
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.sampler import RoundSampler
+from photonfarm.trainer.settings import TrainSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """What arrived and when: with the seed, all that the order of training depends on."""
+
+    rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
+    log: list[tuple[int, int]] = field(default_factory=list)  # (batches drawn by then, rows that had arrived)
+
+    def visible(self, drawn: int) -> int | None:
+        """How many rows had arrived when batch `drawn` was drawn; None past the log's end."""
+        if not self.log or drawn > self.log[-1][0]:
+            return None
+        place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
+        return self.log[place - 1][1] if place else 0
+
+
+class Following:
+    """Draws batches ahead of training; they are read meanwhile. A `script` repeats the growth of an earlier run."""
+
+    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None) -> None:
+        self._feed, self._settings = feed, settings
+        self._script = script or Growth()
+        self._sampler = RoundSampler(settings.seed, settings.catch_up)
+        self._waiting: dict[int, bool] = {}  # arrived, not yet visible: row → held out
+        self._known: set[int] = set()
+        self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
+        self._complete = False
+        self.growth = Growth()
+        self.held_out: list[int] = []
+        self.drawn = 0  # batches
+
+    @property
+    def training_rows(self) -> list[int]:
+        """The visible rows that are trained on, in order of arrival."""
+        return self._sampler.rows
+
+    @property
+    def complete(self) -> bool:
+        """True once everything that is planned has arrived."""
+        return self._complete
+
+    def look(self) -> None:
+        """Make visible what has arrived, or of it what the script says."""
+        rows, self._complete = self._feed.arrivals()
+        self._waiting.update((row, held) for row, held in rows if row not in self._known)
+        scripted = self._script.visible(self.drawn)
+        if scripted is None:
+            self._show(list(self._waiting))
+        else:
+            due = self._script.rows[len(self.growth.rows) : scripted]
+            self._show(due if all(row in self._waiting for row in due) else [])
+
+    def _show(self, rows: list[int]) -> None:
+        if not rows:
+            return
+        held = {row: self._waiting.pop(row) for row in rows}
+        self._known.update(rows)
+        self.growth.rows.extend(rows)
+        self.growth.log.append((self.drawn, len(self.growth.rows)))
+        self.held_out.extend(row for row in rows if held[row])
+        self._sampler.add([row for row in rows if not held[row]])
+
+    def may_draw(self) -> bool:
+        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and enough to begin with.
+
+        Neither holds back once everything planned has arrived. A script is followed as it is.
+        """
+        scripted = self._script.visible(self.drawn)
+        if scripted is not None:
+            return scripted == len(self.growth.rows)
+        arrived, s = len(self.training_rows), self._settings
+        if self._complete:
+            return arrived > 0
+        draws = (self.drawn + 1) * s.batch
+        return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
+
+    def draw_ahead(self, until: int) -> bool:
+        """Draw and ask for batches, up to `prefetch` ahead and batch number `until`; False if there is none to take."""
+        while len(self._asked) < self._settings.prefetch and self.drawn < until:
+            self.look()
+            if not self.may_draw():
+                break
+            rows = self._sampler.draw(self._settings.batch)
+            self._asked.append(rows)
+            self._feed.ask(rows)
+            self.drawn += 1
+        return bool(self._asked)
+
+    def take(self) -> Batch:
+        """The next batch drawn, read."""
+        batch = self._feed.take()
+        self._asked.popleft()
+        return batch
+
+    def drop(self) -> None:
+        """Let go of the batches that were read ahead, so that something else can be read."""
+        for _ in self._asked:
+            self._feed.take()
+
+    def ask_again(self) -> None:
+        """Have the batches that were let go read again."""
+        for rows in self._asked:
+            self._feed.ask(rows)
+
+    def state(self) -> dict[str, Any]:
+        """What is to be restored for the same batches to follow."""
+        return {
+            "sampler": self._sampler.state(),
+            "asked": [list(rows) for rows in self._asked],
+            "drawn": self.drawn,
+            "arrived": list(self.growth.rows),
+            "growth": [list(entry) for entry in self.growth.log],
+            "held_out": list(self.held_out),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._sampler.restore(state["sampler"])
+        self._asked = deque(tuple(rows) for rows in state["asked"])
+        self.drawn = state["drawn"]
+        self.growth = Growth(list(state["arrived"]), [(drawn, n) for drawn, n in state["growth"]])
+        self.held_out = list(state["held_out"])
+        self._known = set(self.growth.rows)
+        self.ask_again()

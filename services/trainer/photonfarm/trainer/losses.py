@@ -1,0 +1,39 @@
+"""What is minimised. Both losses are unbiased under noisy targets, and every change here must keep them so.
+
+Nothing may be clipped, compressed, or weighted by the target: each moves the minimum away from the clean image. Shape
+letters: B batch, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+RELATIVE_EPSILON = 1.0
+"""Squared exposed radiance: what is darker than the display's white counts about as in the linear loss."""
+
+
+def linear_loss(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean squared error in exposed linear radiance against both half-estimates: (B, H, W, 3), (B, 2, H, W, 3) → ().
+
+    Its gradient is that of the error against (A + B)/2, and so in expectation that of the error against the clean image
+    [supplement Lemma 1]. Nothing may be clipped, compressed or weighted by the target here: each would bias it.
+    """
+    return torch.mean((prediction[:, None] - target) ** 2)
+
+
+def relative_loss(prediction: Tensor, target: Tensor) -> Tensor:
+    """The same error relative to the brightness of the prediction, which no gradient passes through.
+
+    Each pixel's weight 1 / (mean² + ε) is the network's own and not the target's, so the noise cannot bend it: in
+    expectation the gradient is the one with the clean image and the same weights (Lehtinen et al., Noise2Noise, 2018;
+    detached as in Müller et al., Real-time Neural Radiance Caching, 2021). A lamp in view, hundreds of times brighter
+    than what it lights, no longer outweighs everything else. Ours, and not what the supplement trained with.
+    """
+    brightness = prediction.detach().mean(dim=-1, keepdim=True)
+    return torch.mean((prediction[:, None] - target) ** 2 / (brightness**2 + RELATIVE_EPSILON)[:, None])
+
+
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"linear": linear_loss, "relative": relative_loss}

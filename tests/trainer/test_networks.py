@@ -1,0 +1,145 @@
+"""The layers and the network: sizes, invariances, masks."""
+
+import pytest
+import torch
+from torch.nn import functional
+
+from photonfarm.trainer.dataset import Batch, Compact, fill
+from photonfarm.trainer.image_synthesis import ImageSynthesisLayer
+from photonfarm.trainer.light_transport import LightTransportLayer, ResidualBlock, masked_max
+from photonfarm.trainer.model import SceneFrame, build
+from photonfarm.trainer.settings import NetworkSettings
+
+
+def parameters(module: torch.nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def layer(seed: int = 0) -> LightTransportLayer:
+    """A layer whose last weights are not zero, unlike at the start."""
+    torch.manual_seed(seed)
+    made = LightTransportLayer(3, 6)
+    for block in made.blocks:
+        torch.nn.init.normal_(block.out.weight)
+        torch.nn.init.normal_(block.out.bias)
+    return made
+
+
+def as_drawn(made: LightTransportLayer, points: torch.Tensor, visible: torch.Tensor) -> torch.Tensor:
+    """Figure 1 taken literally: every point carries its features and the maximum, 64 wide, into the next block."""
+    x = made.preprocess(points)
+    for block in made.blocks:
+        hidden = block.hidden(functional.relu(x))
+        local = block.shortcut(x) + block.out(functional.relu(hidden))
+        maximum = local.masked_fill(~visible[..., None], -torch.inf).amax(dim=1, keepdim=True)
+        x = torch.cat([local, maximum.expand_as(local)], dim=2)
+    return x
+
+
+def test_the_image_synthesis_layer_has_the_published_size() -> None:
+    assert parameters(ImageSynthesisLayer(64 + 10, 64)) == 11_734_467  # 11.7 M
+
+
+def test_the_light_transport_layer_is_the_one_of_figure_1() -> None:
+    made = layer()
+    assert parameters(made) == (9 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
+    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    found = made(varying, fixed, visible)
+    assert found.shape == (2, 50, 64)
+    torch.testing.assert_close(found, as_drawn(made, torch.cat([varying, fixed.expand(2, -1, -1)], dim=2), visible))
+
+
+def test_a_residual_block_starts_as_its_shortcut() -> None:
+    block = ResidualBlock()
+    local, shared = torch.randn(2, 5, 32), torch.randn(2, 32)
+    both = torch.cat([local, shared[:, None].expand_as(local)], dim=2)
+    torch.testing.assert_close(block(local, shared), functional.linear(both, block.shortcut.weight))
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    made, order = layer(), torch.randperm(50)
+    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    shuffled = made(varying[:, order], fixed[order], visible[:, order])
+    torch.testing.assert_close(shuffled, made(varying, fixed, visible)[:, order])
+
+
+def test_invisible_points_never_leak_into_visible_ones() -> None:
+    made = layer()
+    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    louder = torch.where(visible[..., None], varying, 1e4)  # would win every maximum
+    assert torch.equal(made(louder, fixed, visible)[visible], made(varying, fixed, visible)[visible])
+
+
+def test_the_maximum_over_no_visible_point_is_zero() -> None:
+    x = torch.randn(2, 5, 4)
+    visible = torch.tensor([[False] * 5, [True, False, True, False, False]])
+    found = masked_max(x, visible)
+    assert torch.equal(found[0], torch.zeros(4))
+    assert torch.equal(found[1], torch.maximum(x[1, 0], x[1, 2]))
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (8, 24)])
+def test_an_image_keeps_its_size_and_may_be_negative(shape: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    image = ImageSynthesisLayer(7, 4)(torch.randn(2, 7, *shape))
+    assert image.shape == (2, 3, *shape)
+    assert image.min() < 0
+
+
+# ------------------------------------------------------------------------------------------------- the whole network
+
+
+def batch_of(source, rows: tuple[int, ...]) -> Batch:
+    _, cloud = source.base()
+    batch = Batch.empty(len(rows), len(cloud.position), source.spec)
+    for place, row in enumerate(rows):
+        fill(batch, place, Compact.of(source.read(row), source.spec), source.spec, cloud)
+    return batch.filled(rows)
+
+
+def network(source, seed: int = 0, **settings: object):
+    chosen = NetworkSettings(width=4, **settings)
+    return build(chosen, SceneFrame.of(source.spec, *source.base(), chosen), seed)
+
+
+def test_the_seed_makes_the_weights_and_leaves_torchs_generator_alone(make_source) -> None:
+    source = make_source(1)
+    before = torch.get_rng_state()
+    one, same, other = (network(source, seed).state_dict() for seed in (0, 0, 1))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not torch.equal(one["descriptor"], other["descriptor"])
+
+
+def test_a_batch_gives_what_its_samples_give_one_by_one(make_source) -> None:
+    source = make_source(3)
+    made = network(source)
+    with torch.no_grad():
+        together = made(batch_of(source, (0, 1, 2)).inputs)
+        alone = torch.cat([made(batch_of(source, (row,)).inputs) for row in range(3)])
+    assert together.shape == (3, 16, 16, 3)
+    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
+
+
+def test_every_weight_of_the_network_gets_a_gradient(make_source) -> None:
+    source = make_source(4)
+    made = network(source)
+    for block in made.light_transport.blocks:
+        torch.nn.init.normal_(block.out.weight)
+    made(batch_of(source, (0, 1, 2, 3)).inputs).square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters())
+
+
+def test_points_beyond_those_used_are_left_out(make_source) -> None:
+    source = make_source(1, points=256)
+    assert network(source, points=100).descriptor.shape == (100, 32)
+
+
+def test_the_network_without_points_does_not_look_at_them(make_source) -> None:
+    source = make_source(2)
+    made = network(source, architecture="cnn")
+    batch = batch_of(source, (0, 1))
+    with torch.no_grad():
+        image = made(batch.inputs)
+        batch.inputs.position.add_(1)
+        assert torch.equal(made(batch.inputs), image)

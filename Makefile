@@ -16,7 +16,7 @@ $(STAMP): constraints.txt $(PROJECTS:%=%/pyproject.toml)
 	@touch $@
 
 demo: $(STAMP)
-	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 2000 --store demo/store --run demo/run --out demo
+	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 3000 --store demo/store --run demo/run --out demo
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

@@ -10,8 +10,7 @@ import pytest
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
-
-@pytest.fixture()
+@pytest.fixture
 def photonfarm(tmp_path: Path) -> Command:
     """Runs the command line in an empty folder, away from any Redis of the machine."""
 
@@ -25,7 +24,7 @@ def photonfarm(tmp_path: Path) -> Command:
     return run
 
 
-@pytest.fixture()
+@pytest.fixture
 def small_room(tmp_path: Path) -> Path:
     """The ready spec `room`, at 16² and with a small cloud: its kernels and its code, at a fraction of its time."""
     import photonfarm.shared

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.slow()
+@pytest.mark.slow
 def test_the_whole_farm_renders_trains_and_reports(photonfarm, tmp_path: Path, small_room: Path) -> None:
     arguments = ("up", small_room, "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
     result = photonfarm(*arguments, timeout=400)

@@ -27,7 +27,7 @@ def compose(*args: str, data: Path, timeout: float = 1500) -> str:
     ).stdout  # fmt: skip
 
 
-@pytest.fixture()
+@pytest.fixture
 def data(tmp_path: Path) -> Iterator[Path]:
     yield tmp_path
     print(compose("logs", "--no-color", "--tail", "30", data=tmp_path))

@@ -16,12 +16,12 @@ def described(**changes: object) -> dict[str, object]:
     return {**DESCRIBED, **changes}
 
 
-@pytest.fixture()
+@pytest.fixture
 def static_spec() -> SceneSpec:
     return parse_spec(described(), where="test")
 
 
-@pytest.fixture()
+@pytest.fixture
 def dynamic_spec(static_spec: SceneSpec) -> SceneSpec:
     """Three objects (one on a line, one on a plane, one in a volume) and a light on a ceiling of zero height."""
     boxes = [((0, 0, 0), (2, 0, 0)), ((-1, 0.5, -1), (1, 0.5, 1)), ((0, 0, 0), (1, 2, 3))]

@@ -10,7 +10,7 @@ from photonfarm.shared.scene import SceneSpec
 COUNT = 4000
 
 
-@pytest.fixture()
+@pytest.fixture
 def sampled(dynamic_spec: SceneSpec) -> list[Modification]:
     return [sample_modification(dynamic_spec, 0, i) for i in range(COUNT)]
 

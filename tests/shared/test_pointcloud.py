@@ -13,7 +13,7 @@ from photonfarm.shared.scene import SceneSpec
 COUNT = 40_000
 
 
-@pytest.fixture()
+@pytest.fixture
 def geometry() -> Geometry:
     """Four shapes of 1, 0 (degenerate), 2 and 3 triangles with interleaved faces and different areas."""
     vertices = np.array(
@@ -65,7 +65,7 @@ def test_first_and_last_shape_are_reachable() -> None:
     assert set(found) == {0, 1, 2}
 
 
-@pytest.fixture()
+@pytest.fixture
 def base() -> BasePointCloud:
     rng = np.random.default_rng(0)
     position = rng.normal(size=(500, 3)).astype(np.float32)

@@ -26,7 +26,7 @@ look_at = { min = [0, 0, 0], max = [1, 1, 1] }
 """
 
 
-@pytest.fixture()
+@pytest.fixture
 def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "scenes"
     (folder / "small/meshes").mkdir(parents=True)
@@ -56,7 +56,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
     ("described", "sentence"),
     [
         (ball(shapes=["Bal"]), r"ball.shapes: 'Bal' is not a shape id of the scene; nearest: Ball"),
-        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"objects.0.box: is inverted along y: min 1.0 is above max 0.0"),
+        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"0.box: is inverted along y: min 1.0 is above max 0.0"),
         (ball(removal_probability=1.5), r"objects.0.removal_probability = 1.5: .* less than or equal to 1"),
         (ball(removal_probability=-0.1), r"objects.0.removal_probability = -0.1: .* greater than or equal to 0"),
         (changed(scene={"file": "none/scene.xml"}), r"scene.file = 'none/scene.xml' is not there .* PHOTONFARM_SCENES"),

@@ -11,7 +11,7 @@ from photonfarm.shared.view import Camera, View, sample_view
 COUNT = 4000
 
 
-@pytest.fixture()
+@pytest.fixture
 def sampled(static_spec: SceneSpec) -> np.ndarray:
     return np.array([sample_view(static_spec, make_key("m", i % 7), 0, i).vector for i in range(COUNT)])
 

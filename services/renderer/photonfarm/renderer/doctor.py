@@ -60,7 +60,8 @@ def _renders() -> str:
     start = time.perf_counter()
     image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
     seconds = time.perf_counter() - start
-    return f"{mi.variant()}: bdpt rendered {spec.film.width}² pixels of a Cornell box, mean {image.mean():.3f}, in {seconds:.1f} s"
+    size = f"{spec.film.width} × {spec.film.height}"
+    return f"{mi.variant()}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"
 
 
 def _writes(store: Path) -> str:

@@ -33,7 +33,8 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
     spec = reader.spec
     caption = (
         f"{len(reader.rows)} complete samples of scene {spec.scene_id}; {len(shown)} shown. A and B are independent "
-        f"half-estimates of {spec.transport.half_spp} samples per pixel, shown as clip({spec.exposure:g} · I, 0, 1)^(1/2.2)."
+        f"half-estimates of {spec.transport.half_spp} samples per pixel each, shown as "
+        f"clip({spec.exposure:g} · I, 0, 1)^(1/2.2)."
     )
     return _PAGE.format(
         title=html.escape(f"photonfarm: {spec.name}"), caption=caption, head="<th>".join(("", *COLUMNS)), rows=body

@@ -84,13 +84,16 @@ def _wait(look: Callable[[], T], stop: threading.Event) -> T | None:
 @contextmanager
 def _sign_of_life(folder: Path) -> Iterator[None]:
     """Touch a file now and then, from a thread of its own, for `check`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ALIVE_FILE).touch()
+    except OSError as error:
+        raise StoreError(f"{folder}: the folder of the training run cannot be written: {error.strerror}") from error
     ended = threading.Event()
 
     def touch() -> None:
-        while not ended.is_set():
+        while not ended.wait(ALIVE_S / 4):
             (folder / ALIVE_FILE).touch()
-            ended.wait(ALIVE_S / 4)
 
     thread = threading.Thread(target=touch, daemon=True)
     thread.start()

@@ -1,0 +1,76 @@
+"""The sensor's side of light tracing, and what of sensor and film this integrator accepts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+SENSORS = ("PerspectiveCamera", "ThinLensCamera")
+
+
+@dataclass(slots=True)
+class SensorSample:
+    """The lens seen from a surface point."""
+
+    d: Any  # Vector3f: unit direction to the lens
+    position: Any  # Point2f: where the film is hit, in pixels of the whole film
+    weight: Any  # Spectrum: importance/r², normalised over the crop window
+    area_density_over_cos: Any  # Float: p_cam/r², by which primary rays would find the surface, without its cosine
+    start: Any  # Point3f: where primary rays through this film position begin (the near plane)
+    valid: Any  # Bool
+
+
+def check_sensor(sensor: Any, *, light_tracing: bool) -> None:
+    """Raise ValueError for a film filter other than box, a film other than hdrfilm.
+
+    And sensors light paths cannot hit.
+    """
+    film = sensor.film()
+    if not film.rfilter().is_box_filter():
+        raise ValueError(
+            f"bdpt: the film's reconstruction filter is {film.rfilter().class_name()!r}; only the box filter is "
+            f"allowed, because "
+            "any other divides by a random sum of weights, to which light splats do not belong: the image would "
+            "be biased "
+            "(most of all at its border); write <rfilter type='box'/> in the film"
+        )
+    if film.class_name() != "HDRFilm":
+        raise ValueError(
+            f"bdpt: the film is {film.class_name()!r}; only 'hdrfilm' is allowed, because samples and light "
+            f"splats are summed "
+            "in one unnormalised RGB block; use an hdrfilm"
+        )
+    if light_tracing and sensor.class_name() not in SENSORS:
+        raise ValueError(
+            f"bdpt: the sensor is {sensor.class_name()!r}; light paths can be joined to 'perspective' and "
+            f"'thinlens' only, because "
+            "other sensors in Mitsuba have no sample_direction; use one of these, or light_ratio=0 and connections=0"
+        )
+
+
+def primary_importance(sensor: Any, si: Any, aperture: Any, active: Any) -> Any:
+    """p_cam/r² at a first hit (Float), for the point of the aperture its ray came from; 0 outside the crop window."""
+    return sensor.sample_direction(si, aperture, active)[1][0]
+
+
+def sample_sensor(sensor: Any, si: Any, aperture: Any, active: Any) -> SensorSample:
+    """Join a surface point to the lens. Visibility is left to the caller: test the segment from ``si`` to ``start``.
+
+    The segment ends where primary rays begin, so objects before the near plane do not cast shadows and points outside
+    the clipping range are not seen, as is the case for primary rays (``thinlens`` does not check this itself).
+    """
+    film = sensor.film()
+    ds, weight = sensor.sample_direction(si, aperture, active)
+    ray, _ = sensor.sample_ray(0, 0, ds.uv / mi.ScalarVector2f(film.crop_size()), aperture, active)
+    along = dr.dot(si.p - ray.o, ray.d)
+    return SensorSample(
+        d=ds.d,
+        position=ds.uv + mi.ScalarVector2f(film.crop_offset()),
+        weight=weight,
+        area_density_over_cos=weight[0],
+        start=ray.o,
+        valid=active & (weight[0] > 0) & (along > 0) & (along <= ray.maxt),
+    )

@@ -1,0 +1,396 @@
+"""The lights of a scene as data: which light is chosen with what probability, and how a light path starts.
+
+The selection probabilities are arrays in device memory, never literals: they are rebuilt from the scene at the start
+of each render without reading anything back, so a light that is switched off in place (radiance 0) is never chosen and
+no kernel changes.
+
+Mitsuba's ``sample_ray`` has no density and is wrong for rotated environment maps and stale bounding spheres, so
+emission is sampled here by type. In each case the density is e = ê·c with a number ê per light that is known before
+sampling (column ``emission``):
+
+    area                 uniform on the surface, cosine-weighted direction    ê = P/(A·π)             c = cos₀
+    constant, envmap     direction by the light's own density p_ω, disk πR²   ê = P/(πR²)             c = p_ω
+    directional          its direction, disk πR²                              ê = P/(πR²)             c = 1
+    point, projector     uniform on the sphere                                ê = P/(4π)              c = 1
+    spot                 uniform in its cone                                  ê = P/(2π(1 − cos θ))   c = 1
+
+P is the selection probability, A the area, R the radius of a sphere around the scene's *present* bounding box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
+"""How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""
+
+_KIND_BY_CLASS = {
+    "AreaLight": AREA,
+    "ConstantBackgroundEmitter": INFINITE,
+    "EnvironmentMapEmitter": INFINITE,
+    "PointLight": POSITION,
+    "SpotLight": POSITION,
+    "Projector": POSITION,
+    "DirectionalEmitter": DIRECTION,
+}
+_BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
+_FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
+
+
+@dataclass(slots=True)
+class Lights:
+    """The lights of one scene at one moment. N lights.
+
+    Tables "by id" are indexed by Dr.Jit's registry id of the emitter.
+    """
+
+    pointers: Any  # EmitterPtr, N
+    count: int  # N
+    kinds: tuple[int, ...]  # kind of each light, N; fixed while the scene's topology is
+    kind: Any  # UInt32, N: the same as data
+    nee_cdf: Any  # Float, N: running sum of the weights for next event estimation, not normalised
+    nee: Any  # Float, by id: probability of selection for next event estimation
+    emit_cdf: Any  # Float, N: the same for light paths; it differs from nee only where there are EYE_ONLY lights
+    emission: Any  # Float, by id: ê of the table above, 0 where light paths never start
+    axis: Any  # Vector3f, N: axis of a spot light's cone
+    cos_cutoff: Any  # Float, N: −1 for lights that shine everywhere
+    centre: Any  # Point3f, 1: centre of the scene's sphere
+    radius: Any  # Float, 1: its radius
+
+    def only(self, kind: int) -> bool:
+        """Whether every light that can be selected is of this kind: decided on the host.
+
+        So other kinds cost nothing.
+        """
+        return all(k in (kind, HIT_ONLY) for k in self.kinds)
+
+    def has(self, kind: int) -> bool:
+        """Whether there is a light of this kind: decided on the host."""
+        return kind in self.kinds
+
+    def is_kind(self, index: Any, kind: int) -> Any:
+        """Mask (mi.Bool) of the lanes whose light ``index`` is of this kind."""
+        if not self.has(kind):
+            return mi.Bool(False)
+        if self.only(kind):
+            return mi.Bool(True)
+        return dr.gather(mi.UInt32, self.kind, index) == kind
+
+    def nee_probability(self, emitter: Any) -> Any:
+        """Probability of choosing the given emitters for next event estimation (0 for the null pointer)."""
+        return dr.gather(mi.Float, self.nee, dr.reinterpret_array(mi.UInt32, emitter))
+
+    def emission_factor(self, emitter: Any) -> Any:
+        """ê of the given emitters (0 for the null pointer)."""
+        return dr.gather(mi.Float, self.emission, dr.reinterpret_array(mi.UInt32, emitter))
+
+
+# ------------------------------------------------ Reading a scene ------------------------------------------------
+
+
+def read_lights(scene: Any) -> Lights:
+    """The scene's lights as they are now: some small arrays and one small kernel, no host synchronisation."""
+    emitters = list(scene.emitters())
+    n = len(emitters)
+    ids = [_registry_id(emitter) for emitter in emitters]
+    shapes = {_registry_id(shape.emitter()): shape for shape in scene.shapes() if shape.is_emitter()}
+    kinds = tuple(_kind(emitter, shapes.get(key)) for emitter, key in zip(emitters, ids, strict=True))
+    parameters = [mi.traverse(emitter) for emitter in emitters]
+    pointers = scene.emitters_dr()
+    centre, radius = _scene_sphere(scene)
+    kind = mi.UInt32(list(kinds))  # lists: Dr.Jit compiles again for each alignment of numpy's memory
+
+    weights = [_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
+    for i, key in enumerate(ids):
+        if kinds[i] == AREA and shapes[key].is_mesh():
+            weights[i] = dr.select(_is_flat(shapes[key]), weights[i], 0)
+    weight = _column(n, weights)
+    weight = dr.select(kind == HIT_ONLY, 0, weight)
+    emit_weight = dr.select(kind == EYE_ONLY, 0, weight)
+    nee_cdf, nee = _normalise(weight, n)
+    emit_cdf, emit = _normalise(emit_weight, n)
+    axis, cos_cutoff = _cones(parameters, emitters)
+
+    emission = emit / (dr.two_pi * (1 - cos_cutoff))  # positions; π·R² for lights at infinity, A·π for areas
+    emission = dr.select((kind == INFINITE) | (kind == DIRECTION), emit / (dr.pi * dr.square(radius)), emission)
+    if AREA in kinds:
+        area = pointers.get_shape().surface_area()
+        emission = dr.select(kind == AREA, dr.select(area > 0, emit / (area * dr.pi), 0), emission)
+
+    index = mi.UInt32(ids)
+    nee_by_id, emission_by_id = dr.zeros(mi.Float, max(ids) + 1), dr.zeros(mi.Float, max(ids) + 1)
+    dr.scatter(nee_by_id, nee, index)
+    dr.scatter(emission_by_id, emission, index)
+    dr.eval(nee_cdf, nee_by_id, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
+    return Lights(
+        pointers, n, kinds, kind, nee_cdf, nee_by_id, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
+    )  # fmt: skip
+
+
+def _registry_id(emitter: Any) -> int:
+    """Dr.Jit's number of an emitter: a literal, so reading it waits for nothing."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
+
+
+def _kind(emitter: Any, shape: Any) -> int:
+    kind = _KIND_BY_CLASS.get(emitter.class_name(), EYE_ONLY)
+    if kind != AREA:
+        return kind
+    if shape is None:
+        return HIT_ONLY  # on an instanced shape: it can be hit, but has no place of its own to be sampled from
+    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    if textured and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
+        return HIT_ONLY  # Mitsuba's sampling of such a light does not know the surface's texture coordinates
+    return AREA
+
+
+def _is_flat(mesh: Any) -> Any:
+    """Whether a mesh light's vertex normals are its faces' (Bool, 1), as data.
+
+    Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such
+    lights are left to hits, with selection probability 0.
+    """
+    if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
+        return mi.Bool(True)
+    corner = dr.arange(mi.UInt32, mesh.face_count()) * 3
+    faces = mesh.faces_buffer()
+    vertices = [dr.gather(mi.UInt32, faces, corner + k) for k in range(3)]
+    p0, p1, p2 = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), v) for v in vertices)
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    normals = mesh.vertex_normals_buffer()
+    aligned = [dr.abs(dr.dot(normal, dr.gather(mi.Vector3f, normals, v))) for v in vertices]
+    return dr.max(dr.fmax(1 - dr.minimum(dr.minimum(aligned[0], aligned[1]), aligned[2]), 0)) < _FLAT
+
+
+def _weight(emitter: Any, parameters: Any) -> Any:
+    """Weight of selection (Float, 1): the emitter's ``sampling_weight`` while it shines, else 0."""
+    shines = mi.Bool(True)
+    keys = list(parameters.keys())
+    brightness = [key for key in keys if key.startswith(_BRIGHTNESS) and not key.endswith("to_uv")]
+    if brightness:
+        shines = mi.Bool(False)
+        for key in brightness:
+            shines |= _is_positive(parameters[key])
+    if "scale" in parameters:
+        shines &= _is_positive(parameters["scale"])
+    return dr.select(shines, dr.opaque(mi.Float, emitter.sampling_weight()), 0)
+
+
+def _is_positive(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        return mi.Bool(False)
+    if isinstance(value, int | float):
+        return dr.opaque(mi.Float, float(value)) > 0
+    if dr.is_tensor_v(value):
+        return dr.max(value.array) > 0
+    if not (dr.is_array_v(value) and dr.is_float_v(value)):
+        return mi.Bool(False)
+    dr.make_opaque(value)
+    highest = dr.max(value) if dr.depth_v(value) > 1 else value
+    return dr.max(highest) > 0 if dr.width(highest) > 1 else highest > 0
+
+
+def _column(n: int, entries: list[Any]) -> Any:
+    column = dr.zeros(mi.Float, n)
+    places = mi.UInt32(list(range(n)))
+    for i, entry in enumerate(entries):
+        dr.scatter(column, entry, dr.gather(mi.UInt32, places, mi.UInt32(i)))
+    return column
+
+
+def _normalise(weight: Any, n: int) -> tuple[Any, Any]:
+    """(running sum, probabilities) of weights (Float, N). All zero gives zero probabilities."""
+    cdf = dr.cumsum(weight) if n > 1 else weight
+    total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
+    return cdf, dr.select(total > 0, weight / total, 0)
+
+
+def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
+    """Axis and cosine of the cut-off angle of each light; a whole sphere for all but spot lights."""
+    n = len(emitters)
+    if not any(emitter.class_name() == "SpotLight" for emitter in emitters):
+        return mi.Vector3f(*(dr.opaque(mi.Float, x, n) for x in (0, 0, 1))), dr.opaque(mi.Float, -1, n)
+    axes, cosines = [], []
+    for emitter, params in zip(emitters, parameters, strict=True):
+        spot = emitter.class_name() == "SpotLight"
+        axes.append(dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1)) if spot else mi.Vector3f(0, 0, 1))
+        cosines.append(dr.cos(dr.deg2rad(params["cutoff_angle"])) if spot else mi.Float(-1))
+    return mi.Vector3f(*(_column(n, [axis[k] for axis in axes]) for k in range(3))), _column(n, cosines)
+
+
+def _scene_sphere(scene: Any) -> tuple[Any, Any]:
+    """Centre and radius of a sphere around everything, as data.
+
+    Moving an object past the old box recompiles nothing.
+    """
+    box = scene.bbox()
+    if not box.valid() or not scene.shapes():
+        return mi.Point3f(dr.opaque(mi.Float, 0)), dr.opaque(mi.Float, 1)
+    sphere = box.bounding_sphere()
+    radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
+    return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
+
+
+# ------------------------------------------- Next event estimation (y₀ from x)
+# -------------------------------------------
+
+
+@dataclass(slots=True)
+class DirectSample:
+    """A light seen from a surface point."""
+
+    d: Any  # Vector3f: unit direction to the light
+    p: Any  # Point3f: the sampled point of a light with a position
+    at_infinity: Any  # Bool
+    radiance_over_density: Any  # Spectrum: Le/p_NEE
+    density: Any  # Float: p_NEE in solid angle with the selection; the selection alone for delta lights
+    delta: Any  # Bool: no ray can hit this light
+    ratio_over_cos: Any  # Float: e/(p_NEE·cos₀) as in weights.next_event, without cos_x
+    valid: Any  # Bool
+
+
+def choose(lights: Lights, cdf: Any, u: Any) -> Any:
+    """Index of a light (UInt32) by inversion of a running sum: the smallest i with cdf(i) > u·cdf(N−1).
+
+    So never a dead one.
+    """
+    if lights.count == 1:
+        return dr.zeros(mi.UInt32, dr.width(u))
+    target = u * dr.gather(mi.Float, cdf, mi.UInt32(lights.count - 1))
+    return dr.binary_search(0, lights.count - 1, lambda i: dr.gather(mi.Float, cdf, i) <= target)
+
+
+def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSample:
+    """Choose a light and a point of it, as seen from ``si``."""
+    index = choose(lights, lights.nee_cdf, rng.next_float32() if lights.count > 1 else mi.Float(0))
+    emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
+    ds, weight = emitter.sample_direction(si, next_2d(rng), active)
+    selection = lights.nee_probability(emitter)
+    density = selection * ds.pdf
+    valid = active & (density > 0) & (dr.max(weight) > 0)
+
+    at_infinity = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
+    delta = lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION) | ds.delta
+    shape_factor = mi.Float(1)  # e/(ê·cos₀): 1, p_ω or 1/r²
+    shape_factor = dr.select(lights.is_kind(index, INFINITE), ds.pdf, shape_factor)
+    shape_factor = dr.select(lights.is_kind(index, POSITION), dr.rcp(dr.square(ds.dist)), shape_factor)
+    ratio = lights.emission_factor(emitter) * shape_factor / density
+    return DirectSample(
+        d=ds.d,
+        p=ds.p,
+        at_infinity=at_infinity,
+        radiance_over_density=dr.select(valid, weight / selection, 0),
+        density=density,
+        delta=delta,
+        ratio_over_cos=dr.select(valid, ratio, 0),
+        valid=valid,
+    )
+
+
+def hit_densities(scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any, active: Any) -> tuple[Any, Any]:
+    """(p_NEE in solid angle.
+
+    E) with which next event estimation at ``origin`` and emission would have found this hit.
+    """
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p = origin
+    ds = mi.DirectionSample3f(scene, si, reference)
+    p_direction = emitter.pdf_direction(reference, ds, active)
+    factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
+    return lights.nee_probability(emitter) * p_direction, lights.emission_factor(emitter) * factor
+
+
+# ------------------------------------------------ Emission (from y₀) ------------------------------------------------
+
+
+@dataclass(slots=True)
+class Emission:
+    """The start of light paths: a ray and what the weights at the first hit need to know of y₀."""
+
+    ray: Any  # Ray3f
+    throughput: Any  # Spectrum: Le·cos₀/e
+    emitter: Any  # EmitterPtr
+    factor: Any  # Float: ê
+    p_direction: Any  # Float: p_ω of a light at infinity
+    sample: Any  # DirectionSample3f: p, n, uv of y₀ on an area light
+    is_area: Any  # Bool
+    at_infinity: Any  # Bool: INFINITE or DIRECTION
+    delta: Any  # Bool: POSITION or DIRECTION
+    valid: Any  # Bool
+
+
+def sample_emission(lights: Lights, rng: Any, n: int) -> Emission:
+    """Start n light paths."""
+    index = choose(lights, lights.emit_cdf, rng.next_float32() if lights.count > 1 else dr.zeros(mi.Float, n))
+    emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
+    factor = lights.emission_factor(emitter)
+    u_position, u_direction = next_2d(rng), next_2d(rng)
+    out = Emission(
+        ray=dr.zeros(mi.Ray3f, n),
+        throughput=mi.Spectrum(0),
+        emitter=emitter,
+        factor=factor,
+        p_direction=mi.Float(1),
+        sample=dr.zeros(mi.DirectionSample3f, n),
+        is_area=lights.is_kind(index, AREA),
+        at_infinity=lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION),
+        delta=lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION),
+        valid=factor > 0,
+    )
+    if lights.has(AREA):
+        _start_on_area(out, u_position, u_direction, out.valid & out.is_area)
+    if lights.has(INFINITE) or lights.has(DIRECTION):
+        _start_at_infinity(out, lights, u_position, u_direction, out.valid & out.at_infinity)
+    if lights.has(POSITION):
+        _start_at_point(out, lights, index, u_direction, out.valid & lights.is_kind(index, POSITION))
+    out.throughput = dr.select(out.valid, out.throughput / factor, 0)
+    out.valid &= dr.max(out.throughput) > 0
+    return out
+
+
+def _start_on_area(out: Emission, u_position: Any, u_direction: Any, mask: Any) -> None:
+    ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
+    si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
+    si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
+    out.throughput[mask] = out.emitter.eval(si, mask)
+    out.ray = dr.select(mask, si.spawn_ray(si.to_world(si.wi)), out.ray)
+    out.sample = mi.DirectionSample3f(ps)
+
+
+def _start_at_infinity(out: Emission, lights: Lights, u_position: Any, u_direction: Any, mask: Any) -> None:
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p = lights.centre
+    ds, weight = out.emitter.sample_direction(reference, u_direction, mask)
+    disk = mi.warp.square_to_uniform_disk_concentric(u_position)
+    offset = mi.Frame3f(ds.d).to_world(mi.Vector3f(disk.x, disk.y, 1))
+    ray = mi.Ray3f(lights.centre + lights.radius * offset, -ds.d)
+    out.throughput[mask] = weight
+    out.ray = dr.select(mask, ray, out.ray)
+    out.p_direction[mask] = ds.pdf
+
+
+def _start_at_point(out: Emission, lights: Lights, index: Any, u: Any, mask: Any) -> None:
+    axis, cos_cutoff = dr.gather(mi.Vector3f, lights.axis, index), dr.gather(mi.Float, lights.cos_cutoff, index)
+    cos_theta = 1 - u.x * (1 - cos_cutoff)
+    sin_theta = dr.safe_sqrt(1 - dr.square(cos_theta))
+    sin_phi, cos_phi = dr.sincos(dr.two_pi * u.y)
+    d = mi.Frame3f(axis).to_world(mi.Vector3f(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta))
+    reference = dr.zeros(mi.Interaction3f)
+    reference.p = lights.centre
+    position = out.emitter.sample_direction(reference, mi.Point2f(0.5), mask)[0].p
+    reference.p = dr.fma(
+        d, lights.radius, position
+    )  # the light's intensity along d is what this point receives, times r²
+    ds, weight = out.emitter.sample_direction(reference, mi.Point2f(0.5), mask)
+    out.throughput[mask] = weight * dr.square(ds.dist)
+    out.ray = dr.select(mask, mi.Ray3f(position, d), out.ray)
+
+
+def next_2d(rng: Any) -> Any:
+    """Two uniform numbers in [0, 1) as a Point2f."""
+    first = rng.next_float32()
+    return mi.Point2f(first, rng.next_float32())

@@ -1,0 +1,282 @@
+"""Eye sub-paths: from the lens into the scene, with hits of lights (s=0), next event estimation.
+
+(s=1) and connections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from . import weights
+from .camera import primary_importance
+from .emission import Lights, hit_densities, next_2d, sample_direct
+from .light_paths import LightVertices, PathOptions
+from .loops import traced_once
+
+_MAX_THROUGHPUT_KEPT = 0.95
+
+
+@dataclass(slots=True)
+class EyeState:
+    """Loop variables of an eye path."""
+
+    active: Any  # Bool: this path goes on
+    rng: Any  # PCG32
+    ray: Any  # Ray3f: to the next vertex
+    throughput: Any  # Spectrum
+    radiance: Any  # Spectrum: the estimate so far
+    eta: Any  # Float: product of relative refractive indices, for Russian roulette
+    dvcm: Any  # Float: see weights.py
+    dvc: Any  # Float
+    depth: Any  # UInt32: edges so far
+    hit: Any  # Bool: the first ray hit something (alpha)
+
+
+@dataclass(slots=True)
+class Connectable:
+    """Light vertices, and which of them this pass's eye paths are joined to."""
+
+    vertices: LightVertices
+    seen: Any  # UInt32: number each was drawn from
+    paths: Any  # UInt32, 1: how many there are
+    pairing: Any  # UInt32, 1: seed of the shifts
+
+
+def trace_eye_paths(
+    scene: Any,
+    sensor: Any,
+    lights: Lights | None,
+    options: PathOptions,
+    *,
+    rng: Any,
+    ray: Any,
+    weight: Any,
+    aperture: Any,
+    connectable: Connectable | None,
+) -> tuple[Any, Any]:
+    """(radiance: Spectrum, whether the first ray hit anything: Bool) of eye paths that start with ``ray``."""
+    n = dr.width(ray)
+    state = EyeState(
+        active=dr.full(mi.Bool, options.max_depth > 0, n),
+        rng=rng,
+        ray=mi.Ray3f(ray),
+        throughput=mi.Spectrum(weight),
+        radiance=mi.Spectrum(0),
+        eta=mi.Float(1),
+        dvcm=mi.Float(0),
+        dvc=mi.Float(0),
+        depth=mi.UInt32(0),
+        hit=mi.Bool(False),
+    )
+    (state,) = traced_once(
+        state=(state,),
+        cond=lambda s: s.active,
+        body=partial(
+            _bounce,
+            scene=scene,
+            sensor=sensor,
+            lights=lights,
+            options=options,
+            aperture=aperture,
+            connectable=connectable,
+        ),
+        labels=("eye path",),
+        label="bdpt eye paths",
+    )
+    return state.radiance, state.hit
+
+
+def _bounce(
+    s: EyeState,
+    *,
+    scene: Any,
+    sensor: Any,
+    lights: Lights | None,
+    options: PathOptions,
+    aperture: Any,
+    connectable: Connectable | None,
+) -> tuple[EyeState]:
+    """One vertex of an eye path: light it shines by itself, light from a light, light from light paths, scatter."""
+    ctx = mi.BSDFContext()
+
+    # ------------------------------------ Arrive ------------------------------------
+
+    si = scene.ray_intersect(s.ray, active=s.active)
+    depth = s.depth + 1
+    first = depth == 1
+    hit = s.hit | (first & s.active & si.is_valid())
+    cos_in = dr.abs(dr.dot(si.n, s.ray.d))
+    r2 = dr.square(si.t)
+    dvcm, dvc = weights.arrive(s.dvcm, s.dvc, r2, cos_in)
+    if options.traces_light:
+        importance = primary_importance(sensor, si, aperture, s.active & first)
+        dvcm = dr.select(first, weights.eye_start(options.light_ratio, importance, cos_in), dvcm)
+    count = mi.Float(dr.select(first, 1, options.count))
+    radiance = mi.Spectrum(s.radiance)
+
+    # ------------------------------- Hit a light (s=0) -------------------------------
+
+    if lights is not None:
+        emitter = si.emitter(scene, s.active)
+        p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.active & ~first)
+        w = weights.hit_emitter(p_direct, p_emission, s.dvcm, dr.select(si.is_valid(), dvc, s.dvc))
+        emitted = emitter.eval(si, s.active)
+        radiance += dr.select(dr.max(emitted) > 0, s.throughput * emitted * dr.select(first, 1, w), 0)
+
+    active = s.active & si.is_valid() & (cos_in > 0) & (depth < options.max_depth)
+    bsdf = si.bsdf()
+    smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+    # -------------------- Next event estimation (s=1), sample the next direction --------------------
+
+    if lights is not None:
+        light = sample_direct(lights, si, s.rng, smooth)
+        wo = si.to_local(light.d)
+    else:
+        wo = mi.Vector3f(0, 0, 1)
+    value, p_forward, bs, bs_weight = bsdf.eval_pdf_sample(ctx, si, wo, s.rng.next_float32(), next_2d(s.rng), active)
+    if lights is not None:
+        joined = light.valid & (dr.max(value) > 0)
+        shadow = si.spawn_ray_to(light.p)
+        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), shadow)
+        joined &= ~scene.ray_test(shadow, joined)
+        p_reverse = reverse_pdf(ctx, bsdf, si, wo, joined)
+        w = weights.next_event(
+            dr.select(light.delta, 0, p_forward / light.density),
+            light.ratio_over_cos * dr.abs(dr.dot(si.n, light.d)),
+            count,
+            p_reverse,
+            dvcm,
+            dvc,
+        )
+        radiance += dr.select(joined, s.throughput * value * light.radiance_over_density * w, 0)
+
+    # -------------------------- Connect to light paths (s, t ≥ 2) --------------------------
+
+    if connectable is not None:
+        own = OwnVertex(si, bsdf, s.throughput, count, dvcm, dvc, depth, smooth & (depth + 1 < options.max_depth))
+        radiance += connect_all(scene, options, connectable, own)
+
+    # ----------------------------------- Scatter -----------------------------------
+
+    state = replace(s, active=active, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth, hit=hit)
+    _scatter(state, ctx, si, bsdf, bs, bs_weight, count)
+    _roulette(state, options)
+    return (state,)
+
+
+def reverse_pdf(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> Any:
+    """Density of sampling ``si.wi`` from ``wo``."""
+    exchanged = mi.SurfaceInteraction3f(si)
+    wi = mi.Vector3f(si.wi)
+    exchanged.wi = wo
+    return bsdf.pdf(ctx, exchanged, wi, active)
+
+
+def _scatter(s: EyeState, ctx: Any, si: Any, bsdf: Any, bs: Any, bs_weight: Any, count: Any) -> None:
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    d = si.to_world(bs.wo)
+    cos_out = dr.abs(dr.dot(si.n, d))
+    s.throughput = s.throughput * bs_weight
+    s.eta = s.eta * bs.eta
+    s.active &= (bs.pdf > 0) & (dr.max(s.throughput) > 0)
+
+    p_reverse = reverse_pdf(ctx, bsdf, si, bs.wo, s.active & ~delta)
+    vcm, vc = weights.scatter(s.dvcm, s.dvc, count, cos_out, bs.pdf, p_reverse)
+    delta_vcm, delta_vc = weights.scatter_delta(s.dvc, cos_out)
+    s.dvcm, s.dvc = dr.select(delta, delta_vcm, vcm), dr.select(delta, delta_vc, vc)
+    s.ray = si.spawn_ray(d)
+
+
+def _roulette(s: EyeState, options: PathOptions) -> None:
+    """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges.
+
+    By the throughput without refraction's scaling.
+    """
+    kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
+    roulette = s.depth >= options.rr_depth
+    s.active &= ~roulette | (s.rng.next_float32() < kept)
+    s.throughput[roulette] *= dr.rcp(kept)
+
+
+# ------------------------------------------------ Connections ------------------------------------------------
+
+
+@dataclass(slots=True)
+class OwnVertex:
+    """The eye vertex that is being joined."""
+
+    si: Any  # SurfaceInteraction3f
+    bsdf: Any  # BSDFPtr
+    throughput: Any  # Spectrum
+    count: Any  # Float: count of the technique that joins the vertex before
+    dvcm: Any  # Float
+    dvc: Any  # Float
+    depth: Any  # UInt32
+    active: Any  # Bool
+
+
+def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex) -> Any:
+    """Sum over n_C connections to kept vertices of n_C light paths, as radiance (Spectrum)."""
+    total = mi.Spectrum(0)
+    lane = dr.arange(mi.UInt32, dr.width(own.si))
+    for k in range(options.connections):
+        shift = mi.sample_tea_32(connectable.pairing, own.depth * options.connections + k)[0]
+        path = (lane + (shift & 0x3FFFFFFF)) % connectable.paths
+        total += _connect(scene, options, connectable, own, path)
+    return total / options.connections
+
+
+def _connect(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex, path: Any) -> Any:
+    """One connection (Georgiev 2012, §4.3): both vertices' BSDFs, G without its cosines, visibility and weight."""
+    ctx = mi.BSDFContext()
+    drawn_from = dr.gather(mi.UInt32, connectable.seen, path, own.active)
+    active = own.active & (drawn_from > 0)
+    vertex = dr.gather(LightVertices, connectable.vertices, path, active)
+    active &= own.depth + vertex.depth + 1 <= options.max_depth
+    other = _surface(vertex, active)
+    si = own.si
+
+    offset = other.p - si.p
+    r2 = dr.squared_norm(offset)
+    active &= r2 > 0
+    d = offset * dr.rsqrt(r2)
+    wo, wo_other = si.to_local(d), other.to_local(-d)
+    cos_own, cos_other = dr.abs(dr.dot(si.n, d)), dr.abs(dr.dot(other.n, d))
+    cos_in = dr.abs(dr.dot(other.n, vertex.direction))
+
+    # The eye vertex forward and backward; the light vertex with its directions exchanged, and forward
+    f, p = own.bsdf.eval_pdf(ctx, si, wo, active)
+    active &= dr.max(f) > 0
+    p_reverse = reverse_pdf(ctx, own.bsdf, si, wo, active)
+    bsdf_other = other.bsdf()
+    p_other = bsdf_other.pdf(ctx, other, wo_other, active)
+    exchanged = mi.SurfaceInteraction3f(other)
+    wi_other = mi.Vector3f(other.wi)
+    exchanged.wi = wo_other
+    f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, exchanged, wi_other, active)
+
+    first_other = vertex.depth == 1
+    count_other = mi.Float(dr.select(first_other, 1, options.count))
+    light_sum = p * cos_other * (count_other * vertex.dvcm + p_reverse_other * vertex.dvc)
+    eye_sum = p_other * cos_own * (own.count * own.dvcm + p_reverse * own.dvc)
+    w = weights.connection_over_r2(options.count, r2, light_sum, eye_sum)
+    value = own.throughput * f * vertex.throughput * f_other * (cos_other / cos_in * w * mi.Float(drawn_from))
+    active &= dr.max(value) > 0
+    active &= ~scene.ray_test(si.spawn_ray_to(other.p), active)
+    return dr.select(active, value, 0)
+
+
+def _surface(vertex: LightVertices, active: Any) -> Any:
+    """The surface at a kept vertex (SurfaceInteraction3f), found again from its intersection record."""
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    pi.t, pi.prim_uv, pi.prim_index = vertex.t, vertex.prim_uv, vertex.prim_index
+    pi.shape = dr.reinterpret_array(mi.ShapePtr, vertex.shape)
+    pi.instance = dr.reinterpret_array(mi.ShapePtr, vertex.instance)
+    pi.valid = mi.Bool(True)
+    return pi.compute_surface_interaction(mi.Ray3f(vertex.origin, vertex.direction), mi.RayFlags.All, active)

@@ -1,0 +1,287 @@
+"""Light sub-paths: from a light into the scene, each vertex joined to the lens (t=1).
+
+One in each path kept for connections.
+
+Which vertex is kept: one, uniformly among those a connection can reach, by reservoir sampling (Vitter, *Random
+Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each light path
+whatever ``max_depth`` is, nothing can overflow, and weighting the kept vertex by the number it was drawn from keeps
+the sum over all of them unbiased.
+
+The light side never evaluates an adjoint BSDF. It evaluates the radiance-mode BSDF with directions exchanged, times
+|cos_g(out)|/|cos_g(in)|, so both sides integrate the same function under any shading normal (Veach 1997, §5.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from . import weights
+from .camera import sample_sensor
+from .emission import AREA, Emission, Lights, next_2d, sample_emission
+from .loops import traced_once
+from .randomness import generator
+
+_MAX_THROUGHPUT_KEPT = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class PathOptions:
+    """What both kinds of sub-path need to know; numbers which may change between renders are in device memory."""
+
+    max_depth: int  # edges; 2³² − 1 for unbounded
+    rr_depth: int  # edges after which Russian roulette begins
+    connections: int  # n_C: connections made at each eye vertex
+    count: Any  # Float: technique count of connections in the weights (see integrator.connection_count)
+    light_ratio: Any  # Float: n_T, light paths per eye path
+    connects: bool  # whether any connection is made
+    traces_light: bool  # whether any light path is joined to the lens
+
+
+@dataclass(slots=True)
+class LightVertices:
+    """One kept vertex for each of N light paths.
+
+    What the surface is there is found again from its intersection record.
+    """
+
+    origin: Any  # Point3f: the ray that reached it
+    direction: Any  # Vector3f
+    t: Any  # Float
+    prim_uv: Any  # Point2f
+    prim_index: Any  # UInt32
+    shape: Any  # UInt32: registry id
+    instance: Any  # UInt32
+    throughput: Any  # Spectrum
+    dvcm: Any  # Float
+    dvc: Any  # Float
+    depth: Any  # UInt32: edges from the light
+
+
+@dataclass(slots=True)
+class LightState:
+    """Loop variables of a light path."""
+
+    active: Any  # Bool: this path goes on
+    rng: Any  # PCG32
+    ray: Any  # Ray3f: to the next vertex
+    throughput: Any  # Spectrum
+    dvcm: Any  # Float: see weights.py
+    dvc: Any  # Float
+    depth: Any  # UInt32: edges so far
+    seen: Any  # UInt32: vertices a connection could reach so far
+
+
+def empty_vertices(n: int) -> LightVertices:
+    """Room for one vertex of each of n light paths."""
+    return LightVertices(
+        *(
+            dr.empty(kind, n)
+            for kind in (mi.Point3f, mi.Vector3f, mi.Float, mi.Point2f, mi.UInt32, mi.UInt32, mi.UInt32)
+        ),
+        *(dr.empty(kind, n) for kind in (mi.Spectrum, mi.Float, mi.Float, mi.UInt32)),
+    )
+
+
+def trace_light_paths(
+    scene: Any, sensor: Any, lights: Lights, options: PathOptions, *, seed: Any, n: int, splat: Any, block: Any
+) -> tuple[LightVertices | None, Any]:
+    """Trace n light paths, put their images on the lens into ``block``, each value times ``splat``.
+
+    (eye paths per light path).
+
+    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) where no connections are wanted.
+    """
+    rng = generator(seed, n)
+    start = sample_emission(lights, rng, n)
+    vertices = empty_vertices(n) if options.connects else None
+    body = partial(
+        vertex_bounce,
+        scene=scene,
+        sensor=sensor,
+        lights=lights,
+        options=options,
+        start=start,
+        splat=splat,
+        block=block,
+        vertices=vertices,
+    )
+    (state,) = traced_once(
+        state=(first_state(start, rng),),
+        cond=lambda s: s.active,
+        body=body,
+        labels=("light path",),
+        label="bdpt light paths",
+    )
+    if vertices is None:
+        return None, state.seen
+    dr.eval(state.seen, vertices)
+    return vertices, state.seen
+
+
+def first_state(start: Emission, rng: Any) -> LightState:
+    """Loop variables before the first hit."""
+    zero = mi.Float(0)
+    return LightState(
+        mi.Bool(start.valid),
+        rng,
+        start.ray,
+        mi.Spectrum(start.throughput),
+        zero,
+        mi.Float(0),
+        mi.UInt32(0),
+        mi.UInt32(0),
+    )
+
+
+def vertex_bounce(
+    s: LightState,
+    *,
+    scene: Any,
+    sensor: Any,
+    lights: Lights,
+    options: PathOptions,
+    start: Emission,
+    splat: Any,
+    block: Any,
+    vertices: LightVertices | None,
+) -> tuple[LightState]:
+    """One vertex of a light path: arrive, join to the lens, keep it perhaps, scatter."""
+    ctx = mi.BSDFContext()
+
+    # ------------------------------------ Arrive ------------------------------------
+
+    pi = scene.ray_intersect_preliminary(s.ray, active=s.active)
+    si = pi.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
+    depth = s.depth + 1
+    cos_in = dr.abs(dr.dot(si.n, s.ray.d))
+    active = s.active & si.is_valid() & (cos_in > 0)
+    first = depth == 1
+    dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t), cos_in)
+    start_dvcm, start_dvc = start_weights(start, lights, si, cos_in, active & first)
+    dvcm, dvc = dr.select(first, start_dvcm, dvcm), dr.select(first, start_dvc, dvc)
+    count = mi.Float(dr.select(first, 1, options.count))
+    bsdf = si.bsdf()
+    smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+    # ------------------------------ Join to the lens (t=1) ------------------------------
+
+    if options.traces_light:
+        aperture = next_2d(s.rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        seen = sample_sensor(sensor, si, aperture, active & smooth)
+        value, p_reverse = _exchanged(ctx, bsdf, si, si.to_local(seen.d), seen.valid)
+        cos_out = dr.abs(dr.dot(si.n, seen.d))
+        w = weights.light_tracing(
+            seen.area_density_over_cos * cos_out, options.light_ratio, count, p_reverse, dvcm, dvc
+        )
+        joined = seen.valid & (dr.max(value) > 0)
+        joined &= ~scene.ray_test(si.spawn_ray_to(seen.start), joined)
+        image = s.throughput * value * seen.weight * (w * splat * cos_out / cos_in)
+        block.put(seen.position, [], dr.select(joined, image, 0), mi.Float(0), mi.Float(0), joined)
+
+    # ----------------------------- Keep for connections -----------------------------
+
+    count_seen = mi.UInt32(s.seen)
+    if vertices is not None:
+        reachable = active & smooth & (depth + 1 < options.max_depth)
+        count_seen[reachable] += 1
+        keep = reachable & (s.rng.next_float32() * mi.Float(count_seen) < 1)
+        record = _record(pi, s, dvcm, dvc, depth)
+        dr.scatter(vertices, record, dr.arange(mi.UInt32, dr.width(start.valid)), keep)
+
+    # ----------------------------------- Scatter -----------------------------------
+
+    state = replace(
+        s, active=active & (depth + 1 < options.max_depth), dvcm=dvcm, dvc=dvc, depth=depth, seen=count_seen
+    )
+    scatter(state, si, bsdf, cos_in, count)
+    roulette(state, start, options)
+    return (state,)
+
+
+def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
+    """Sample the next direction. Delta lobes: importance-mode weight times Veach's factor (Veach 1997, eq. 5.20)."""
+    importance = mi.BSDFContext()
+    importance.mode = mi.TransportMode.Importance
+    bs, delta_weight = bsdf.sample(importance, si, s.rng.next_float32(), next_2d(s.rng), s.active)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    d = si.to_world(bs.wo)
+    cos_out = dr.abs(dr.dot(si.n, d))
+    value, p_reverse = _exchanged(mi.BSDFContext(), bsdf, si, bs.wo, s.active & ~delta)
+
+    shading = dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.abs(mi.Frame3f.cos_theta(bs.wo))
+    factor = dr.select(delta, delta_weight * shading, value / bs.pdf) * (cos_out / cos_in)
+    # A failed sample may have a density and a direction: only its weight, which is 0, says that it failed
+    s.active &= (bs.pdf > 0) & (dr.max(delta_weight) > 0) & (dr.max(factor) > 0) & dr.isfinite(dr.max(factor))
+    s.throughput = dr.select(s.active, s.throughput * factor, 0)
+
+    vcm, vc = weights.scatter(s.dvcm, s.dvc, count, cos_out, bs.pdf, p_reverse)
+    delta_vcm, delta_vc = weights.scatter_delta(s.dvc, cos_out)
+    s.dvcm, s.dvc = dr.select(delta, delta_vcm, vcm), dr.select(delta, delta_vc, vc)
+    s.ray = si.spawn_ray(d)
+
+
+def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
+    """Russian roulette on the throughput relative to the start: after ``rr_depth`` edges.
+
+    As Mitsuba's ``path`` does.
+    """
+    kept = dr.minimum(dr.max(s.throughput) / dr.max(start.throughput), _MAX_THROUGHPUT_KEPT)
+    thins = s.depth >= options.rr_depth
+    s.active &= ~thins | (s.rng.next_float32() < kept)
+    s.throughput[thins] *= dr.rcp(kept)
+    s.active &= dr.max(s.throughput) > 0
+
+
+def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+    """(BSDF·|cos_s(wi)|, pdf) of radiance that comes in along ``si.wi`` and goes out along ``wo``.
+
+    Directions exchanged.
+
+    The pdf is the density of sampling ``si.wi`` from ``wo``: the reverse density of a light path's bounce.
+    """
+    exchanged = mi.SurfaceInteraction3f(si)
+    wi = mi.Vector3f(si.wi)
+    exchanged.wi = wo
+    return bsdf.eval_pdf(ctx, exchanged, wi, active)
+
+
+def start_weights(start: Emission, lights: Lights, si: Any, cos_in: Any, mask: Any) -> tuple[Any, Any]:
+    """(dVCM, dVC) at the first hit; see weights.py. Lanes outside ``mask`` may hold anything."""
+    selection = lights.nee_probability(start.emitter)
+    dvcm, dvc = mi.Float(0), mi.Float(0)
+    if lights.has(AREA):
+        ds = mi.DirectionSample3f(start.sample)
+        offset = start.sample.p - si.p
+        ds.dist = dr.norm(offset)
+        ds.d = offset / ds.dist
+        p_direction = selection * start.emitter.pdf_direction(si, ds, mask & start.is_area)
+        dvcm = weights.light_start_area(p_direction, start.factor, cos_in)
+        dvc = weights.light_start_dvc(dr.rcp(start.factor), cos_in)
+    dvcm = dr.select(
+        start.at_infinity,
+        weights.light_start_infinite(selection, start.factor, cos_in),
+        dr.select(start.is_area, dvcm, weights.light_start_finite(selection, start.factor, dr.square(si.t), cos_in)),
+    )
+    dvc = dr.select(start.at_infinity, weights.light_start_dvc(dr.rcp(start.factor * start.p_direction), cos_in), dvc)
+    return dvcm, dr.select(start.delta, 0, dvc)
+
+
+def _record(pi: Any, s: LightState, dvcm: Any, dvc: Any, depth: Any) -> LightVertices:
+    return LightVertices(
+        s.ray.o,
+        s.ray.d,
+        pi.t,
+        pi.prim_uv,
+        pi.prim_index,
+        dr.reinterpret_array(mi.UInt32, pi.shape),
+        dr.reinterpret_array(mi.UInt32, pi.instance),
+        s.throughput,
+        dvcm,
+        dvc,
+        depth,
+    )

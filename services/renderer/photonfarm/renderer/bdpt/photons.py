@@ -1,0 +1,105 @@
+"""Photons: the surface hits of light sub-paths, handed out as arrays; the same walk as the renderer's light paths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import numpy.typing as npt
+
+from . import randomness
+from .emission import Emission, read_lights, sample_emission
+from .light_paths import LightState, PathOptions, first_state, roulette, scatter
+from .loops import traced_once
+from .scenes import check_scene
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photons:
+    """P = paths · depth slots; slot d·paths + i is hit d + 1 of path i.
+
+    Empty slots have bounce −1 and zeros elsewhere.
+    """
+
+    position: Floats  # [P, 3], scene units
+    direction: Floats  # [P, 3], unit: the way the light travels on arriving
+    normal: Floats  # [P, 3], unit: geometric, as the surface is oriented
+    power: (
+        Floats  # [P, 3], watts (RGB) in scene units, over the number of emitted paths: their sum is the arriving flux
+    )
+    bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
+
+
+def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, rr_depth: int | None = None) -> Photons:
+    """Trace ``paths`` light paths of up to ``depth`` surface hits each.
+
+    ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
+    emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. ``rr_depth``: hits
+    after which Russian roulette thins the paths; None: never, since slots are fixed anyway. Compiles nothing again
+    when the scene is edited in place or for another seed. Raises ValueError for scenes with media, and for numbers
+    below 1.
+    """
+    if paths < 1 or depth < 1 or (rr_depth is not None and rr_depth < 1):
+        raise ValueError(
+            f"trace_photons: paths is {paths}, depth {depth}, rr_depth {rr_depth}; each must be at least 1"
+        )
+    check_scene(scene)
+    slots = paths * depth
+    if not scene.emitters():
+        zeros = np.zeros((slots, 3), np.float32)
+        return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(slots, -1, np.int32))
+    with dr.suspend_grad():
+        lights = read_lights(scene)
+        rng = randomness.generator(randomness.stream_seed(seed, 0, randomness.PHOTONS), paths)
+        start = sample_emission(lights, rng, paths)
+        out = (
+            dr.zeros(mi.Point3f, slots),
+            dr.zeros(mi.Vector3f, slots),
+            dr.zeros(mi.Normal3f, slots),
+            dr.zeros(mi.Spectrum, slots),
+        )
+        bounce = dr.full(mi.Int32, -1, slots)
+        zero = dr.opaque(mi.Float, 0)
+        options = PathOptions(depth + 1, rr_depth if rr_depth is not None else depth + 1, 0, zero, zero, False, False)
+        traced_once(
+            state=(first_state(start, rng),),
+            cond=lambda s: s.active,
+            body=partial(
+                _hit,
+                scene=scene,
+                start=start,
+                options=options,
+                out=out,
+                bounce=bounce,
+                paths=dr.opaque(mi.UInt32, paths),
+            ),
+            labels=("photon",),
+            label="photons",
+        )
+        dr.eval(out, bounce)
+    position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
+    return Photons(position, direction, normal, power / np.float32(paths), np.array(bounce))
+
+
+def _hit(
+    s: LightState, *, scene: Any, start: Emission, options: PathOptions, out: Any, bounce: Any, paths: Any
+) -> tuple[LightState]:
+    """One vertex of a light path: write it down, scatter."""
+    si = scene.ray_intersect(s.ray, active=s.active)
+    cos_in = dr.abs(dr.dot(si.n, s.ray.d))
+    active = s.active & si.is_valid() & (cos_in > 0)
+    slot = s.depth * paths + dr.arange(mi.UInt32, dr.width(start.valid))
+    for column, value in zip(out, (si.p, s.ray.d, si.n, s.throughput), strict=True):
+        dr.scatter(column, value, slot, active)
+    dr.scatter(bounce, mi.Int32(s.depth), slot, active)
+    depth = s.depth + 1
+    state = replace(s, active=active & (depth + 1 < options.max_depth), depth=depth)
+    scatter(state, si, si.bsdf(), cos_in, mi.Float(1))
+    roulette(state, start, options)
+    return (state,)

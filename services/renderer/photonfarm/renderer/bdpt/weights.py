@@ -1,0 +1,117 @@
+"""Multiple importance weights of the bidirectional path tracer: pure functions of two running sums.
+
+A path of k edges can be made by several techniques: s vertices from a light, t from the camera. The balance heuristic
+with technique counts weights a sample of technique i by nᵢpᵢ / Σⱼ nⱼpⱼ (Veach, *Robust Monte Carlo Methods for Light
+Transport Simulation*, 1997, §9.2.4, §10.2.1). Each sub-path carries the part of Σⱼ nⱼpⱼ / pᵢ that its own vertices
+decide in two numbers, dVCM and dVC (Georgiev, *Implementing Vertex Connection and Merging*, 2012, eqs. 31–46, with the
+merging terms left out).
+
+Counts, per eye path: 1 for a hit emitter (s=0) and for next event estimation (s=1), ``connection_count`` for a
+connection, and ``light_ratio`` for light tracing (t=1). A technique that is left out has count 0; the weights stay a
+partition of unity over the others, so the estimate stays unbiased for every choice. Russian roulette is in none of the
+densities: it thins samples of a technique and compensates each, so it does not change what a technique's density is.
+
+Letters: p solid-angle densities, cos = |n_geometric · d|, "in" the edge by which a vertex was reached, "rev" against
+the walk. All functions take and return ``mi.Float`` (or plain floats: the tests sum the weights of one path by hand).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+LARGEST = 1e30
+"""Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
+
+
+def light_start_finite(nee_area_density: Any, emission: Any, r2: Any, cos_in: Any) -> Any:
+    """DVCM at y₁ of a light with a position: p_NEE(y₀)/e · r²/cos_in (Georgiev 2012, eq. 31, completed on arrival)."""
+    return dr.minimum(nee_area_density / emission * r2 / cos_in, LARGEST)
+
+
+def light_start_area(nee_direction_density: Any, emission_per_cos: Any, cos_in: Any) -> Any:
+    """DVCM at y₁ of an area light. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ both cos₀ and r² cancel: p_ω /.
+
+    (ê·cos_in).
+    """
+    return dr.minimum(nee_direction_density / (emission_per_cos * cos_in), LARGEST)
+
+
+def light_start_infinite(nee_direction_density: Any, emission: Any, cos_in: Any) -> Any:
+    """DVCM at y₁ of a light at infinity: no r², since its "position" is a direction (Georgiev 2012, §5.1.
+
+    Last paragraph).
+    """
+    return dr.minimum(nee_direction_density / emission / cos_in, LARGEST)
+
+
+def light_start_dvc(cos_0_over_emission: Any, cos_in: Any) -> Any:
+    """DVC at y₁: cos₀/e/cos_in (eq. 32); the caller passes 0 for delta lights, and 1/e for lights at infinity."""
+    return dr.minimum(cos_0_over_emission / cos_in, LARGEST)
+
+
+def eye_start(light_ratio: Any, sensor_weight: Any, cos_in: Any) -> Any:
+    """DVCM at x₁: n_T/p_cam · r²/cos_in (eq. 31), with Mitsuba's sensor weight = p_cam/r².
+
+    0 where the sensor cannot be hit.
+    """
+    return dr.select(sensor_weight > 0, dr.minimum(light_ratio / (sensor_weight * cos_in), LARGEST), 0)
+
+
+def arrive(dvcm: Any, dvc: Any, r2: Any, cos_in: Any) -> tuple[Any, Any]:
+    """(dVCM, dVC) on reaching a later vertex: the solid-angle densities become area densities (between eqs.
+
+    31–33 and 34–36).
+    """
+    return dr.minimum(dvcm * r2 / cos_in, LARGEST), dr.minimum(dvc / cos_in, LARGEST)
+
+
+def scatter(dvcm: Any, dvc: Any, count_before: Any, cos_out: Any, p_forward: Any, p_reverse: Any) -> tuple[Any, Any]:
+    """(dVCM, dVC) after a non-delta bounce: 1/p_fwd and cos_out/p_fwd·(n·dVCM + p_rev·dVC) (eqs. 34, 35).
+
+    ``count_before`` is the count of the technique that joins this sub-path, ended one vertex earlier, to the rest.
+    """
+    return (
+        dr.minimum(1 / p_forward, LARGEST),
+        dr.minimum(cos_out / p_forward * (count_before * dvcm + p_reverse * dvc), LARGEST),
+    )
+
+
+def scatter_delta(dvc: Any, cos_out: Any) -> tuple[Any, Any]:
+    """(dVCM, dVC) after a delta bounce: nothing joins at either side of it, and p_fwd = p_rev cancel (eqs. 53, 54)."""
+    return dr.zeros(type(dvc)) if dr.is_array_v(dvc) else 0.0, cos_out * dvc
+
+
+def hit_emitter(nee_direction_density: Any, emission: Any, dvcm: Any, dvc: Any) -> Any:
+    """Weight of s=0: 1/(1 + p_ω·dVCM + e·dVC) (eqs. 37, 43), dVCM from *before* and dVC from *after* the arrival.
+
+    Written with p_ω instead of the area density, so that r²/cos cancels and the environment needs no case of its own.
+    """
+    return 1 / (1 + nee_direction_density * dvcm + emission * dvc)
+
+
+def next_event(p_bsdf_over_p_nee: Any, ratio: Any, count_before: Any, p_reverse: Any, dvcm: Any, dvc: Any) -> Any:
+    """Weight of s=1: 1/(1 + wL + wC), wC = ratio·(n·dVCM + p_rev·dVC) (eqs. 37, 44, 45).
+
+    ``ratio``: e·cos_x/(p_NEE·cos₀), the density with which a light path from the same point would arrive at x, over
+    p_NEE.
+    """
+    return 1 / (1 + p_bsdf_over_p_nee + ratio * (count_before * dvcm + p_reverse * dvc))
+
+
+def light_tracing(
+    sensor_area_density: Any, light_ratio: Any, count_before: Any, p_reverse: Any, dvcm: Any, dvc: Any
+) -> Any:
+    """Weight of t=1: 1/(1 + wL), wL = p_cam,A/n_T·(n·dVCM + p_rev·dVC) (eqs. 37, 46)."""
+    return 1 / (1 + sensor_area_density / light_ratio * (count_before * dvcm + p_reverse * dvc))
+
+
+def connection_over_r2(count: Any, r2: Any, light_sum: Any, eye_sum: Any) -> Any:
+    """Weight of a connection divided by r²: n/(n·r² + wL·r² + wC·r²) (eqs. 37, 40, 41).
+
+    Free of 0/0 and of a spike as r → 0.
+
+    ``light_sum`` = p_x→y·cos_y·(n·dVCM + p_rev·dVC) of the light vertex, ``eye_sum`` the same with x and y exchanged.
+    """
+    return count / dr.maximum(count * r2 + light_sum + eye_sum, 1e-35)

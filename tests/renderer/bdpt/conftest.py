@@ -1,0 +1,95 @@
+"""What the integrator's tests share: the variant, one thread, and comparisons that keep the images of a failure."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.renderer import backend
+
+mi = backend.load(threads=1)
+import drjit as dr  # noqa: E402 - after the variant is set
+
+from photonfarm.shared.statistics import block_z_test  # noqa: E402
+
+Z_LIMIT = 4.5  # a normal z beyond this has probability 7e-6; with 16 blocks a test fails by chance once in 10 000 runs
+FAILURES = Path(os.environ.get("PHOTONFARM_TEST_FAILURES", "test-failures"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_thread() -> Iterator[None]:
+    """Light splats are added in a fixed order only by one thread."""
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(before)
+
+
+@pytest.fixture
+def renders() -> Callable[..., Any]:
+    """Function (scene, integrator dictionary, spp, seeds) → images [K, H, W, 3]."""
+
+    def render(scene: Any, integrator: dict[str, Any], spp: int, seeds: range) -> Any:
+        plugin = mi.load_dict(integrator)
+        return np.stack([np.array(mi.render(scene, integrator=plugin, spp=spp, seed=seed))[..., :3] for seed in seeds])
+
+    return render
+
+
+@pytest.fixture
+def assert_equal_means(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Function that fails unless two sets of images have equal means in every block.
+
+    It keeps the images of a failure.
+    """
+
+    def check(a: Any, b: Any, blocks: int = 4) -> None:
+        test = block_z_test(a, b, blocks=blocks)
+        if test.finite and test.z_max < Z_LIMIT:
+            return
+        folder = save(request, bdpt=a, reference=b)
+        pytest.fail(
+            f"largest block |z| {test.z_max:.2f} (limit {Z_LIMIT}), means' ratio {test.mean_ratio:.4f} ± "
+            f"{test.mean_ratio_standard_error:.4f}, finite: {test.finite}\n{np.round(test.z, 1)}\n"
+            f"images: {folder}\nrepeat: python -m pytest '{request.node.nodeid}'"
+        )
+
+    return check
+
+
+@pytest.fixture
+def assert_mean_is(request: pytest.FixtureRequest) -> Callable[..., None]:
+    """Function that fails unless the mean of images is a known number, within 4.5 standard errors and 0.05 %."""
+
+    def check(images: Any, truth: float) -> None:
+        means = np.asarray(images, dtype=np.float64).reshape(len(images), -1).mean(axis=1)
+        tolerance = (
+            Z_LIMIT * 1.3 * means.std(ddof=1) / np.sqrt(len(means)) + 5e-4 * truth
+        )  # 1.3: Student's t of 8 renders
+        if abs(means.mean() - truth) <= tolerance:
+            return
+        folder = save(request, bdpt=images)
+        pytest.fail(
+            f"mean {means.mean():.5f}, expected {truth:.5f} ± {tolerance:.5f}\nimages: {folder}\n"
+            f"repeat: python -m pytest '{request.node.nodeid}'"
+        )
+
+    return check
+
+
+def save(request: pytest.FixtureRequest, **images: Any) -> Path:
+    folder = FAILURES / request.node.name
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, stack in images.items():
+        np.save(folder / f"{name}.npy", stack)
+        mean = mi.Bitmap(np.ascontiguousarray(np.mean(stack, axis=0), dtype=np.float32))
+        # Not EXR: Mitsuba's writer waits forever when Dr.Jit has a single thread
+        mean.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(
+            str(folder / f"{name}.png")
+        )
+    return folder.resolve()

@@ -1,0 +1,265 @@
+"""The plugin as a plugin: reproducibility, edits in place, removed lights, refusals, photons."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from photonfarm.renderer import bdpt
+from photonfarm.renderer.bdpt import camera, emission, variant
+from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
+
+SIZE = 16
+
+
+def load(name: str = "many_lights", **more: Any) -> Any:
+    return mi.load_dict({**HARD_SCENES[name](SIZE), **more}, optimize=False)
+
+
+def image(scene: Any, seed: int = 0, spp: int = 4, **parameters: Any) -> Any:
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters})
+    return np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp))
+
+
+def test_the_public_face_is_pinned() -> None:
+    assert bdpt.__all__ == ["BidirectionalPathTracer", "Photons", "trace_photons"]
+
+
+def test_two_renders_with_one_seed_are_bit_identical() -> None:
+    scene = load()
+    np.testing.assert_array_equal(image(scene, seed=0), image(scene, seed=0))
+    assert not np.array_equal(image(scene, seed=0), image(scene, seed=1))
+
+
+def test_an_image_in_several_passes_has_the_same_mean(monkeypatch: pytest.MonkeyPatch, assert_equal_means: Any) -> None:
+    from photonfarm.renderer.bdpt import integrator
+
+    scene = load("cove")
+    whole = np.stack([image(scene, seed=s, spp=32) for s in range(8)])
+    monkeypatch.setattr(integrator, "PASS_PATHS", 3000)  # cuts through a pixel
+    parts = np.stack([image(scene, seed=100 + s, spp=32) for s in range(8)])
+    assert_equal_means(parts, whole)
+
+
+def test_it_loads_from_xml() -> None:
+    scene = mi.load_string(
+        '<scene version="3.0.0"><integrator type="bdpt"><integer name="connections" value="2"/>'
+        '<float name="light_ratio" value="0.5"/></integrator><sensor type="perspective"><film type="hdrfilm">'
+        '<integer name="width" value="4"/><integer name="height" value="4"/><rfilter type="box"/></film></sensor>'
+        '<emitter type="constant"/></scene>'
+    )
+    assert scene.integrator().connections == 2
+    assert scene.integrator().light_ratio == 0.5
+    np.testing.assert_allclose(np.array(mi.render(scene, spp=2)), 1, rtol=1e-5)
+
+
+# ------------------------------------------------ Edits in place ------------------------------------------------
+
+
+def compiled(function: Any) -> int:
+    """Number of kernels that had to be compiled."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        function()
+        return sum(1 for entry in dr.kernel_history([dr.KernelType.JIT]) if not entry["cache_hit"])
+
+
+def opaque(transform: Any) -> Any:
+    dr.make_opaque(transform)
+    return transform
+
+
+def test_edits_in_place_compile_nothing() -> None:
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([-0.3, 0.2, 0.3]).scale(0.2)}
+    scene = load("many_lights", box=box)
+    parameters = mi.traverse(scene)
+
+    def place(key: str, origin: list[float], target: list[float], up: list[float], size: float = 1) -> None:
+        frame = mi.Transform4f().look_at(origin=origin, target=target, up=up) @ mi.Transform4f().scale([size, size, 1])
+        parameters[key] = opaque(frame)
+        parameters.update()
+
+    def everything(seed: int) -> None:
+        image(scene, seed=seed)
+        bdpt.trace_photons(scene, seed=seed, paths=64, depth=3)
+
+    place("sensor.to_world", [0, -3.2, 1], [0, 0, 1], [0, 0, 1])
+    place("light.to_world", [0, 0, 1.95], [0, 0, 0], [0, 1, 0], 0.3)
+    everything(0)
+    assert compiled(lambda: everything(1)) == 0, "another seed"
+
+    place("sensor.to_world", [0.2, -3, 1.2], [0, 0, 0.9], [0, 0, 1])
+    assert compiled(lambda: everything(2)) == 0, "the camera moved"
+    vertices = dr.unravel(mi.Point3f, parameters["box.vertex_positions"])
+    parameters["box.vertex_positions"] = dr.ravel(vertices + mi.Point3f(0.1, 0.1, 4))
+    parameters.update()
+    assert compiled(lambda: everything(3)) == 0, "an object moved, out of the old bounding box"
+    place("light.to_world", [0.3, 0.2, 1.9], [0.3, 0.2, 0], [0, 1, 0], 0.3)
+    assert compiled(lambda: everything(4)) == 0, "a light moved"
+    for key in ("light.emitter.radiance.value", "bulb.intensity.value", "sky.radiance.value"):
+        parameters[key] = mi.Color3f(0)
+        parameters.update()
+        assert compiled(lambda: everything(5)) == 0, f"{key} went out"
+
+
+def test_dead_lights_are_never_chosen(renders: Any, assert_equal_means: Any) -> None:
+    scene, without = load("many_lights"), HARD_SCENES["many_lights"](SIZE)
+    parameters = mi.traverse(scene)
+    dead = {"light": "light.emitter.radiance.value", "bulb": "bulb.intensity.value", "sky": "sky.radiance.value"}
+    for key in dead.values():
+        parameters[key] = mi.Color3f(0)
+    parameters.update()
+    lights = emission.read_lights(scene)
+    alive = np.array(lights.nee)[[int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]) for e in scene.emitters()]]
+    assert np.count_nonzero(alive) == lights.count - len(dead)
+    assert alive.sum() == pytest.approx(1)
+
+    del without["bulb"], without["sky"]
+    del without["light"]["emitter"]
+    without["light"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}  # a light's default
+    integrator = {"type": "bdpt", "max_depth": 5}
+    reference = renders(mi.load_dict(without, optimize=False), integrator, 64, range(100, 108))
+    assert_equal_means(renders(scene, integrator, 64, range(8)), reference)
+
+
+def test_a_scene_with_no_light_left_is_black() -> None:
+    scene = load("cove")
+    parameters = mi.traverse(scene)
+    parameters["light.emitter.radiance.value"] = mi.Color3f(0)
+    parameters.update()
+    assert not image(scene).any()
+
+
+def test_lights_follow_geometry_that_is_moved_in_place(renders: Any, assert_equal_means: Any) -> None:
+    """The bounding sphere of Mitsuba's own constant and directional lights is late by an update, or never refreshed."""
+    sun = {"type": "directional", "direction": [0.3, 1, -1], "irradiance": {"type": "rgb", "value": 2.0}}
+    far = mi.ScalarTransform4f().translate([0, 6, 0.5])
+    block = {"type": "cube", "bsdf": {"type": "diffuse"}}
+    shift = far @ mi.ScalarTransform4f().scale(0.9)
+    moved = load("constant_environment", sun=sun, block={**block, "to_world": mi.ScalarTransform4f().scale(0.9)})
+    parameters = mi.traverse(moved)
+    vertices = dr.unravel(mi.Point3f, parameters["block.vertex_positions"])
+    parameters["block.vertex_positions"] = dr.ravel(vertices + mi.Point3f(0, 6, 0.5))
+    parameters.update()
+    fresh = load("constant_environment", sun=sun, block={**block, "to_world": shift})
+    integrator = {"type": "bdpt", "max_depth": 4}
+    assert_equal_means(renders(moved, integrator, 64, range(8)), renders(fresh, integrator, 64, range(50, 58)))
+
+
+def test_a_mesh_light_with_smooth_normals_is_left_to_hits(renders: Any, assert_equal_means: Any) -> None:
+    scene = HARD_SCENES["cove"](8)
+    scene["light"] = {"type": "sphere", "center": [0, 0, 1.8], "radius": 0.15}
+    mesh = mi.load_dict(scene["light"])
+    assert mesh is not None
+    n = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], np.float32)
+    faces = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1], [5, 2, 1], [5, 3, 2], [5, 4, 3], [5, 1, 4]]
+    properties = mi.Properties()
+    properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 5.0}})
+    octahedron = mi.Mesh("octahedron", 6, 8, has_vertex_normals=True, props=properties)
+    values = mi.traverse(octahedron)
+    values["vertex_positions"] = (n * 0.2 + np.array([0, 0, 1.8], np.float32)).ravel()
+    values["vertex_normals"] = n.ravel()
+    values["faces"] = np.array(faces, np.uint32).ravel()
+    values.update()
+    scene["light"] = octahedron
+    loaded = mi.load_dict(scene, optimize=False)
+    assert not np.array(emission.read_lights(loaded).nee).any()
+    by_hits = renders(loaded, {"type": "bdpt", "max_depth": 3}, 64, range(8))
+    assert by_hits.max() > 0
+
+
+# ------------------------------------------------ Refusals ------------------------------------------------
+
+
+def refusal(scene: Any, **parameters: Any) -> str:
+    integrator = mi.load_dict({"type": "bdpt", **parameters})
+    with pytest.raises(ValueError, match="bdpt") as caught:
+        integrator.render(scene, 0, 0, 1)
+    return str(caught.value)
+
+
+def test_a_filter_other_than_box_is_refused_with_the_reason() -> None:
+    scene = HARD_SCENES["cove"](SIZE)
+    scene["sensor"]["film"]["rfilter"] = {"type": "gaussian"}
+    message = refusal(mi.load_dict(scene))
+    assert "box" in message
+    assert "because" in message
+
+
+def test_a_sensor_that_light_paths_cannot_hit_is_refused_unless_there_are_none() -> None:
+    scene = HARD_SCENES["cove"](SIZE)
+    del scene["sensor"]["fov"]
+    scene["sensor"]["type"] = "orthographic"
+    loaded = mi.load_dict(scene)
+    assert "light_ratio=0" in refusal(loaded)
+    assert np.isfinite(image(loaded, connections=0, light_ratio=0.0)).all()
+    assert "PerspectiveCamera" in camera.SENSORS
+
+
+def test_media_are_refused() -> None:
+    fog = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    assert "medium" in refusal(load("cove", fog=fog))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"connections": -1},
+        {"light_ratio": -0.5},
+        {"connections": 1, "light_ratio": 0.0},
+        {"max_depth": -2},
+        {"rr_depth": 0},
+    ],
+)
+def test_parameters_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises((ValueError, RuntimeError), match=r"allowed|need"):
+        mi.load_dict({"type": "bdpt", **wrong})
+
+
+@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb_polarized"])
+def test_variants_without_rgb_arrays_are_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant.mi, "variant", lambda: name)
+    with pytest.raises(ValueError, match=name):
+        variant.require_variant()
+
+
+def test_a_missing_variant_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant.mi, "variant", lambda: None)
+    with pytest.raises(RuntimeError, match="set_variant"):
+        variant.require_variant()
+
+
+# ------------------------------------------------ Photons ------------------------------------------------
+
+
+# A point light of intensity π in a closed sphere of reflectance ½ emits 4π²; all of it arrives, and half of it after
+# each bounce.
+def test_photons_carry_the_power_of_the_light() -> None:
+    sphere = {
+        "type": "sphere",
+        "flip_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    }
+    light = {"type": "point", "position": [0.3, 0, 0], "intensity": {"type": "rgb", "value": np.pi}}
+    scene = mi.load_dict({"type": "scene", "sphere": sphere, "light": light})
+    photons = bdpt.trace_photons(scene, seed=0, paths=1000, depth=4)
+    assert photons.position.shape == photons.direction.shape == photons.normal.shape == photons.power.shape == (4000, 3)
+    for bounce in range(4):
+        power = photons.power[photons.bounce == bounce].sum(axis=0)
+        np.testing.assert_allclose(power, 4 * np.pi**2 * 0.5**bounce, rtol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(photons.position, axis=1), 1, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(photons.direction, axis=1), 1, atol=1e-4)
+
+
+def test_empty_photon_slots_are_marked() -> None:
+    photons = bdpt.trace_photons(load("cove"), seed=3, paths=200, depth=6)
+    empty = photons.bounce == -1
+    assert empty.any()
+    assert not photons.power[empty].any()
+    assert (photons.power[~empty] > 0).all()
+    again = bdpt.trace_photons(load("cove"), seed=3, paths=200, depth=6)
+    np.testing.assert_array_equal(photons.position, again.position)

@@ -36,7 +36,7 @@ def test_the_whole_farm_renders_trains_and_reports(photonfarm, tmp_path: Path, s
 
 def _read_as_the_readme_does(folder: Path) -> None:
     """The reading example of README.md, run as it stands, reads committed samples with plain zarr-python."""
-    (example,) = re.findall(r"```python\n(import json.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (example,) = re.findall(r"```python\n(from pathlib import Path.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     check = "\nimport sys, numpy\nassert numpy.isfinite(half_a).all() and not numpy.array_equal(half_a, half_b)\n"
     check += "assert not any(name.startswith('photonfarm') for name in sys.modules)\n"
     subprocess.run([sys.executable, "-c", example + check], cwd=folder, check=True)

@@ -24,10 +24,7 @@ class SensorSample:
 
 
 def check_sensor(sensor: Any, *, light_tracing: bool) -> None:
-    """Raise ValueError for a film filter other than box, a film other than hdrfilm.
-
-    And sensors light paths cannot hit.
-    """
+    """Raise ValueError unless the film is an hdrfilm with a box filter and light can hit the sensor."""
     film = sensor.film()
     if not film.rfilter().is_box_filter():
         raise ValueError(

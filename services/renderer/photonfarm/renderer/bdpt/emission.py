@@ -62,10 +62,7 @@ class Lights:
     radius: Any  # Float, 1: its radius
 
     def only(self, kind: int) -> bool:
-        """Whether every light that can be selected is of this kind: decided on the host.
-
-        So other kinds cost nothing.
-        """
+        """Whether every light that can be selected is of this kind; known on the host, so that other kinds cost nothing."""
         return all(k in (kind, HIT_ONLY) for k in self.kinds)
 
     def has(self, kind: int) -> bool:
@@ -256,7 +253,7 @@ class DirectSample:
 def choose(lights: Lights, cdf: Any, u: Any) -> Any:
     """Index of a light (UInt32) by inversion of a running sum: the smallest i with cdf(i) > u·cdf(N−1).
 
-    So never a dead one.
+    A dead one is never chosen.
     """
     if lights.count == 1:
         return dr.zeros(mi.UInt32, dr.width(u))
@@ -292,10 +289,7 @@ def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSampl
 
 
 def hit_densities(scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any, active: Any) -> tuple[Any, Any]:
-    """(p_NEE in solid angle.
-
-    E) with which next event estimation at ``origin`` and emission would have found this hit.
-    """
+    """(p_NEE in solid angle, e): this hit's densities under next event estimation at ``origin`` and under emission."""
     reference = dr.zeros(mi.Interaction3f)
     reference.p = origin
     ds = mi.DirectionSample3f(scene, si, reference)

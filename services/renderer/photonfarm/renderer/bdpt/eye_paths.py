@@ -1,6 +1,6 @@
-"""Eye sub-paths: from the lens into the scene, with hits of lights (s=0), next event estimation.
+"""Eye sub-paths: from the lens into the scene.
 
-(s=1) and connections.
+They hit lights (s=0), estimate direct light at each vertex (s=1) and connect to light paths.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def _scatter(s: EyeState, ctx: Any, si: Any, bsdf: Any, bs: Any, bs_weight: Any,
 def _roulette(s: EyeState, options: PathOptions) -> None:
     """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges.
 
-    By the throughput without refraction's scaling.
+    Paths are kept by their throughput without refraction's scaling.
     """
     kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
     roulette = s.depth >= options.rr_depth

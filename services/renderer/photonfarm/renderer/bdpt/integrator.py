@@ -75,9 +75,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> Any:
-        """The image (TensorXf [H, W, C], linear radiance). Raises ValueError for scenes.
+        """The image (TensorXf [H, W, C], linear radiance).
 
-        Sensors and films it cannot render.
+        Raises ValueError for scenes, sensors and films it cannot render.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         seed = int(seed if isinstance(seed, int) else seed[0])
@@ -166,9 +166,9 @@ def connection_count(connections: int, max_depth: int) -> float:
 
 
 def primary_rays(sensor: Any, rng: Any, *, begin: int, n: int, spp: int) -> tuple[Any, Any, Any, Any]:
-    """(rays, sensor weights, film positions in pixels, aperture samples) of the samples begin … begin+n−1.
+    """Rays, sensor weights, film positions in pixels and aperture samples of the samples begin … begin + n − 1.
 
-    Spp to a pixel.
+    Each pixel has `spp` of them, one after the other.
     """
     film = sensor.film()
     size, offset = mi.ScalarVector2u(film.crop_size()), mi.ScalarVector2f(film.crop_offset())

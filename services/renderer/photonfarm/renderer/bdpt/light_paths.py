@@ -1,9 +1,7 @@
-"""Light sub-paths: from a light into the scene, each vertex joined to the lens (t=1).
+"""Light sub-paths: from a light into the scene, each vertex joined to the lens (t=1), one of each path kept.
 
-One in each path kept for connections.
-
-Which vertex is kept: one, uniformly among those a connection can reach, by reservoir sampling (Vitter, *Random
-Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each light path
+The vertex kept for connections is drawn uniformly among those a connection can reach, by reservoir sampling (Vitter,
+*Random Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each path
 whatever ``max_depth`` is, nothing can overflow, and weighting the kept vertex by the number it was drawn from keeps
 the sum over all of them unbiased.
 
@@ -90,11 +88,10 @@ def empty_vertices(n: int) -> LightVertices:
 def trace_light_paths(
     scene: Any, sensor: Any, lights: Lights, options: PathOptions, *, seed: Any, n: int, splat: Any, block: Any
 ) -> tuple[LightVertices | None, Any]:
-    """Trace n light paths, put their images on the lens into ``block``, each value times ``splat``.
+    """Trace n light paths and put their images on the lens into ``block``, each value times ``splat``.
 
-    (eye paths per light path).
-
-    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) where no connections are wanted.
+    ``splat`` is the number of eye paths per light path. Returns (kept vertices, number each was drawn from: UInt32
+    [n]), or (None, ·) where no connections are wanted.
     """
     rng = generator(seed, n)
     start = sample_emission(lights, rng, n)
@@ -226,9 +223,9 @@ def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
 
 
 def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
-    """Russian roulette on the throughput relative to the start: after ``rr_depth`` edges.
+    """Russian roulette after ``rr_depth`` edges, as Mitsuba's ``path`` does.
 
-    As Mitsuba's ``path`` does.
+    Paths are kept by their throughput relative to the start.
     """
     kept = dr.minimum(dr.max(s.throughput) / dr.max(start.throughput), _MAX_THROUGHPUT_KEPT)
     thins = s.depth >= options.rr_depth
@@ -238,9 +235,7 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
 
 
 def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
-    """(BSDF·|cos_s(wi)|, pdf) of radiance that comes in along ``si.wi`` and goes out along ``wo``.
-
-    Directions exchanged.
+    """(BSDF·|cos_s(wi)|, pdf) of radiance in along ``wo`` and out along ``si.wi``: directions exchanged.
 
     The pdf is the density of sampling ``si.wi`` from ``wo``: the reverse density of a light path's bounce.
     """

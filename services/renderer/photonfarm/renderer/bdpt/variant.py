@@ -6,10 +6,7 @@ import mitsuba as mi
 
 
 def require_variant() -> str:
-    """The active variant's name. Raises RuntimeError if none is set.
-
-    ValueError if the integrator cannot work under it.
-    """
+    """The active variant's name; raises RuntimeError if none is set, ValueError for one the integrator cannot use."""
     variant = mi.variant()
     if variant is None:
         raise RuntimeError(

@@ -26,33 +26,33 @@ LARGEST = 1e30
 
 
 def light_start_finite(nee_area_density: Any, emission: Any, r2: Any, cos_in: Any) -> Any:
-    """DVCM at y₁ of a light with a position: p_NEE(y₀)/e · r²/cos_in (Georgiev 2012, eq. 31, completed on arrival)."""
+    """dVCM at y₁ of a light with a position: p_NEE(y₀)/e · r²/cos_in (Georgiev 2012, eq. 31, completed on arrival)."""
     return dr.minimum(nee_area_density / emission * r2 / cos_in, LARGEST)
 
 
 def light_start_area(nee_direction_density: Any, emission_per_cos: Any, cos_in: Any) -> Any:
-    """DVCM at y₁ of an area light. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ both cos₀ and r² cancel: p_ω /.
+    """dVCM at y₁ of an area light, p_ω/(ê·cos_in).
 
-    (ê·cos_in).
+    With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ both cos₀ and r² cancel.
     """
     return dr.minimum(nee_direction_density / (emission_per_cos * cos_in), LARGEST)
 
 
 def light_start_infinite(nee_direction_density: Any, emission: Any, cos_in: Any) -> Any:
-    """DVCM at y₁ of a light at infinity: no r², since its "position" is a direction (Georgiev 2012, §5.1.
+    """dVCM at y₁ of a light at infinity (Georgiev 2012, §5.1, last paragraph).
 
-    Last paragraph).
+    There is no r², since its "position" is a direction.
     """
     return dr.minimum(nee_direction_density / emission / cos_in, LARGEST)
 
 
 def light_start_dvc(cos_0_over_emission: Any, cos_in: Any) -> Any:
-    """DVC at y₁: cos₀/e/cos_in (eq. 32); the caller passes 0 for delta lights, and 1/e for lights at infinity."""
+    """dVC at y₁: cos₀/e/cos_in (eq. 32); the caller passes 0 for delta lights, and 1/e for lights at infinity."""
     return dr.minimum(cos_0_over_emission / cos_in, LARGEST)
 
 
 def eye_start(light_ratio: Any, sensor_weight: Any, cos_in: Any) -> Any:
-    """DVCM at x₁: n_T/p_cam · r²/cos_in (eq. 31), with Mitsuba's sensor weight = p_cam/r².
+    """dVCM at x₁: n_T/p_cam · r²/cos_in (eq. 31), with Mitsuba's sensor weight = p_cam/r².
 
     0 where the sensor cannot be hit.
     """
@@ -60,9 +60,9 @@ def eye_start(light_ratio: Any, sensor_weight: Any, cos_in: Any) -> Any:
 
 
 def arrive(dvcm: Any, dvc: Any, r2: Any, cos_in: Any) -> tuple[Any, Any]:
-    """(dVCM, dVC) on reaching a later vertex: the solid-angle densities become area densities (between eqs.
+    """(dVCM, dVC) on reaching a later vertex, between eqs. 31–33 and 34–36.
 
-    31–33 and 34–36).
+    The solid-angle densities become area densities.
     """
     return dr.minimum(dvcm * r2 / cos_in, LARGEST), dr.minimum(dvc / cos_in, LARGEST)
 
@@ -108,9 +108,7 @@ def light_tracing(
 
 
 def connection_over_r2(count: Any, r2: Any, light_sum: Any, eye_sum: Any) -> Any:
-    """Weight of a connection divided by r²: n/(n·r² + wL·r² + wC·r²) (eqs. 37, 40, 41).
-
-    Free of 0/0 and of a spike as r → 0.
+    """Weight of a connection divided by r²: n/(n·r² + wL·r² + wC·r²) (eqs. 37, 40, 41); no 0/0, no spike as r → 0.
 
     ``light_sum`` = p_x→y·cos_y·(n·dVCM + p_rev·dVC) of the light vertex, ``eye_sum`` the same with x and y exchanged.
     """

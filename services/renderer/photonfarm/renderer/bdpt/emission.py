@@ -62,7 +62,7 @@ class Lights:
     radius: Any  # Float, 1: its radius
 
     def only(self, kind: int) -> bool:
-        """Whether every light that can be selected is of this kind; known on the host, so that other kinds cost nothing."""
+        """Whether every light that can be selected is of this kind; decided on the host: the rest costs nothing."""
         return all(k in (kind, HIT_ONLY) for k in self.kinds)
 
     def has(self, kind: int) -> bool:

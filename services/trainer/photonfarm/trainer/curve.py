@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 
 WIDTH, HEIGHT = 460, 300  # px
-LEFT, RIGHT, TOP, BOTTOM = 64, 12, 12, 48  # px, margins of the plotting area
+LEFT, RIGHT, TOP, BOTTOM = 64, 24, 12, 48  # px, margins of the plotting area
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 .curves { display: flex; flex-wrap: wrap; gap: 1rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .6rem .2rem 0; text-align: left; font-weight: normal;
         vertical-align: top; } th { color: #555; }
-.pictures td, .pictures th { text-align: center; } img { image-rendering: pixelated; display: block; }
+.pictures td, .pictures th { text-align: center; max-width: 8.5rem; } img { image-rendering: pixelated; display: block; }
 p, li { max-width: 46rem; } code { overflow-wrap: anywhere; }
 """
 PICTURE_WIDTH = 128  # px on the page, at least
@@ -80,7 +80,7 @@ def _pictures(shown: Sequence[Shown]) -> str:
     rows = "".join(_picture_row(sample) for sample in shown)
     return (
         '<h2>Held-out samples</h2>\n<table class="pictures"><tr><th>target (A + B)/2, noisy</th><th>prediction</th>'
-        f"<th>albedo</th><th>|prediction − target|, with its noise</th><th>error</th></tr>{rows}</table>\n"
+        f"<th>albedo</th><th>|prediction − target|</th><th>error</th></tr>{rows}</table>\n"
         "<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>.</p>"
     )
 

@@ -30,6 +30,12 @@ def test_equal_constant_images_pass_although_their_variance_is_zero() -> None:
     assert not block_z_test(ones, ones * 1.01).passed
 
 
+def test_the_rounding_of_a_bright_block_without_variance_is_no_bias() -> None:
+    a, b = noise(0), noise(1)
+    a[:, :2, :2], b[:, :2, :2] = 9.60001024, 9.59995619  # a light seen directly, summed in float32 in two ways
+    assert block_z_test(a, b).passed
+
+
 def test_images_that_are_not_finite_fail() -> None:
     broken = noise(0)
     broken[0, 0, 0, 0] = np.inf

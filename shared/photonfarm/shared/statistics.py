@@ -33,28 +33,29 @@ class BlockTest:
 
 
 def block_z_test(
-    images_a: Array, images_b: Array, blocks: int = 16, significance: float = 0.001, floor: float = 1e-6
+    images_a: Array, images_b: Array, blocks: int = 16, significance: float = 0.001, floor: float = 1e-5
 ) -> BlockTest:
     """Welch's test for each block, with Šidák's correction for their number.
 
     ``images_a`` [K, H, W, C], ``images_b`` [L, H, W, C] with K, L ≥ 2; images smaller than ``blocks`` get one block
     per pixel. ``significance``: probability that any block of two equal sets fails. With few renders the statistic
     follows Student's t, not a normal distribution: each t is mapped to the normal z of the same tail probability, so
-    ``z`` means the same for all K, L. ``floor``: standard error, relative to the mean of the images, below which
-    blocks count as equal (float32 rounding). Raises ValueError for other shapes.
+    ``z`` means the same for all K, L. ``floor``: standard error, relative to the larger of the block's and the images'
+    mean, below which blocks count as equal: the rounding of float32 sums over some thousand samples. Raises ValueError
+    for other shapes.
     """
     a, b = (np.asarray(x, dtype=np.float64) for x in (images_a, images_b))
     if a.ndim != 4 or b.ndim != 4 or a.shape[1:] != b.shape[1:] or min(len(a), len(b)) < 2:
         raise ValueError(
             f"block_z_test: got shapes {a.shape} and {b.shape}; allowed are [K, H, W, C] and [L, H, W, C] with "
-            f"K, L ≥ 2, since "
-            "the variance is estimated from the renders themselves"
+            "K, L ≥ 2, since the variance is estimated from the renders themselves"
         )
     means_a, means_b = block_means(a, blocks), block_means(b, blocks)
     squared_a, squared_b = means_a.var(axis=0, ddof=1) / len(a), means_b.var(axis=0, ddof=1) / len(b)
     squared = squared_a + squared_b
     difference = means_a.mean(axis=0) - means_b.mean(axis=0)
-    smallest = floor * max(abs(float(a.mean())), abs(float(b.mean())), 1e-30)
+    overall = max(abs(float(a.mean())), abs(float(b.mean())), 1e-30)
+    smallest = floor * np.maximum(np.maximum(np.abs(means_a).max(axis=0), np.abs(means_b).max(axis=0)), overall)
     t = difference / np.maximum(np.sqrt(squared), smallest)
     # Welch–Satterthwaite degrees of freedom
     pieces = squared_a**2 / (len(a) - 1) + squared_b**2 / (len(b) - 1)

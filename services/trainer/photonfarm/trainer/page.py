@@ -23,7 +23,8 @@ h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
 .curves { display: flex; flex-wrap: wrap; gap: 1rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .6rem .2rem 0; text-align: left; font-weight: normal;
         vertical-align: top; } th { color: #555; }
-.pictures td, .pictures th { text-align: center; max-width: 8.5rem; } img { image-rendering: pixelated; display: block; }
+.pictures td, .pictures th { text-align: center; max-width: 8.5rem; }
+img { image-rendering: pixelated; display: block; }
 p, li { max-width: 46rem; } code { overflow-wrap: anywhere; }
 """
 PICTURE_WIDTH = 128  # px on the page, at least

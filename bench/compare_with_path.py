@@ -145,10 +145,13 @@ def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[Row, 
     test = block_z_test(a, b, blocks=BLOCKS)
     reference = weighted_mean(a, b)
     cost = bdpt_s / plan.bdpt_spp / (path_s / plan.path_spp)
-    efficiency, trimmed = (
-        relative_mse(b, reference, trim=trim) * path_s / (relative_mse(a, reference, trim=trim) * bdpt_s)
-        for trim in (0.0, 0.01)
-    )
+
+    def error(images: Any, trim: float) -> float:
+        """relMSE about the set's own mean: that of another would count the better set's images against themselves."""
+        centred = images - images.mean(axis=0) + reference
+        return relative_mse(centred, reference, trim=trim) * len(images) / (len(images) - 1)
+
+    efficiency, trimmed = (error(b, trim) * path_s / (error(a, trim) * bdpt_s) for trim in (0.0, 0.01))
     row = Row(
         name, plan.size, plan.seeds, plan.path_spp, plan.bdpt_spp, arguments.connections, arguments.light_ratio,
         plan.max_depth, test.z_max, test.mean_ratio, test.mean_ratio_standard_error, efficiency, trimmed, cost,

@@ -10,7 +10,7 @@ import pytest
 
 from photonfarm.renderer import jobs
 from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.errors import BackendError, IncompleteError, QueueError
 from photonfarm.shared.keys import seed_of
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -188,13 +188,18 @@ def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     spec: SceneSpec = parse_spec(described, where="test", beside=folders[0])
     result = store.plan(spec, Request())
     renderer = ShardRenderer(store, worker="test", load=recorded.load)
-    with pytest.raises(SpecError, match="set PHOTONFARM_SCENES to the folder that holds it"):
+    with pytest.raises(BackendError, match="set PHOTONFARM_SCENES to the folder that holds it"):
         renderer.render(result.scene_id, 0)
     monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[1]))
-    with pytest.raises(SpecError, match="the scene file here is another one than was planned"):
+    with pytest.raises(BackendError, match="the scene file here is another one than was planned"):
         renderer.render(result.scene_id, 0)
     monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[0]))
     assert jobs.located(spec) == spec
+
+
+def test_a_job_of_another_store_is_refused(store: Store, recorded: type) -> None:
+    with pytest.raises(QueueError, match="is not of the store"):
+        ShardRenderer(store, worker="test", load=recorded.load).render("0" * 32, 0)
 
 
 def test_the_queues_function_does_nothing_outside_a_worker(monkeypatch: pytest.MonkeyPatch) -> None:

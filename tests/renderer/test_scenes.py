@@ -342,3 +342,23 @@ def test_a_real_room_is_loaded_edited_and_rendered(name: str, monkeypatch: pytes
     assert len(geometry.shape_group) == len(loaded.scene.shapes())
     assert np.all(np.isfinite(cloud.normal))
     assert set(np.unique(cloud.group)) <= {-1, *range(len(spec.groups))}
+
+
+def test_a_mesh_light_with_smooth_normals_is_refused_and_a_flat_one_is_not(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "bulb.ply")
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    described = {"name": "bulb", "scene": {"file": "scene.xml"}, "view": {"origin": unit, "look_at": unit}}
+
+    def load(flat: bool) -> LoadedScene:
+        (tmp_path / "scene.xml").write_text(
+            '<scene version="3.0.0"><shape type="ply" id="Bulb"><string name="filename" value="bulb.ply"/>'
+            f'<boolean name="face_normals" value="{str(flat).lower()}"/><emitter type="area"/></shape>'
+            '<shape type="rectangle" id="Floor"/></scene>'
+        )
+        return LoadedScene.load(parse_spec(described, where="test", beside=tmp_path), tmp_path)
+
+    with pytest.raises(SpecError, match="mesh light 'Bulb' has smooth vertex normals"):
+        load(flat=False)
+    assert load(flat=True).photons(0).power.sum() > 0  # type: ignore[union-attr]

@@ -5,7 +5,7 @@
     ├── StoreError (OSError)       exit 4   a store that cannot be read or written
     │   └── CorruptError           exit 4   stored bytes that are not what was committed
     ├── QueueError (OSError)       exit 5   no Redis, or one that refuses us
-    ├── BackendError (RuntimeError) exit 6  Mitsuba, Dr.Jit or LLVM cannot be used on this machine
+    ├── BackendError (RuntimeError) exit 6  this machine cannot render: Mitsuba, LLVM or scene files
     └── IncompleteError            exit 7   work that ended before it was done
 
 Exit 0 is success, 2 is wrong usage of a command (given by click). A message names the key, the value and the rule.
@@ -43,7 +43,7 @@ class QueueError(PhotonfarmError, OSError):
 
 
 class BackendError(PhotonfarmError, RuntimeError):
-    """Mitsuba, Dr.Jit or LLVM cannot be used here."""
+    """Mitsuba, Dr.Jit, LLVM or the scene files cannot be used on this machine."""
 
     exit_code = 6
 

@@ -68,7 +68,7 @@ def _surface_at(
     shape = geometry.face_shape[face]
     first = np.searchsorted(geometry.face_shape, np.arange(len(geometry.shape_group)))  # each shape's first face
     hit = dr.zeros(mi.PreliminaryIntersection3f, len(face))
-    hit.valid = mi.Bool(np.ones(len(face), np.bool_))
+    hit.valid = dr.full(mi.Bool, True, len(face))
     hit.t = floats(np.ones(len(face)))
     hit.prim_index = integers(face - first[shape])
     hit.prim_uv = mi.Point2f(*(floats(barycentric[:, i]) for i in (1, 2)))

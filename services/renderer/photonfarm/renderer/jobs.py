@@ -6,6 +6,7 @@ a non-finite value is thrown away and drawn again with the next seed of its kind
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, SpecError
 from photonfarm.shared.keys import Key, seed_of
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
@@ -97,8 +98,11 @@ class ShardRenderer:
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit one job; False if it was committed already.
 
-        Raises SpecError if the scene file here is not the planned one, IncompleteError if renders stay non-finite.
+        Raises QueueError for a job of another store, BackendError if the scene file here is not the planned one,
+        IncompleteError if renders stay non-finite.
         """
+        if scene_id not in self._store.scene_ids():
+            raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
         stored = self._store.scene(scene_id)
         if stored.is_committed(job):
             return False
@@ -121,18 +125,24 @@ class ShardRenderer:
             self._scenes[scene_id] = self._scenes.pop(scene_id)
         else:
             stored = self._store.scene(scene_id)
-            loaded = self._load(located(stored.spec))
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
-            self._scenes[scene_id] = stored, loaded
+            gc.collect()  # Dr.Jit finds no kernel in its cache while an older scene is still half alive
+            self._scenes[scene_id] = stored, self._load(located(stored.spec))
         return self._scenes[scene_id]
 
 
 def located(spec: SceneSpec) -> SceneSpec:
-    """The spec, once its scene file has been found on this machine and is the one that was planned; else SpecError."""
-    here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
+    """The spec, once its scene file has been found on this machine and is the one that was planned.
+
+    Raises BackendError otherwise: that is the machine's fault and not the job's, which others may do.
+    """
+    try:
+        here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
+    except SpecError as error:
+        raise BackendError(f"this machine cannot render {error}") from error
     if here.scene_id != spec.scene_id:
-        raise SpecError(
+        raise BackendError(
             f"scene {spec.scene_id} ({spec.name}): the scene file here is another one than was planned (its files' "
             f"digest is {here.content[:12]}…, planned was {spec.content[:12]}…); give every worker the same files"
         )

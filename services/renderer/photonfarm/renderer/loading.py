@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from photonfarm.renderer import rooms
+from photonfarm.renderer.bdpt.emission import is_flat
 from photonfarm.renderer.bdpt.scenes import check_scene
 from photonfarm.renderer.rooms.shapes import rectangle_light
 from photonfarm.shared.errors import SpecError
@@ -30,7 +31,18 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
         check_scene(scene)
     except ValueError as error:
         raise SpecError(f"{spec.name}: {error}") from error
+    _check_lights(spec, scene)
     return scene
+
+
+def _check_lights(spec: SceneSpec, scene: Any) -> None:
+    """Raise SpecError for mesh lights with smooth normals: they can be hit only, and would give next to pure noise."""
+    for shape in scene.shapes():
+        if shape.is_emitter() and shape.is_mesh() and not np.array(is_flat(shape)).all():
+            raise SpecError(
+                f"{spec.name}: mesh light {shape.id()!r} has smooth vertex normals, with which it cannot be sampled "
+                'without bias; give it <boolean name="face_normals" value="true"/>'
+            )
 
 
 def _builtin(spec: SceneSpec) -> Any:

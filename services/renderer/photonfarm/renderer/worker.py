@@ -236,10 +236,11 @@ class RenderWorker(SimpleWorker):
         self._settings = settings
         self._store = store
         self._fatal: PhotonfarmError | None = None
+        self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
         self._heart = _Heart(settings)
 
     def run(self) -> int:
-        """Work until stopped, complete or due for a successor; the exit code."""
+        """Work until stopped, complete or due for a successor; the exit code, 0 only if all is complete."""
         self._heart.start()
         self.bootstrap(logging_level="WARNING")
         self._install_signal_handlers()
@@ -255,7 +256,8 @@ class RenderWorker(SimpleWorker):
                 done += 1
                 if self._fatal:
                     raise self._fatal
-                if done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes:
+                worn = done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+                if worn or self._tainted:
                     return RECYCLED
         except StopRequested:
             pass
@@ -263,7 +265,7 @@ class RenderWorker(SimpleWorker):
             with contextlib.suppress(redis.RedisError):
                 self._heart.end()
                 self.teardown()
-        return 0
+        return RECYCLED  # for a supervisor that has not been told to stop itself
 
     def _take(self) -> tuple[RenderJob, Any] | None:
         self.heartbeat()
@@ -308,6 +310,7 @@ class RenderWorker(SimpleWorker):
         if isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
             self._fatal = error  # the next job would fail as well
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
+            self._tainted = not isinstance(error, PhotonfarmError)
             with contextlib.suppress(redis.RedisError):
                 queue.record_failure(self.connection, job.id, f"{type(error).__name__}: {error}")
         return False

@@ -104,7 +104,7 @@ def read_lights(scene: Any) -> Lights:
     weights = [_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
-            weights[i] = dr.select(_is_flat(shapes[key]), weights[i], 0)
+            weights[i] = dr.select(is_flat(shapes[key]), weights[i], 0)
     weight = _column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
     emit_weight = dr.select(kind == EYE_ONLY, 0, weight)
@@ -145,7 +145,7 @@ def _kind(emitter: Any, shape: Any) -> int:
     return AREA
 
 
-def _is_flat(mesh: Any) -> Any:
+def is_flat(mesh: Any) -> Any:
     """Whether a mesh light's vertex normals are its faces' (Bool, 1), as data.
 
     Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such

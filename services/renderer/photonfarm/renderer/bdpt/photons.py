@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from . import randomness
-from .emission import Emission, read_lights, sample_emission
-from .light_paths import LightState, PathOptions, first_state, roulette, scatter
+from .emission import read_lights, sample_emission
+from .light_paths import LightState, PathOptions, first_state, scatter
 from .loops import traced_once
 from .scenes import check_scene
 
@@ -36,19 +36,17 @@ class Photons:
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
-def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, rr_depth: int | None = None) -> Photons:
+def trace_photons(scene: Any, *, seed: int, paths: int, depth: int) -> Photons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
-    emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. ``rr_depth``: hits
-    after which Russian roulette thins the paths; None: never, since slots are fixed anyway. Compiles nothing again
-    when the scene is edited in place or for another seed. Raises ValueError for scenes with media, and for numbers
-    below 1.
+    emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
+    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see `emission`) emit none. Compiles
+    nothing again when the scene is edited in place or for another seed. Raises ValueError for scenes with media, and
+    for numbers below 1.
     """
-    if paths < 1 or depth < 1 or (rr_depth is not None and rr_depth < 1):
-        raise ValueError(
-            f"trace_photons: paths is {paths}, depth {depth}, rr_depth {rr_depth}; each must be at least 1"
-        )
+    if paths < 1 or depth < 1:
+        raise ValueError(f"trace_photons: paths is {paths} and depth {depth}; each must be at least 1")
     check_scene(scene)
     slots = paths * depth
     if not scene.emitters():
@@ -66,14 +64,13 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, rr_depth: in
         )
         bounce = dr.full(mi.Int32, -1, slots)
         zero = dr.opaque(mi.Float, 0)
-        options = PathOptions(depth + 1, rr_depth if rr_depth is not None else depth + 1, 0, zero, zero, False, False)
+        options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
         traced_once(
             state=(first_state(start, rng),),
             cond=lambda s: s.active,
             body=partial(
                 _hit,
                 scene=scene,
-                start=start,
                 options=options,
                 out=out,
                 bounce=bounce,
@@ -87,19 +84,16 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, rr_depth: in
     return Photons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 
 
-def _hit(
-    s: LightState, *, scene: Any, start: Emission, options: PathOptions, out: Any, bounce: Any, paths: Any
-) -> tuple[LightState]:
+def _hit(s: LightState, *, scene: Any, options: PathOptions, out: Any, bounce: Any, paths: Any) -> tuple[LightState]:
     """One vertex of a light path: write it down, scatter."""
     si = scene.ray_intersect(s.ray, active=s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & si.is_valid() & (cos_in > 0)
-    slot = s.depth * paths + dr.arange(mi.UInt32, dr.width(start.valid))
+    slot = s.depth * paths + dr.arange(mi.UInt32, dr.width(s.active))
     for column, value in zip(out, (si.p, s.ray.d, si.n, s.throughput), strict=True):
         dr.scatter(column, value, slot, active)
     dr.scatter(bounce, mi.Int32(s.depth), slot, active)
     depth = s.depth + 1
     state = replace(s, active=active & (depth + 1 < options.max_depth), depth=depth)
     scatter(state, si, si.bsdf(), cos_in, mi.Float(1))
-    roulette(state, start, options)
     return (state,)

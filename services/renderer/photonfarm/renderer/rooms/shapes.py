@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.arrays import floats, integers
 from photonfarm.renderer.rooms.materials import Colour, rgb
 from photonfarm.renderer.rooms.solids import smooth_normals
 
@@ -36,13 +37,13 @@ def mesh(
     )
     made.set_id(shape_id)
     parameters = mi.traverse(made)
-    parameters["faces"] = mi.UInt32(np.asarray(solid.faces, np.uint32).ravel())
+    parameters["faces"] = integers(np.asarray(solid.faces))
     if uv is not None:
-        parameters["vertex_texcoords"] = mi.Float(uv.ravel())
-    parameters["vertex_positions"] = mi.Float(np.asarray(solid.vertices, np.float32).ravel())
+        parameters["vertex_texcoords"] = floats(uv)
+    parameters["vertex_positions"] = floats(np.asarray(solid.vertices))
     parameters.update()
     if smooth:  # Mitsuba's own, made on the update, leave seams between the parts of a solid
-        parameters["vertex_normals"] = mi.Float(smooth_normals(np.asarray(solid.vertices), solid.faces).ravel())
+        parameters["vertex_normals"] = floats(smooth_normals(np.asarray(solid.vertices), solid.faces))
         parameters.update()
     return made
 

@@ -194,16 +194,18 @@ def save_pictures(folder: Path, name: str, pictures: dict[str, Any]) -> None:
 
 
 def print_table(rows: list[Row]) -> None:
+    """The table as Markdown."""
     print(
-        f"{'scene':24} {'size':>5} {'spp path/bdpt':>14} {'z max':>6} {'mean ratio':>17} {'efficiency':>10} "
-        f"{'trimmed':>8} "
-        f"{'cost':>6} {'wall s':>7}  verdict"
+        "| scene | size | seeds | spp path / bdpt | max block z | mean ratio | efficiency | trimmed | cost | wall s |",
+        end="",
     )
+    print(" verdict |")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for r in rows:
         print(
-            f"{r.scene[-24:]:24} {r.size:5} {f'{r.path_spp}/{r.bdpt_spp}':>14} {r.z_max:6.2f} "
-            f"{r.mean_ratio:8.4f} ± {r.mean_ratio_standard_error:.4f} {r.efficiency:10.2f} {r.efficiency_trimmed:8.2f} "
-            f"{f'×{r.cost_per_sample:.2f}':>6} {r.path_wall_s + r.bdpt_wall_s:7.0f}  {r.verdict}"
+            f"| {r.scene} | {r.size}² | {r.seeds} | {r.path_spp} / {r.bdpt_spp} | {r.z_max:.2f} "
+            f"| {r.mean_ratio:.4f} ± {r.mean_ratio_standard_error:.4f} | {r.efficiency:.2f} | {r.efficiency_trimmed:.2f} "
+            f"| ×{r.cost_per_sample:.2f} | {r.path_wall_s + r.bdpt_wall_s:.0f} | {r.verdict} |"
         )
 
 

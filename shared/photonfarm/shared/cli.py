@@ -7,12 +7,14 @@ from collections.abc import Callable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import click
+from click.core import ParameterSource
+from rich import markup
 from rich.console import Console
 
-from photonfarm.shared.errors import PhotonfarmError
+from photonfarm.shared.errors import PhotonfarmError, StoreError
 from photonfarm.shared.settings import file_defaults
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -48,7 +50,20 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     to stdout, talk goes to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec, 4 store, 5 Redis, 6 this machine
     cannot render, 7 incomplete, 1 anything else.
     """
-    ctx.default_map = file_defaults(config)
+    named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
+    if named or config.is_file():
+        ctx.default_map = file_defaults(config, {verb: _options(verb) for verb in _verbs()})
+
+
+def _options(verb: str) -> dict[str, str]:
+    """Names of a verb's options as they are written, without dashes, and what click calls them."""
+    parameters = _verbs()[verb].load().params
+    return {
+        flag.lstrip("-"): str(option.name)
+        for option in parameters
+        if isinstance(option, click.Option)
+        for flag in option.opts
+    }
 
 
 def main(args: list[str] | None = None) -> None:
@@ -56,8 +71,15 @@ def main(args: list[str] | None = None) -> None:
     try:
         umbrella(args, prog_name="photonfarm")
     except PhotonfarmError as error:
-        Console(stderr=True, soft_wrap=True).print(f"[bold red]photonfarm:[/] {error}", highlight=False)
-        sys.exit(error.exit_code)
+        _fail(str(error), error.exit_code)
+    except OSError as error:  # a file that a user named, and nobody closer to it could say more
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
+
+
+def _fail(sentence: str, exit_code: int) -> NoReturn:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print("[bold red]photonfarm:[/]", markup.escape(sentence), highlight=False)
+    sys.exit(exit_code)
 
 
 # --------------------------------------------------------------------------------------------------- options they share

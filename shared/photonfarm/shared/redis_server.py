@@ -12,7 +12,6 @@ import hashlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -20,19 +19,11 @@ from types import TracebackType
 from typing import IO, Self
 
 from photonfarm.shared.errors import QueueError
+from photonfarm.shared.processes import tied
 from photonfarm.shared.queue import connect
 
 START_S = 20.0
 STOP_S = 20.0
-
-_LAUNCH = """
-import ctypes, os, signal, sys
-if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: end with the process that started us…
-    if os.getppid() != int(sys.argv[1]):
-        sys.exit(1)  # …which has ended already
-os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 
 class EmbeddedRedis:
@@ -84,6 +75,11 @@ class EmbeddedRedis:
         """Stop the server."""
         self.stop()
 
+    def keep_running(self) -> None:
+        """Start the server again if it has ended; what it held is there again, but for its last second."""
+        if self._process is not None and self._lock is not None and self._process.poll() is not None:
+            self._wait_for_answer(self._start(self._lock))
+
     def stop(self) -> None:
         """Ask our own server to end, which writes what it holds, and wait for it."""
         if self._process is not None:
@@ -113,7 +109,7 @@ class EmbeddedRedis:
         return self._lock
 
     def _start(self, lock: IO[bytes]) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-c", _LAUNCH, str(os.getpid()), str(server_binary())]
+        command = tied([str(server_binary())])
         for setting, value in self._settings().items():
             command += [f"--{setting}", *value.split(" ")] if value else [f"--{setting}", ""]
         with (self.folder / "redis.log").open("ab") as log:

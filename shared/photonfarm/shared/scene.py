@@ -224,7 +224,7 @@ def load_spec(path: str | Path) -> SceneSpec:
 
     Raises SpecError with one sentence that names the key, the value and the rule.
     """
-    file = _find_spec(str(path))
+    file = find_spec(str(path))
     try:
         described = tomllib.loads(file.read_text())
     except (OSError, UnicodeDecodeError) as error:
@@ -293,7 +293,8 @@ def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
     )
 
 
-def _find_spec(name: str) -> Path:
+def find_spec(name: str) -> Path:
+    """The file of a spec: a path, or a bare name among `scenes/` here and the built-in ones; else SpecError."""
     path = Path(name)
     if path.suffix == ".toml" or path.exists():
         return path

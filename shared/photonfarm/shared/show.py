@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 import numpy as np
+from rich import markup
 from rich.console import Console
 from rich.table import Table
 
@@ -47,7 +48,7 @@ def _json(document: Any) -> None:
 def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
     table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(markup.escape, row))
     Console(soft_wrap=True).print(table, highlight=False)
 
 
@@ -166,7 +167,7 @@ def findings(found: Iterable[Finding], as_json: bool) -> int:
         seen.append(finding)
         if not as_json:
             mark = "[green]ok[/]  " if finding.works else ("[red]FAIL[/]" if finding.exit_code else "[yellow]none[/]")
-            console.print(f"{mark} [bold]{finding.name}[/]: {finding.detail}", highlight=False)
+            console.print(f"{mark} [bold]{finding.name}[/]: {markup.escape(finding.detail)}", highlight=False)
     if as_json:
         _json([{"name": f.name, "works": f.works, "detail": f.detail} for f in seen])
     return code

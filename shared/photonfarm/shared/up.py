@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from photonfarm.shared.errors import IncompleteError
+from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import SCENES_VARIABLE
+from photonfarm.shared.scene import SCENES_VARIABLE, find_spec
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.durable import store_errors
 from photonfarm.shared.submission import submit
 
 POLL_S = 0.5
@@ -28,29 +32,47 @@ Process = subprocess.Popen[bytes]
 
 
 def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: int, out: Path, **request: int) -> None:
-    """Submit, render, train, and write the preview and the report; raises IncompleteError if a part fails.
+    """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
     Started again after any interruption it goes on where it was, as the store and the trainer's checkpoints last.
     """
     console = Console(stderr=True, highlight=False)
-    run.mkdir(parents=True, exist_ok=True)
+    with store_errors("keep the logs of a run here", run):
+        run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
+        stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(spec, store, redis.url, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
-        environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis.url}
-        beside = str(Path(spec).parent)  # where the spec may have found its scene file, and the workers must too
-        environment[SCENES_VARIABLE] = os.pathsep.join(filter(None, (environment.get(SCENES_VARIABLE), beside)))
-        verbs = {f"worker-{i + 1}": ["work", "--until-complete", "--name", f"worker-{i + 1}"] for i in range(workers)}
+        environment = _environment(spec, store, redis.url)
+        work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
+        verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
             verbs["trainer"] = ["train", spec, "--run", str(run), "--steps", str(train_steps)]
         running = {
             name: stack.enter_context(_process(verb, environment, run / f"{name}.log")) for name, verb in verbs.items()
         }
-        _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), console)
-        _call(["preview", spec, "--out", str(out / "preview.html")], environment)
+        _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), redis, console)
         if train_steps:
             _call(["report", "--run", str(run), "--out", str(out)], environment)
+        _call(["preview", spec, "--out", str(out / "preview.html")], environment)
+
+
+@contextmanager
+def _unwound_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end us as Ctrl-C does, so that what we started is stopped."""
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _environment(spec: str, store: Path, redis_url: str) -> dict[str, str]:
+    """What our processes are told; also the folder of the spec, where its scene file may lie."""
+    scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
+    told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
+    return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
 
 
 def _verb(arguments: list[str]) -> list[str]:
@@ -68,8 +90,9 @@ def _process(arguments: list[str], environment: Mapping[str, str], log: Path) ->
     """One verb as a process of its own; on the way out it is asked to stop, and waited for."""
     with log.open("ab") as output:
         process = subprocess.Popen(
-            _verb(arguments), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        )
+            tied(_verb(arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, below
+        )  # fmt: skip
     try:
         yield process
     finally:
@@ -91,33 +114,31 @@ class _Farm:
         self.steps = steps
         self.step = 0
         self.note = ""
-        self._metrics_read = 0
 
     def look(self) -> tuple[int, int]:
         """Samples committed and planned, by now; `step` and `note` follow the trainer's log."""
-        path = self.run / "metrics.jsonl"
-        if path.exists():
-            with path.open() as lines:
-                lines.seek(self._metrics_read)
-                while (line := lines.readline()).endswith("\n"):
-                    self._metrics_read = lines.tell()
-                    self._take(json.loads(line))
+        for record in self._records():
+            self.step = record.get("step", self.step)
+            if record.get("kind") == "validation":
+                self.note = f", held-out error {record['error']:.5f} ± {record['standard_error']:.5f}"
         progress = self.scene.progress()
         return progress.committed_samples, progress.planned_samples
 
-    def _take(self, record: dict[str, object]) -> None:
-        self.step = int(str(record.get("step", self.step)))
-        if record.get("kind") == "validation":
-            self.note = f", held-out error {record['error']:.5f} ± {record['standard_error']:.5f}"
+    def _records(self) -> list[dict[str, Any]]:
+        """The trainer's log as it is now; read whole, since a trainer that resumes takes back what it will redo."""
+        path = self.run / "metrics.jsonl"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def _watch(running: Mapping[str, Process], farm: _Farm, console: Console) -> None:
+def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, console: Console) -> None:
     """Show progress until every process has ended; raises IncompleteError as soon as one has failed."""
     last_line = started = time.monotonic()
     with _bars(console) as bars:
         samples = bars.add_task("samples", total=None)
         steps = bars.add_task("training steps", total=farm.steps, visible=farm.steps > 0)
         while True:
+            redis.keep_running()
             alive = any(process.poll() is None for process in running.values())
             committed, planned = farm.look()
             bars.update(samples, completed=committed, total=planned)

@@ -26,16 +26,19 @@ def doctor(store: Path, redis_url: str, as_json: bool) -> None:
 @store_option
 @redis_option
 @click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
+@click.option("--scene", "scene_id", help="Work for this scene id alone.")
 @click.option("--until-complete", is_flag=True, help="Stop when nothing is missing.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
-def work(store: Path, redis_url: str, name: str | None, until_complete: bool, check: bool) -> None:
+def work(
+    store: Path, redis_url: str, name: str | None, scene_id: str | None, until_complete: bool, check: bool
+) -> None:
     """Render queued jobs into the store, on one core, until told to stop; start one per core."""
     from photonfarm.renderer import worker
 
     if check:
         worker.check(redis_url)
     else:
-        worker.run_worker(store, redis_url, name=name, until_complete=until_complete)
+        worker.run_worker(store, redis_url, name=name, scene_id=scene_id, until_complete=until_complete)
 
 
 @click.command()

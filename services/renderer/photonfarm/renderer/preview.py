@@ -56,7 +56,7 @@ def _table_row(reader: SceneReader, row: int) -> str:
         pictures.of_albedo(sample.buffers.albedo),
         pictures.of_normal(sample.buffers.normal),
         pictures.of_depth(sample.buffers.depth),
-        photon_picture(sample, reader.read_photons(row), spec),
+        photon_picture(sample, reader.read_photons(row) if spec.photons.paths else None, spec),
     )
     scale = max(1, 128 // spec.film.width)
     cells = "".join(f'<td><img alt="" src="{pictures.png_uri(panel, scale)}">' for panel in panels)

@@ -202,9 +202,10 @@ def print_table(rows: list[Row]) -> None:
     print(" verdict |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for r in rows:
+        ratio = f"{r.mean_ratio:.4f} ± {r.mean_ratio_standard_error:.4f}"
         print(
             f"| {r.scene} | {r.size}² | {r.seeds} | {r.path_spp} / {r.bdpt_spp} | {r.z_max:.2f} "
-            f"| {r.mean_ratio:.4f} ± {r.mean_ratio_standard_error:.4f} | {r.efficiency:.2f} | {r.efficiency_trimmed:.2f} "
+            f"| {ratio} | {r.efficiency:.2f} | {r.efficiency_trimmed:.2f} "
             f"| ×{r.cost_per_sample:.2f} | {r.path_wall_s + r.bdpt_wall_s:.0f} | {r.verdict} |"
         )
 

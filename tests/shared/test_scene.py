@@ -123,6 +123,8 @@ def test_a_light_is_shapes_or_a_rectangle_and_not_both(scenes: Path) -> None:
         parse_spec(changed(lights=[light]), where="spec")
     lit = {**light, "rectangle": {"size": [1, 1], "radiance": [3, 3, 3]}}
     assert parse_spec(changed(lights=[lit]), where="spec").lights[0].removal_probability == 0
+    with pytest.raises(SpecError, match=r"lamp.shapes: none of Floor emits light in the scene"):
+        parse_spec(changed(lights=[{**light, "shapes": ["Floor"]}]), where="spec")
     dark = {**light, "rectangle": {"size": [1, 1], "radiance": [0, 0, 0]}}
     with pytest.raises(SpecError, match="all ≥ 0 and one > 0"):
         parse_spec(changed(lights=[dark]), where="spec")

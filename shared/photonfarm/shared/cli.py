@@ -184,7 +184,11 @@ def up(spec: str, store: Path, workers: int, run: Path, train_steps: int, out: P
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done."""
     from photonfarm.shared.up import run_farm
 
-    run_farm(spec, store, workers=workers, run=run, train_steps=train_steps, out=out, **request)
+    try:
+        run_farm(spec, store, workers=workers, run=run, train_steps=train_steps, out=out, **request)
+    except KeyboardInterrupt:
+        click.echo("stopped; the same command goes on from here", err=True)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -239,11 +239,12 @@ def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = N
     spec = _validate({**described, "content": ""}, where)
     if spec.scene.file is None:
         content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
-        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
+        _check_shapes(spec, scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)], where)
     else:
         scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
-        content, known = scene.digest, scene.shape_ids
-    _check_shapes(spec, known, where)
+        content = scene.digest
+        _check_shapes(spec, scene.shape_ids, where)
+        _check_lights(spec, scene.emitting, where)
     return spec.model_copy(update={"content": content})
 
 
@@ -275,6 +276,15 @@ def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
                 )
         if isinstance(group, Light) and group.rectangle and group.name in known:
             raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
+
+
+def _check_lights(spec: SceneSpec, emitting: frozenset[str], where: str) -> None:
+    for light in spec.lights:
+        if light.shapes and not emitting.intersection(light.shapes):
+            raise SpecError(
+                f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
+                "moves belongs under [[objects]]"
+            )
 
 
 def find_scene(file: str, where: str, beside: Path | None = None) -> Path:

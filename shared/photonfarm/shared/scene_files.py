@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +46,7 @@ class SceneFile:
 
     path: Path
     shape_ids: frozenset[str]
+    emitting: frozenset[str]  # ids of the shapes that are lights
     digest: str  # of the file and of every file it names
 
     @classmethod
@@ -53,8 +54,14 @@ class SceneFile:
         """Read and check a scene; raises SpecError for a missing file or an unsupported feature."""
         root = _parse(path)
         _refuse_unsupported(root, path)
-        ids = {node.get("id", "") for node in root.iter("shape")} - {""}
-        return cls(path, frozenset(ids), _digest(path, _named_files(root, path)))
+        shapes = {node.get("id", ""): node for node in root.iter("shape") if node.get("id")}
+        lights = {node.get("id") for node in root.iter("emitter")} - {None}
+        emitting = {name for name, node in shapes.items() if _emits(node, lights)}
+        return cls(path, frozenset(shapes), frozenset(emitting), _digest(path, _named_files(root, path)))
+
+
+def _emits(shape: ElementTree.Element, lights: Set[str | None]) -> bool:
+    return any(part.tag == "emitter" or (part.tag == "ref" and part.get("id") in lights) for part in shape)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

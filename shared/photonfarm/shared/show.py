@@ -49,7 +49,9 @@ def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
     table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
     for row in rows:
         table.add_row(*map(markup.escape, row))
-    Console(soft_wrap=True).print(table, highlight=False)
+    console = Console(soft_wrap=True)
+    console.width = max(console.width, 132)  # ids are for copying: never cut
+    console.print(table, highlight=False)
 
 
 # ----------------------------------------------------------------------------------------------------------- scene show
@@ -109,6 +111,11 @@ def submission(result: Submission, as_json: bool) -> None:
     """What became of a request."""
     if as_json:
         _json(asdict(result))
+        return
+    if result.dry_run:
+        click.echo(
+            f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
+        )
         return
     queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
     click.echo(

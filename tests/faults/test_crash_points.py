@@ -1,5 +1,6 @@
 """A writer is killed at every step of its work; nothing half-done is ever seen, and the next writer completes it."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -111,7 +112,11 @@ def test_temporary_files_of_the_living_and_of_other_machines_are_left_alone(
     scene = planned(1)
     mine = durable.temporary(scene.folder / "tmp")
     foreign = scene.folder / "tmp/another-machine-1-0-0.partial"
-    for path in (mine, foreign):
+    namesake = scene.folder / f"tmp/{os.uname().nodename}-2-0-4194999-0-0.partial"  # of host "…-2", or a container
+    dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-4194999-"))  # no process has this number
+    for path in (mine, foreign, namesake, dead):
         path.write_bytes(b"half a file")
+    assert Store(scene.folder.parent.parent).sweep(stray_age_s=0) == 1
+    assert not dead.exists()
     assert Store(scene.folder.parent.parent).sweep(stray_age_s=0) == 0
-    assert durable.sweep(scene.folder / "tmp", now_s=foreign.stat().st_mtime + 2 * 86400) == 2
+    assert durable.sweep(scene.folder / "tmp", now_s=foreign.stat().st_mtime + 2 * 86400) == 3

@@ -146,6 +146,21 @@ def test_after_three_renders_that_are_not_finite_the_job_fails_and_nothing_is_st
     assert scene.missing_jobs() == [0, 1]
 
 
+def test_buffers_that_are_not_finite_fail_the_job_and_name_view_and_sample(
+    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = recorded.buffers
+
+    def broken(self: Any, view: Any) -> Any:
+        buffers = plain(self, view)
+        buffers.normal[0, 0, 0] = np.nan
+        return buffers
+
+    monkeypatch.setattr(recorded, "buffers", broken)
+    with pytest.raises(IncompleteError, match=r"normal of view 0 came out non-finite \(sample [0-9a-f]{32}\)"):
+        render_all(scene, store, recorded)
+
+
 def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, recorded: type) -> None:
     render_all(scene, store, recorded)
     recorded.calls.clear()

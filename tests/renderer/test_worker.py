@@ -92,6 +92,21 @@ def test_a_machine_without_a_backend_ends_the_worker_and_fails_no_job(
     assert queue_status(connect(server.url)).failed == {}
 
 
+def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    """The other scene's job, queued by someone else, cannot be stored: that scene's failure and not the worker's."""
+    store = Store(tmp_path / "store")
+    other = store.scene(store.plan(analytic.small_spec(points=17), Request(modifications=6), shard_rows=3).scene_id)
+    (other.folder / "tmp").rmdir()
+    (other.folder / "tmp").write_text("a file where the folder should be")
+    queue.reconcile(store, connect(server.url), scene_id=other.scene_id, limit=1)
+    run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
+    assert scene.missing_jobs() == []
+    assert other.missing_jobs() == [0, 1]
+    assert list(queue_status(connect(server.url)).failed) == [f"{other.scene_id}-0"]
+
+
 def test_strangers_in_the_queue_are_refused_and_ours_go_on(
     analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
 ) -> None:

@@ -110,15 +110,6 @@ def test_another_seed_plans_other_samples(store: Store) -> None:
     assert store.plan(samples.small_spec(), Request(modifications=3, seed=1)).new >= 2
 
 
-def test_a_request_can_be_extended_by_its_first_modification(store: Store) -> None:
-    spec = samples.small_spec()
-    scene = store.scene(store.plan(spec, Request(modifications=10, views_per_modification=2)).scene_id)
-    store.plan(spec, Request(modifications=10, views_per_modification=2, first_modification=10))
-    whole = Store(store.root.parent / "whole", create=True)
-    other = whole.scene(whole.plan(spec, Request(modifications=20, views_per_modification=2)).scene_id)
-    assert set(planned(scene)) == set(planned(other))
-
-
 def test_a_static_scene_has_one_modification_and_as_many_views_as_were_asked_for(store: Store) -> None:
     result = store.plan(
         samples.small_spec(objects=[]), Request(modifications=20, views_per_modification=3), shard_rows=8

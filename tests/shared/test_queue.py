@@ -161,6 +161,12 @@ def test_a_job_with_a_heartbeat_or_a_recent_failure_is_left_alone(
     assert queue_status(connection).workers == 0
 
 
+def test_one_scene_alone_can_be_queued(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
+    store.plan(samples.small_spec(points=17), Request())
+    assert reconcile(store, connection, scene_id=scene.scene_id) == 10
+    assert reconcile(store, connection) == 1
+
+
 def test_no_more_is_queued_than_the_limit(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
     assert reconcile(store, connection, limit=4) == 4
     assert reconcile(store, connection, limit=4) == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import StoreError
+from photonfarm.shared.errors import IncompleteError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers, arrays_of
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
@@ -91,17 +91,17 @@ def test_a_value_that_is_not_finite_is_refused_and_nothing_is_committed(
     given = samples.outputs(scene, 0)
     target = given.radiance[1] if where == "radiance" else given.buffers[1].depth
     target.flat[5] = value
-    with pytest.raises(StoreError, match=f"{where}.* of row 1"):
+    with pytest.raises(IncompleteError, match=f"{where}.* of row 1"):
         scene.commit(0, given, samples.FIGURES)
     assert scene.missing_jobs() == [0, 1, 2]
 
 
 def test_outputs_that_are_not_exactly_the_jobs_are_refused(scene: SceneStore) -> None:
     given = samples.outputs(scene, 0)
-    with pytest.raises(StoreError, match="radiance of job 0: row 3 is missing"):
+    with pytest.raises(IncompleteError, match="radiance of job 0: row 3 is missing"):
         scene.commit(0, replace(given, radiance={r: v for r, v in given.radiance.items() if r != 3}), samples.FIGURES)
     wrong = {**given.buffers, 0: ViewBuffers(*(np.zeros((4, 4), np.float32),) * 3)}
-    with pytest.raises(StoreError, match=r"depth of row 0 has shape \(4, 4\); \(8, 8\) is required"):
+    with pytest.raises(IncompleteError, match=r"depth of row 0 has shape \(4, 4\); \(8, 8\) is required"):
         scene.commit(0, replace(given, buffers=wrong), samples.FIGURES)
 
 
@@ -122,6 +122,39 @@ def test_two_writers_of_one_job_leave_one_complete_job(scene: SceneStore) -> Non
     marker.unlink()
     assert scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
     assert json.loads(marker.read_text())["files"] == described
+
+
+def test_files_that_a_dead_writer_left_without_a_row_are_replaced(scene: SceneStore) -> None:
+    """Its row 1 was to lie in radiance_wide; rendered again, it fits float16."""
+    theirs, ours = samples.outputs(scene, 0), samples.outputs(scene, 0)
+    theirs.radiance[1][0, 0, 0, 0] = 1e9
+    scene.commit(0, theirs, samples.FIGURES)
+    (scene.folder / "committed/000000000000.json").unlink()
+    (scene.folder / "plans/000000/radiance_wide/c.0.0.0.0.0").unlink()
+    assert scene.commit(0, ours, samples.FIGURES)
+    for row in range(4):
+        np.testing.assert_array_equal(reader_of(scene).read(row).radiance, ours.radiance[row])
+
+
+def test_a_whole_render_that_a_dead_writer_left_is_kept_and_described(scene: SceneStore) -> None:
+    theirs = samples.outputs(scene, 0)
+    theirs.radiance[1][0, 0, 0, 0] = 1e9
+    scene.commit(0, theirs, samples.FIGURES)
+    files = scene.marker(0)["files"]
+    (scene.folder / "committed/000000000000.json").unlink()
+    assert scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+    assert scene.marker(0)["files"] == files
+    assert reader_of(scene).read(1).radiance[0, 0, 0, 0] == np.float32(1e9)
+
+
+def test_plans_are_loaded_once_by_a_store(store: Store, scene: SceneStore) -> None:
+    assert store.scene(scene.scene_id).plans()[0] is store.scenes()[0].plans()[0]
+
+
+def test_a_store_that_is_just_being_made_holds_no_scenes(store: Store) -> None:
+    (store.root / "scenes").rmdir()
+    looked_at = Store(store.root)
+    assert (looked_at.scenes(), looked_at.sweep()) == ([], 0)
 
 
 def test_a_marker_tells_the_files_and_the_figures(scene: SceneStore) -> None:

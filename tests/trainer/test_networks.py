@@ -92,9 +92,10 @@ def test_an_image_keeps_its_size_and_may_be_negative(shape: tuple[int, int]) -> 
 def batch_of(source, rows: tuple[int, ...]) -> Batch:
     _, cloud = source.base()
     batch = Batch.empty(len(rows), len(cloud.position), source.spec)
-    for place, row in enumerate(rows):
-        fill(batch, place, Compact.of(source.read(row), source.spec), source.spec, cloud)
-    return batch.filled(rows)
+    samples = [Compact.of(source.read(row), source.spec) for row in rows]
+    for place, sample in enumerate(samples):
+        fill(batch, place, sample, source.spec, cloud)
+    return batch.filled(rows, tuple(sample.unit for sample in samples))
 
 
 def network(source, seed: int = 0, **settings: object):

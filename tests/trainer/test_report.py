@@ -9,11 +9,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.trainer.curve import Level, learning_curve
 from photonfarm.trainer.dataset import is_held_out
-from photonfarm.trainer.loop import train
+from photonfarm.trainer.loop import SETTINGS, train
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.store_source import StoreSource
 
@@ -41,7 +41,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     assert figures["val_error_last"] < figures["val_error_first"]
     assert figures["noise_floor"] > 0
     assert figures["val_error_mean_colour"] > 0
-    assert figures["samples_held_out"] % 4 == 0, "whole configurations, two views of two passes each"
+    assert figures["samples_held_out"] == 4 * figures["configurations_held_out"], "two views of two passes each"
 
     page = (tmp_path / "out/report.html").read_text()
     assert page.count("data:image/png;base64,") == 4 * min(6, figures["samples_held_out"])
@@ -84,6 +84,26 @@ def test_a_report_without_held_out_samples_says_so(scene, commit, make_source, t
     commit(scene, 0)
     with pytest.raises(IncompleteError, match="samples are complete; a report needs both"):
         write_report(scene.folder.parent.parent, run, tmp_path / "out")
+
+
+def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene, commit, tiny, run, tmp_path) -> None:
+    scene.plan(Request(modifications=8, views_per_modification=2), shard_rows=16)
+    commit(scene, 0)
+    source = StoreSource(scene.folder.parent.parent, scene.scene_id)
+    shares = np.linspace(0.01, 0.9, 90)
+    rows = source.refresh()
+    share = next(s for s in shares if sum(is_held_out(source, int(row), s) for row in rows) == 2)
+    store = scene.folder.parent.parent
+    train(StoreSource(store, scene.scene_id), tiny(max_steps=1, hold_out=share, minimum_samples=1), run)
+    settings = json.loads((run / SETTINGS).read_text())
+    (run / SETTINGS).write_text(json.dumps({**settings, "device": "cuda"}))
+    write_report(store, run, tmp_path / "out")
+    assert json.loads((tmp_path / "out/report.json").read_text())["val_error_last_standard_error"] is None
+    assert "NaN" not in (tmp_path / "out/report.json").read_text()
+    assert "(± –)" in (tmp_path / "out/report.html").read_text()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot write the report"):
+        write_report(store, run, tmp_path / "file")
 
 
 def test_a_learning_curve_names_its_axes_and_puts_smaller_errors_lower() -> None:

@@ -70,6 +70,19 @@ def test_equal_seeds_and_arrivals_give_equal_draws_and_other_seeds_do_not() -> N
     assert grown(RoundSampler(0, 2)) == grown(RoundSampler(0, 2)) != grown(RoundSampler(1, 2))
 
 
+@pytest.mark.parametrize("lot", [1, 2, 3, 6])
+def test_draws_do_not_depend_on_the_lots_in_which_rows_arrived_between_them(lot: int) -> None:
+    whole, lots = RoundSampler(0, 2), RoundSampler(0, 2)
+    for first in (0, 12, 24):
+        whole.add(range(first, first + 12))
+        for row in range(first, first + 12, lot):
+            lots.add(range(row, row + lot))
+        again = RoundSampler(0, 2)
+        again.restore(lots.state())
+        lots = again
+        assert [whole.draw(4) for _ in range(7)] == [lots.draw(4) for _ in range(7)]
+
+
 def test_a_restored_sampler_goes_on_as_the_first_would_have() -> None:
     first, second = RoundSampler(5, 2), RoundSampler(5, 2)
     grown(first)

@@ -1,8 +1,10 @@
 """Training runs on the analytic scene: learning, pace, interruption, exact resume."""
 
+import json
 import os
 import signal
 import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -10,10 +12,11 @@ import pytest
 import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.trainer import checkpoint, metrics_log
+from photonfarm.trainer import checkpoint, metrics_log, service
 from photonfarm.trainer.figures import evaluate
 from photonfarm.trainer.following import Growth
 from photonfarm.trainer.loop import CHECKPOINT, METRICS, read_settings, stop_on_signals, train
+from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import NetworkSettings, small
 
 
@@ -61,9 +64,13 @@ def test_a_killed_run_goes_on_to_the_same_weights_to_the_bit(make_source, tiny, 
     assert steps[0] == steps[1]
 
 
-def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_even_if_killed(make_source, tiny, run, tmp_path) -> None:
-    settings = tiny(max_steps=20, replay_ratio=1.0, replay_buffer=0, minimum_samples=3, poll_seconds=0.1)
-    train(make_source(60, per_look=6), settings, run)
+@pytest.mark.parametrize("per_look", [1, 2, 3, 6])
+def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_even_if_killed(
+    make_source, tiny, run, tmp_path, per_look: int
+) -> None:
+    growing = {"replay_ratio": 1.0, "replay_buffer": 0, "minimum_samples": 8, "poll_seconds": 0.1 * per_look / 6}
+    settings = tiny(max_steps=20, **growing)
+    train(make_source(60, per_look=per_look), settings, run)
     state = checkpoint.load(run / CHECKPOINT)["following"]
     script = Growth(state["arrived"], [tuple(entry) for entry in state["growth"]])
     assert len(script.log) > 3, "rows arrived between steps"
@@ -178,8 +185,65 @@ def test_a_run_is_not_continued_as_another_one(make_source, tiny, run, change: d
 
 
 def test_a_hold_out_that_leaves_nothing_to_validate_on_is_refused(make_source, tiny, run) -> None:
-    with pytest.raises(SpecError, match="hold_out = 1e-06: none of the 8 samples"):
+    with pytest.raises(SpecError, match="hold_out = 1e-06: of the 8 samples planned none is held out"):
         train(make_source(8), tiny(hold_out=1e-6), run)
+
+
+def test_a_hold_out_that_leaves_nothing_to_train_on_is_refused(make_source, tiny, run) -> None:
+    with pytest.raises(SpecError, match=r"hold_out = 0.999999: of the 8 samples planned all are held out"):
+        train(make_source(8), tiny(hold_out=0.999999), run)
+
+
+def test_time_that_is_up_before_anything_is_held_out_leaves_a_checkpoint(make_source, tiny, run) -> None:
+    outcome = train(make_source(8, per_look=0), tiny(max_seconds=0.1), run)
+    assert (outcome.reason, outcome.last_error) == ("seconds", None)
+    assert checkpoint.load(run / CHECKPOINT)["step"] == 0
+
+
+def test_a_run_has_one_trainer_at_a_time(make_source, tiny, run) -> None:
+    with held(run), pytest.raises(StoreError, match="another trainer is at work on this run"):
+        train(make_source(24), tiny(), run)
+    assert train(make_source(24), tiny(max_steps=1), run).step == 1
+
+
+@pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
+def test_a_device_that_is_not_there_is_refused(make_source, tiny, run, device: str) -> None:
+    with pytest.raises(SpecError, match=f"device = '{device}'"):
+        train(make_source(24), tiny(device=device), run)
+
+
+def test_who_reads_the_log_while_it_is_cut_has_it_whole(tmp_path) -> None:
+    path = tmp_path / METRICS
+    log = metrics_log.MetricsLog(path)
+    for step in (1, 2, 3):
+        log.write("train", step=step)
+    with path.open() as reader:
+        log.cut(2)
+        log.write("train", step=4)
+        assert [json.loads(line)["step"] for line in reader] == [1, 2, 3]
+    assert [record["step"] for record in metrics_log.read(path)] == [1, 2, 4]
+
+
+def test_a_full_disk_is_named(tmp_path) -> None:
+    for name in (METRICS, "checkpoint.partial"):
+        (tmp_path / name).symlink_to("/dev/full")
+    with pytest.raises(StoreError, match="cannot write the log: No space left"):
+        metrics_log.MetricsLog(tmp_path / METRICS).write("train", step=1)
+    with pytest.raises(StoreError, match="cannot write the checkpoint: No space left"):
+        checkpoint.save(tmp_path / CHECKPOINT, {})
+
+
+def test_a_run_folder_that_is_a_file_is_named(make_source, tiny, run) -> None:
+    run.write_text("")
+    with pytest.raises(StoreError, match="cannot keep a training run here"):
+        train(make_source(24), tiny(), run)
+
+
+def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path, capsys) -> None:
+    began = time.monotonic()
+    service.run(None, tmp_path / "store", run, "small", {"max_seconds": 0.3})
+    assert time.monotonic() - began < 5
+    assert "no scene to train on has come" in capsys.readouterr().err
 
 
 def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run) -> None:
@@ -195,3 +259,12 @@ def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(make_source, tiny, ru
     with pytest.raises(StoreError, match="is not a readable checkpoint"):
         train(make_source(24), tiny(), run)
     assert (run / CHECKPOINT).read_bytes() == damaged
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"garbage", b"\x80\x02}q\x00.", bytes(range(256)) * 9, b"PK\x03\x04" + bytes(99)]
+)
+def test_bytes_that_are_no_checkpoint_are_refused(tmp_path, content: bytes) -> None:
+    (tmp_path / CHECKPOINT).write_bytes(content)
+    with pytest.raises(StoreError, match=r"checkpoint\.pt: (is not a readable checkpoint|has format None)"):
+        checkpoint.load(tmp_path / CHECKPOINT)

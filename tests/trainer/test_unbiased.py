@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.estimate import Estimate, clean_error, noise_floor
+from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
 from photonfarm.trainer.dataset import Batch, Compact, fill
 from photonfarm.trainer.losses import LOSSES, linear_loss
 from photonfarm.trainer.model import SceneFrame, build
@@ -56,6 +56,14 @@ def test_the_error_with_the_noise_removed_is_the_error_against_the_clean_image()
     truth = float(np.mean((prediction - clean) ** 2))
     assert abs(found.mean - truth) < 3 * found.standard_error
     assert found.standard_error < 0.1 * truth
+
+
+def test_values_of_one_configuration_count_as_one() -> None:
+    """Eight equal values each: the error is that of the 50 configurations, not of 400 samples."""
+    values = np.random.default_rng(3).normal(size=50)
+    found = Estimate.of(group_means(np.repeat(values, 8), list(np.repeat(np.arange(50), 8))))
+    assert found.count == 50
+    assert found.standard_error == pytest.approx(Estimate.of(values).standard_error)
 
 
 def test_the_noise_floor_is_the_variance_of_the_target() -> None:

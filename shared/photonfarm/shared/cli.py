@@ -179,13 +179,20 @@ def status(store: Path, redis_url: str, as_json: bool) -> None:
 @click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
 @click.option("--run", type=click.Path(path_type=Path), default="run", show_default=True, help="The trainer's folder.")
 @click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.125,
+    show_default=True,
+    help="Share of the configurations never trained on; a small plan needs a large one.",
+)
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
-def up(spec: str, store: Path, workers: int, run: Path, train_steps: int, out: Path, **request: Any) -> None:
+def up(spec: str, store: Path, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done."""
     from photonfarm.shared.up import run_farm
 
     try:
-        run_farm(spec, store, workers=workers, run=run, train_steps=train_steps, out=out, **request)
+        run_farm(spec, store, **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

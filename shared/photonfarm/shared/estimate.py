@@ -7,6 +7,7 @@ Arrays are (..., H, W, 3); values are linear radiance (exposed or not), never cl
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from photonfarm.shared.records import F32
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean over samples and its standard error, from `count` independent samples."""
+    """A mean and its standard error, from `count` independent samples; `group_means` makes dependent ones so."""
 
     mean: float
     standard_error: float  # nan for one sample
@@ -31,6 +32,13 @@ class Estimate:
             raise ValueError("per_sample is empty; an estimate needs at least one sample")
         error = float(np.std(per_sample, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
         return cls(float(np.mean(per_sample)), error, count)
+
+
+def group_means(values: NDArray[np.float64], groups: Sequence[Hashable]) -> NDArray[np.float64]:
+    """The mean value of each group, in order of first appearance; `groups` names the group of each value."""
+    place = {group: i for i, group in enumerate(dict.fromkeys(groups))}
+    of_value = np.array([place[group] for group in groups], np.int64)
+    return np.bincount(of_value, weights=values) / np.bincount(of_value)
 
 
 def clean_error(prediction: F32, half_a: F32, half_b: F32) -> float:

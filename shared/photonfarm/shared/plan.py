@@ -8,9 +8,8 @@ as many views more, so that no view is drawn twice and the share of each configu
 of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
 different views of it.
 
-The views of a configuration are numbered from 0; growing any number of a request that starts at modification 0
-therefore names a superset of the old samples, and only the new ones are planned. New views and passes refer to the
-rows that are there.
+The views of a configuration are numbered from 0; growing any number of a request therefore names a superset of the
+old samples, and only the new ones are planned. New views and passes refer to the rows that are there.
 """
 
 from __future__ import annotations
@@ -50,15 +49,11 @@ class Request(Frozen):
     views_per_modification: Count = 1
     passes: Annotated[int, Field(ge=1, le=65536)] = 1
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
-    first_modification: Annotated[int, Field(ge=0, le=MAX_SAMPLES)] = 0  # index of the first; extends an older request
 
     @model_validator(mode="after")
     def _is_not_too_large(self) -> Self:
         if self.samples > MAX_SAMPLES:
-            raise ValueError(
-                f"names {self.samples} samples; at most {MAX_SAMPLES} fit one request: "
-                "make several, with first_modification"
-            )
+            raise ValueError(f"names {self.samples} samples; at most {MAX_SAMPLES} fit one request")
         return self
 
     @property
@@ -180,26 +175,21 @@ def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int)
 def _configurations(spec: SceneSpec, request: Request) -> Iterator[tuple[Modification, range]]:
     """The distinct configurations of a request in order of appearance, each with the indices of its views.
 
-    The n-th appearance of a configuration, counted from index 0 on, stands for views n·V … n·V + V − 1 of it.
+    The n-th appearance of a configuration, stands for views n·V … n·V + V − 1 of it.
     """
     each = request.views_per_modification
-    first, end = request.first_modification, request.first_modification + request.modifications
     if not spec.groups:
-        yield rest(spec), range(first * each, end * each)
+        yield rest(spec), range(request.modifications * each)
         return
-    before: dict[bytes, int] = {}
-    within: dict[bytes, int] = {}
+    counts: dict[bytes, int] = {}
     found: dict[bytes, Modification] = {}
-    for index in range(end):
+    for index in range(request.modifications):
         modification = sample_modification(spec, request.seed, index)
         content = modification.vector.tobytes()
-        counts = before if index < first else within
         counts[content] = counts.get(content, 0) + 1
-        if index >= first:
-            found.setdefault(content, modification)
+        found.setdefault(content, modification)
     for content, modification in found.items():
-        start = before.get(content, 0)
-        yield modification, range(start * each, (start + within[content]) * each)
+        yield modification, range(counts[content] * each)
 
 
 class _Packing:

@@ -28,7 +28,7 @@ from rq.worker_registration import clean_worker_registry
 
 from photonfarm.shared.errors import IncompleteError, QueueError
 from photonfarm.shared.scene import Frozen, sentences
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import SceneStore, Store
 
 QUEUE = "photonfarm"
 FUNCTION = "photonfarm.renderer.jobs.render_shard"
@@ -137,19 +137,26 @@ def open_queue(connection: Redis) -> Queue:
 
 
 def reconcile(
-    store: Store, connection: Redis, *, limit: int = QUEUE_LIMIT, wait_s: float = 10.0, retry_failed: bool = False
+    store: Store,
+    connection: Redis,
+    *,
+    scene_id: str | None = None,
+    limit: int = QUEUE_LIMIT,
+    wait_s: float = 10.0,
+    retry_failed: bool = False,
 ) -> int:
     """Queue every job that is planned, not committed, not queued, not alive and not failed; how many that were.
 
-    One caller at a time: 0 if another one is at it for longer than `wait_s`. At most `limit` jobs are queued in all;
-    the rest follows later. `retry_failed` forgets failures first. Raises QueueError if Redis fails.
+    Of one scene, or of all. One caller at a time: 0 if another one is at it for longer than `wait_s`. At most `limit`
+    jobs are queued in all; the rest follows later. `retry_failed` forgets failures first.
+    Raises QueueError if Redis fails, StoreError if the scene is not there.
     """
     try:
         lock = connection.lock(_LOCK, timeout=LOCK_TTL_S)
         if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
             return 0
         try:
-            return _reconcile(store, connection, limit, retry_failed)
+            return _reconcile(store.scenes(scene_id), connection, limit, retry_failed)
         finally:
             if lock.owned():
                 lock.release()
@@ -157,7 +164,7 @@ def reconcile(
         raise QueueError(f"Redis failed while the queue was filled: {error}") from error
 
 
-def _reconcile(store: Store, connection: Redis, limit: int, retry_failed: bool) -> int:
+def _reconcile(scenes: Iterable[SceneStore], connection: Redis, limit: int, retry_failed: bool) -> int:
     queue = open_queue(connection)
     if retry_failed:
         _forget_failures(connection)
@@ -167,7 +174,7 @@ def _reconcile(store: Store, connection: Redis, limit: int, retry_failed: bool) 
     busy = queued | alive | failed
     missing = (
         (scene.scene_id, job)
-        for scene in store.scenes()
+        for scene in scenes
         for job in scene.missing_jobs()
         if job_name(scene.scene_id, job) not in busy
     )

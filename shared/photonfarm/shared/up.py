@@ -31,7 +31,9 @@ STOP_S = 120.0  # for a process to finish its job or to write its checkpoint
 Process = subprocess.Popen[bytes]
 
 
-def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: int, out: Path, **request: int) -> None:
+def run_farm(
+    spec: str, store: Path, *, workers: int, run: Path, train_steps: int, hold_out: float, out: Path, **request: int
+) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
     Started again after any interruption it goes on where it was, as the store and the trainer's checkpoints last.
@@ -48,7 +50,16 @@ def run_farm(spec: str, store: Path, *, workers: int, run: Path, train_steps: in
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
-            verbs["trainer"] = ["train", spec, "--run", str(run), "--steps", str(train_steps)]
+            verbs["trainer"] = [
+                "train",
+                spec,
+                "--run",
+                str(run),
+                "--steps",
+                str(train_steps),
+                "--hold-out",
+                str(hold_out),
+            ]
         running = {
             name: stack.enter_context(_process(verb, environment, run / f"{name}.log")) for name, verb in verbs.items()
         }

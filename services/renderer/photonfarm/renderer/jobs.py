@@ -99,7 +99,7 @@ class ShardRenderer:
         """Render and commit one job; False if it was committed already.
 
         Raises QueueError for a job of another store, BackendError if the scene file here is not the planned one,
-        IncompleteError if renders stay non-finite.
+        IncompleteError if renders stay non-finite or buffers are.
         """
         if scene_id not in self._store.scene_ids():
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
@@ -185,9 +185,19 @@ class _Rendering:
             for sample in samples:
                 view = rows.views[sample.view_row]
                 if sample.view_row in rows.new_views and sample.view_row not in outputs.buffers:
-                    outputs.buffers[sample.view_row] = self._scene.buffers(view)
+                    outputs.buffers[sample.view_row] = self._buffers(sample, view)
                 outputs.radiance[sample.row] = self._halves(sample, view)
         return outputs, self._redrawn
+
+    def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
+        """They know no seed, so that another try would not help."""
+        buffers = self._scene.buffers(view)
+        for name, values in arrays_of(buffers).items():
+            if not np.isfinite(values).all():
+                raise IncompleteError(
+                    f"{name} of view {sample.view_row} came out non-finite (sample {sample.key.hex()})"
+                )
+        return buffers
 
     def _halves(self, sample: SampleRow, view: View) -> F32:
         """Two independent estimates, (2, H, W, 3)."""

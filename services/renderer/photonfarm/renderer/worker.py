@@ -72,6 +72,7 @@ class WorkerSettings(Frozen):
     redis_url: str
     name: Annotated[str, Field(min_length=1, max_length=128)]
     until_complete: bool = False
+    scene_id: str | None = None  # fill the queue with, and wait for, this scene alone; None: all of the store
     max_jobs: Annotated[int, Field(ge=1)] = 500  # then a fresh child: bounds what leaks, at < 1 % of the time
     max_rss_bytes: Annotated[int, Field(ge=1)] = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more
     deadline_s: Positive = 1800.0  # jobs are meant to take 5 to 30 s; a hundred times that is a hang
@@ -278,13 +279,15 @@ class RenderWorker(SimpleWorker):
 
     def _fill_or_finish(self) -> bool:
         """Look at the store, as there is no coordinator; True if there is nothing left to wait for."""
-        if queue.reconcile(self._store, self.connection, wait_s=0):
+        if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
             return False
         self._store.sweep()
         if not self._settings.until_complete:
             return False
         missing = {
-            queue.job_name(scene.scene_id, job) for scene in self._store.scenes() for job in scene.missing_jobs()
+            queue.job_name(scene.scene_id, job)
+            for scene in self._store.scenes(self._settings.scene_id)
+            for job in scene.missing_jobs()
         }
         failed = queue.queue_status(self.connection).failed
         if missing and missing <= failed.keys():
@@ -307,7 +310,8 @@ class RenderWorker(SimpleWorker):
     def _on_failure(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> bool:  # noqa: ARG002
         """Decide what a failed job means: for the job, for this worker, or nothing."""
         log.warning("job %s failed: %s", job.id, error)
-        if isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
+        ours = self._settings.scene_id in (None, job.id.rpartition("-")[0])
+        if ours and isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
             self._fatal = error  # the next job would fail as well
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)

@@ -32,6 +32,11 @@ run_option = click.option(
 @click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
 @click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
 @click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    help="Share of the configurations never trained on.  [default: the preset's, 1/8 or 1/16]",
+)
 @click.option("--threads", type=click.IntRange(1), help="Processor threads of torch.  [default: 1]")
 @click.option("--device", help="cpu or cuda.  [default: cpu]")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")

@@ -86,6 +86,7 @@ class Batch:
     """Samples as tensors; valid until the next one is taken."""
 
     rows: tuple[int, ...]
+    units: tuple[Key, ...]  # what each is held out by: equal for samples that are not independent
     inputs: Inputs
     target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, linear radiance × exposure
 
@@ -105,20 +106,20 @@ class Batch:
             albedo=memory(*film, 3),
             normal=memory(*film, 3),
         )
-        return cls((), inputs, memory(2, *film, 3))
+        return cls((), (), inputs, memory(2, *film, 3))
 
-    def filled(self, rows: tuple[int, ...]) -> Batch:
-        """The first samples of this memory, named by their rows."""
+    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> Batch:
+        """The first samples of this memory, named by their rows and what they are held out by."""
         n = len(rows)
         i = self.inputs
         inputs = Inputs(i.position[:n], i.visible[:n], i.world_to_camera[:n], i.depth[:n], i.albedo[:n], i.normal[:n])
-        return Batch(rows, inputs, self.target[:n])
+        return Batch(rows, units, inputs, self.target[:n])
 
     def to(self, device: torch.device) -> Batch:
         """The same batch on a device; itself on the CPU."""
         i = self.inputs
         tensors = (i.position, i.visible, i.world_to_camera, i.depth, i.albedo, i.normal)
-        return Batch(self.rows, Inputs(*(t.to(device) for t in tensors)), self.target.to(device))
+        return Batch(self.rows, self.units, Inputs(*(t.to(device) for t in tensors)), self.target.to(device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +128,7 @@ class Compact:
 
     modification: Modification
     view: View
+    unit: Key  # of the configuration, or of the view in a static scene
     radiance: NDArray[np.floating]  # × 2^radiance_exponent, as it is stored
     depth: NDArray[np.floating]
     albedo: NDArray[np.floating]
@@ -137,7 +139,9 @@ class Compact:
         """The sample in as few bytes as hold it exactly."""
         scaled = sample.radiance * np.float32(2.0**spec.radiance_exponent)
         b = sample.buffers
-        return cls(sample.modification, sample.view, *(_smallest(x) for x in (scaled, b.depth, b.albedo, b.normal)))
+        unit = sample.modification.key(spec.scene_id) if spec.groups else make_key(sample.view.vector)
+        images = (_smallest(x) for x in (scaled, b.depth, b.albedo, b.normal))
+        return cls(sample.modification, sample.view, unit, *images)
 
     @property
     def nbytes(self) -> int:

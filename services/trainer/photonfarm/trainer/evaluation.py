@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from photonfarm.shared.estimate import Estimate, clean_error, noise_floor
+from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
+from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.trainer.dataset import Batch
 from photonfarm.trainer.feed import Feed
@@ -21,9 +22,13 @@ Predictor = Callable[[Batch], F32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Errors over held-out samples, in squared exposed radiance per channel."""
+    """Errors over held-out samples, in squared exposed radiance per channel.
 
-    error: Estimate  # against the clean image
+    Views and passes of one configuration share what is hard about it, so they are averaged first; configurations are
+    what is independent.
+    """
+
+    error: Estimate  # against the clean image, over configurations
     floor: float  # noise of the target: what the error against it would show on top
     per_sample: NDArray[np.float64]  # (n,) clean error of each
 
@@ -62,9 +67,12 @@ def constant_predictor(colour: F32) -> Predictor:
 def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate]."""
     errors, floors = [], []
+    units: list[Key] = []
     for batch in found:
+        units.extend(batch.units)
         for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
             errors.append(clean_error(image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
     per_sample = np.array(errors)
-    return HeldOut(Estimate.of(per_sample), float(np.mean(floors)), per_sample)
+    floor = float(np.mean(group_means(np.array(floors), units)))
+    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample)

@@ -36,7 +36,7 @@ class Feed:
         self._complete = False
         self._error: BaseException | None = None
         points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
-        pinned = settings.device != "cpu"
+        pinned = settings.device.startswith("cuda")
         self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
         self._ready: queue.SimpleQueue[tuple[Batch, Batch] | None] = queue.SimpleQueue()
         self._free: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
@@ -110,9 +110,10 @@ class Feed:
             memory = self._free.get() if rows is not None else None
             if rows is None or memory is None:
                 return
-            for place, row in enumerate(rows):
-                fill(memory, place, self._sample(row), self.spec, self.cloud)
-            self._ready.put((memory.filled(rows), memory))
+            samples = [self._sample(row) for row in rows]
+            for place, sample in enumerate(samples):
+                fill(memory, place, sample, self.spec, self.cloud)
+            self._ready.put((memory.filled(rows, tuple(sample.unit for sample in samples)), memory))
 
     def _poll(self, seen: int) -> int:
         rows = self._source.refresh()

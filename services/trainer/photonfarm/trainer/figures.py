@@ -1,7 +1,8 @@
-"""What a run is reported by: errors of its networks on everything held out, and what its samples cost."""
+"""What a run is reported by: errors of its networks on what is held out, and what its samples cost."""
 
 from __future__ import annotations
 
+import math
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -58,9 +59,12 @@ class Evaluation:
 
 
 def evaluate(source: SampleSource, settings: TrainSettings, run: Path) -> Evaluation:
-    """Evaluate a run on what is held out; raises IncompleteError if that is nothing, StoreError without checkpoints."""
+    """Evaluate a run on the first `MOST_HELD_OUT` held-out samples, on the CPU wherever it was trained.
+
+    Raises IncompleteError if nothing is held out, StoreError without checkpoints.
+    """
     torch.set_num_threads(settings.threads)
-    with Feed(source, settings) as feed:
+    with Feed(source, settings.model_copy(update={"device": "cpu"})) as feed:
         arrived, _ = feed.arrivals()
         held_out = [row for row, held in arrived if held][:MOST_HELD_OUT]
         training = [row for row, held in arrived if not held]
@@ -113,13 +117,14 @@ def production(store: Path, scene_id: str) -> SceneStatus:
 def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: SceneStatus) -> dict[str, Any]:
     """The figures of report.json."""
     state = checkpoint.load(run / CHECKPOINT)
-    following = state["following"]
+    following, spread = state["following"], evaluation.last.error.standard_error
     return {
         "scene": status.name,
         "scene_id": status.scene_id,
         "samples_planned": status.samples_planned,
         "samples_committed": status.samples_complete,
-        "samples_held_out": evaluation.last.error.count,
+        "samples_held_out": len(evaluation.last.per_sample),
+        "configurations_held_out": evaluation.last.error.count,
         "samples_per_core_second": status.samples_complete / status.core_s if status.core_s > 0 else None,
         "render_core_seconds": status.core_s,
         "renders_redrawn": status.redrawn,
@@ -128,7 +133,7 @@ def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: 
         "draws_per_sample": state["step"] * settings.batch / max(len(following["sampler"]["rows"]), 1),
         "val_error_first": evaluation.first.error.mean,
         "val_error_last": evaluation.last.error.mean,
-        "val_error_last_standard_error": evaluation.last.error.standard_error,
+        "val_error_last_standard_error": spread if math.isfinite(spread) else None,
         "val_error_mean_colour": evaluation.mean_colour.error.mean,
         "noise_floor": evaluation.last.floor,
         "parameters": evaluation.parameters,

@@ -50,12 +50,12 @@ class Following:
 
     @property
     def complete(self) -> bool:
-        """True once everything that is planned has arrived."""
+        """True once everything that is planned has arrived and is visible."""
         return self._complete
 
     def look(self) -> None:
         """Make visible what has arrived, or of it what the script says."""
-        rows, self._complete = self._feed.arrivals()
+        rows, complete = self._feed.arrivals()
         self._waiting.update((row, held) for row, held in rows if row not in self._known)
         scripted = self._script.visible(self.drawn)
         if scripted is None:
@@ -63,6 +63,7 @@ class Following:
         else:
             due = self._script.rows[len(self.growth.rows) : scripted]
             self._show(due if all(row in self._waiting for row in due) else [])
+        self._complete = complete and not self._waiting
 
     def _show(self, rows: list[int]) -> None:
         if not rows:

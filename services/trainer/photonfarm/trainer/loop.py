@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.store.durable import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import SampleSource
 from photonfarm.trainer.evaluation import batches, measure, network_predictor
@@ -23,7 +24,8 @@ from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.following import Following, Growth
 from photonfarm.trainer.losses import LOSSES
 from photonfarm.trainer.metrics_log import MetricsLog
-from photonfarm.trainer.model import SceneFrame, build
+from photonfarm.trainer.model import SceneFrame, build, usable_device
+from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import TrainSettings
 
 CHECKPOINT = "checkpoint.pt"
@@ -40,7 +42,7 @@ class Outcome:
 
     step: int
     reason: str  # "steps", "seconds" or "stopped"
-    last_error: float | None  # held-out, noise removed; None if it was stopped before the first validation
+    last_error: float | None  # held-out, noise removed; None if it ended before the first validation
 
 
 @contextmanager
@@ -65,24 +67,27 @@ def train(
     clock: Callable[[], float] = time.monotonic,
     script: Growth | None = None,
     listen: Callable[[dict[str, Any]], None] | None = None,
+    waited: float = 0.0,
 ) -> Outcome:
     """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
     checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
-    metrics.jsonl as it is written. Raises SpecError for a run of another network or scene or a hold-out that leaves
-    nothing, and IncompleteError for a loss that is not finite; the last checkpoint stays.
+    metrics.jsonl as it is written. `waited` seconds have gone by already. Raises SpecError for a run of another network
+    or scene, a device that is not there or a hold-out that leaves nothing, StoreError for a folder that cannot be
+    written or that another trainer has, and IncompleteError for a loss that is not finite; the last checkpoint stays.
     """
     torch.set_num_threads(settings.threads)
-    run.mkdir(parents=True, exist_ok=True)
+    usable_device(settings.device)
     stop = stop or threading.Event()
-    began = clock()
-    while not source.ready():
-        if stop.wait(settings.poll_seconds) or clock() - began >= (settings.max_seconds or math.inf):
-            return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
-    with Feed(source, settings, clock) as feed, MetricsLog(run / METRICS, listen) as log:
-        session = Session(feed, settings, run, log, stop, clock, script)
-        return session.run(waited=clock() - began)
+    began = clock() - waited
+    with held(run):
+        while not source.ready():
+            if stop.wait(settings.poll_seconds) or clock() - began >= (settings.max_seconds or math.inf):
+                return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
+        with Feed(source, settings, clock) as feed:
+            log = MetricsLog(run / METRICS, listen)
+            return Session(feed, settings, run, log, stop, clock, script).run(waited=clock() - began)
 
 
 class Session:
@@ -100,7 +105,7 @@ class Session:
     ) -> None:
         self._feed, self._settings, self._run, self._log = feed, settings, run, log
         self._stop, self._clock = stop, clock
-        self._device = torch.device(settings.device)
+        self._device = usable_device(settings.device)
         frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
         self._network = build(settings.network, frame, settings.seed).to(self._device)
         self._optimiser = torch.optim.Adam(
@@ -125,7 +130,7 @@ class Session:
                 self._train_step()
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
-        if reason != "stopped":
+        if reason != "stopped" and self._following.held_out:
             self._validate()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
@@ -137,7 +142,8 @@ class Session:
             self._continue(path)
         else:
             checkpoint.save(self._run / INITIAL, {"network": self._network.state_dict(), **self._identity()})
-        (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
+        with store_errors("write the settings", self._run):
+            (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         self._log.cut(self._step)
 
     def _continue(self, path: Path) -> None:
@@ -200,12 +206,18 @@ class Session:
 
     def _can_validate(self) -> bool:
         self._following.look()
-        if self._following.complete and not self._following.held_out:
-            raise SpecError(
-                f"hold_out = {self._settings.hold_out:g}: none of the {len(self._following.growth.rows)} samples "
-                "planned is held out, and one is needed to validate on; raise it, or plan more configurations"
-            )
+        if self._following.complete:
+            self._check_split()
         return bool(self._following.held_out) and (self._step > 0 or self._following.may_draw())
+
+    def _check_split(self) -> None:
+        rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._following.growth.rows)} samples planned"
+        if not self._following.held_out:
+            raise SpecError(
+                f"{rule} none is held out, and one is needed to validate on; raise it, or plan more configurations"
+            )
+        if not self._following.training_rows:
+            raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
 
     def _validate(self) -> None:
         """Log the held-out error of the network as it is."""

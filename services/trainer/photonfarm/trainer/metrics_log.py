@@ -4,44 +4,38 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
+
+from photonfarm.shared.store.durable import store_errors
 
 
 class MetricsLog:
-    """The log of one run; a context manager. `listen` gets each record as it is written."""
+    """The log of one run. `listen` gets each record as it is written; StoreError where it cannot be."""
 
     def __init__(self, path: Path, listen: Callable[[dict[str, Any]], None] | None = None) -> None:
         self._path, self._listen = path, listen
 
-    def __enter__(self) -> Self:
-        self._file = self._path.open("ab")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._file.close()
-
     def cut(self, step: int) -> None:
         """Drop what was logged after the checkpoint of `step`; the run that continues from there writes it again.
 
-        Cut in place: others may be reading along. A training record of `step` itself was written before the
-        checkpoint and stays, a validation after it.
+        What stays is renamed into place, so that whoever reads along finds a whole file under this name. A training
+        record of `step` itself was written before the checkpoint and stays, a validation after it.
         """
-        kept = 0
-        for line in self._path.read_bytes().splitlines(keepends=True):
-            if not line.endswith(b"\n") or _is_after(json.loads(line), step):
-                break
-            kept += len(line)
-        self._file.truncate(kept)
+        with store_errors("cut the log", self._path):
+            lines = self._path.read_bytes().splitlines(keepends=True) if self._path.exists() else []
+            kept = list(takewhile(lambda line: line.endswith(b"\n") and not _is_after(json.loads(line), step), lines))
+            if len(kept) < len(lines):
+                partial = self._path.with_suffix(".partial")
+                partial.write_bytes(b"".join(kept))
+                partial.replace(self._path)
 
     def write(self, kind: str, **values: Any) -> None:
-        """Append a record and flush it."""
+        """Append a record."""
         record = {"kind": kind, **values}
-        self._file.write(json.dumps(record).encode() + b"\n")
-        self._file.flush()
+        with store_errors("write the log", self._path), self._path.open("ab") as file:
+            file.write(json.dumps(record).encode() + b"\n")
         if self._listen:
             self._listen(record)
 

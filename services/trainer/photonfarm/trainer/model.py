@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from photonfarm.shared.errors import SpecError
 from photonfarm.shared.records import F32, BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.trainer.image_synthesis import ImageSynthesisLayer
@@ -20,6 +21,18 @@ from photonfarm.trainer.settings import NetworkSettings
 
 IMAGE_CHANNELS = 10
 """View ray 3, depth 1, albedo 3, normal 3 [supplement 1.3]."""
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of this name, "cpu", "cuda" or "cuda:N"; raises SpecError where torch cannot use it."""
+    try:
+        device = torch.device(name)
+        if device.type not in ("cpu", "cuda"):
+            raise SpecError(f"device = {name!r}: must be cpu or cuda")
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:  # the latter where torch was built without CUDA
+        raise SpecError(f"device = {name!r}: cannot be used here: {str(error).splitlines()[0]}") from error
+    return device
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,11 +43,11 @@ def page(figures: dict[str, Any], records: Sequence[dict[str, Any]], shown: Sequ
 
 def _headline(figures: dict[str, Any]) -> str:
     first, last, colour = (figures[f"val_error_{name}"] for name in ("first", "last", "mean_colour"))
-    rate = figures["samples_per_core_second"]
+    rate, spread = figures["samples_per_core_second"], figures["val_error_last_standard_error"]
     cells = [
         (f"{figures['samples_committed']}", f"samples of {figures['samples_planned']} planned"),
         ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
-        (f"{last:.4g}", f"held-out error (± {figures['val_error_last_standard_error']:.2g})"),
+        (f"{last:.4g}", f"held-out error (± {'–' if spread is None else f'{spread:.2g}'})"),
         (f"{first:.4g}", f"before training: {first / last:.1f} ×" if last > 0 else "before training"),
         (f"{colour:.4g}", f"mean colour: {colour / last:.1f} ×" if last > 0 else "mean colour"),
         (f"{figures['noise_floor']:.4g}", "noise of the targets"),

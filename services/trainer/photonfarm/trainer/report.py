@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from photonfarm.shared.store.durable import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.figures import evaluate, production, summary, validations
 from photonfarm.trainer.loop import CHECKPOINT, read_settings
@@ -16,15 +17,16 @@ from photonfarm.trainer.store_source import StoreSource
 def write_report(store: Path, run: Path, out: Path) -> dict[str, Any]:
     """Write report.html and report.json of a run into the folder `out`; returns the figures of the latter.
 
-    Both the untrained and the last network are evaluated, on all held-out samples that the store now has. Raises
-    SpecError if `run` is not a run, StoreError without a readable checkpoint or store, IncompleteError if nothing is
-    held out.
+    Both the untrained and the last network are evaluated, on the held-out samples that the store now has, the
+    first 512 if there are more. Raises SpecError if `run` is not a run, StoreError without a readable checkpoint or
+    store or if `out` cannot be written, IncompleteError if nothing is held out.
     """
     settings = read_settings(run)
     scene_id = checkpoint.load(run / CHECKPOINT)["scene_id"]
     evaluation = evaluate(StoreSource(store, scene_id), settings, run)
     figures = summary(settings, run, evaluation, production(store, scene_id))
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "report.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
-    (out / "report.html").write_text(page(figures, validations(run), evaluation.shown))
+    with store_errors("write the report", out):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
+        (out / "report.html").write_text(page(figures, validations(run), evaluation.shown))
     return figures

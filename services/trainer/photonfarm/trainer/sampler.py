@@ -25,6 +25,7 @@ class RoundSampler:
         self._seed, self._catch_up = seed, catch_up
         self.rows: list[int] = []
         self._visits = np.zeros(0, np.int64)
+        self._joined = 0  # rows that are in the rounds; the others join at the next draw
         self._deck: deque[int] = deque()  # places in `rows`
         self._shuffles = 0
 
@@ -34,16 +35,17 @@ class RoundSampler:
         return dict(zip(self.rows, self._visits.tolist(), strict=True))
 
     def add(self, rows: Iterable[int]) -> None:
-        """Rows that have arrived; they join the round that is under way."""
-        before = len(self.rows)
+        """Rows that have arrived; they join the round that is under way, at the next draw."""
         self.rows.extend(rows)
-        self._visits = np.pad(self._visits, (0, len(self.rows) - before))
-        self._shuffle(np.concatenate([np.array(self._deck, np.int64), self._round(before)]))
+        self._visits = np.pad(self._visits, (0, len(self.rows) - len(self._visits)))
 
     def draw(self, count: int) -> tuple[int, ...]:
         """The next `count` rows; all different where there are as many."""
         if not self.rows:
             raise ValueError("no row has arrived; nothing can be drawn")
+        if self._joined < len(self.rows):
+            self._shuffle(np.concatenate([np.array(self._deck, np.int64), self._round(self._joined)]))
+            self._joined = len(self.rows)
         chosen: list[int] = []
         passed: list[int] = []  # drawn again too soon; back to the front of the deck
         while len(chosen) < count:
@@ -63,6 +65,7 @@ class RoundSampler:
         return {
             "rows": list(self.rows),
             "visits": self._visits.tolist(),
+            "joined": self._joined,
             "deck": list(self._deck),
             "shuffles": self._shuffles,
         }
@@ -71,6 +74,7 @@ class RoundSampler:
         """Continue from a `state`."""
         self.rows = list(state["rows"])
         self._visits = np.array(state["visits"], np.int64)
+        self._joined = state["joined"]
         self._deck = deque(state["deck"])
         self._shuffles = state["shuffles"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -27,18 +28,27 @@ ALIVE_S = 60.0  # a run whose sign of life is older is taken for dead
 
 
 def run(spec: str | None, store: Path, folder: Path, preset: str, changes: dict[str, Any]) -> None:
-    """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint."""
+    """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint.
+
+    Waiting for a scene, its base and its samples counts as time spent.
+    """
     from photonfarm.trainer.loop import stop_on_signals, train
+    from photonfarm.trainer.model import usable_device
     from photonfarm.trainer.store_source import StoreSource
 
     settings = _settings(preset, changes)
-    scene_id = load_spec(spec).scene_id if spec else None
+    usable_device(settings.device)
+    scene_id = load_spec(spec).scene_id if spec else _begun_on(folder)
+    began = time.monotonic()
     with stop_on_signals() as stop, _sign_of_life(folder):
-        scene_id = scene_id or _wait(lambda: _only_scene(store), stop)
-        source = StoreSource(store, scene_id) if scene_id else None
-        if source is None or not _wait(source.ready, stop):
+        if not (store / "scenes").is_dir():
+            click.echo(f"waiting for a store and a scene in {store}", err=True)
+        scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
+        if scene_id is None:
+            click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
-        outcome = train(source, settings, folder, stop=stop, listen=_tell)
+        source, waited = StoreSource(store, scene_id), time.monotonic() - began
+        outcome = train(source, settings, folder, stop=stop, listen=_tell, waited=waited)
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 
@@ -47,7 +57,7 @@ def check(folder: Path) -> None:
     try:
         age_s = time.time() - (folder / ALIVE_FILE).stat().st_mtime
     except OSError as error:
-        raise IncompleteError(f"{folder}: no trainer has run here") from error
+        raise IncompleteError(f"{folder}: no trainer is at work here") from error
     if age_s > ALIVE_S:
         raise IncompleteError(
             f"{folder}: the trainer's last sign of life is {age_s:.0f} s old; {ALIVE_S:.0f} s are allowed"
@@ -61,6 +71,15 @@ def _settings(name: str, changes: dict[str, Any]) -> TrainSettings:
         raise SpecError(f"the settings of the training: {'; '.join(sentences(error))}") from error
 
 
+def _begun_on(folder: Path) -> str | None:
+    """The scene that a run was begun on; None for a run that has not begun."""
+    from photonfarm.trainer import checkpoint
+    from photonfarm.trainer.loop import INITIAL
+
+    begun = folder / INITIAL
+    return str(checkpoint.load(begun)["scene_id"]) if begun.exists() else None
+
+
 def _only_scene(store: Path) -> str | None:
     """The scene of a store that has one; None while there is no store or no scene; SpecError if there are several."""
     try:
@@ -70,13 +89,16 @@ def _only_scene(store: Path) -> str | None:
             raise
         return None
     if len(ids) > 1:
-        raise SpecError(f"{store}: holds {len(ids)} scenes; name the spec of the one to train on")
+        names = ", ".join(scene.spec.name for scene in Store(store).scenes())
+        raise SpecError(f"{store}: holds {len(ids)} scenes ({names}); name the spec of the one to train on")
     return ids[0] if ids else None
 
 
-def _wait(look: Callable[[], T], stop: threading.Event) -> T | None:
-    while not (found := look()):
-        if stop.wait(POLL_S):
+def _wait(look: Callable[[], T | None], stop: threading.Event, seconds: float) -> T | None:
+    """What `look` finds at last; None once told to stop, or after so many seconds."""
+    end = time.monotonic() + seconds
+    while (found := look()) is None:
+        if stop.wait(min(POLL_S, max(end - time.monotonic(), 0.0))) or time.monotonic() >= end:
             return None
     return found
 
@@ -102,6 +124,7 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+        (folder / ALIVE_FILE).unlink(missing_ok=True)
 
 
 def _tell(record: dict[str, Any]) -> None:

@@ -14,8 +14,8 @@ import json
 import os
 import socket
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,44 +48,51 @@ def store_errors(doing: str, path: Path) -> Iterator[None]:
         raise StoreError(f"{path}: cannot {doing}: {reason} ({error.filename or path})") from error
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
-    """One file as it lies under its final name."""
-
-    size: int  # bytes
-    sha256: str
-    placed: bool  # False: another writer's complete file was there already
-
-
 def temporary(folder: Path) -> Path:
-    """A new name in a `tmp` folder that says whose it is: host, process, number."""
+    """A new name in a `tmp` folder that says whose it is: host, process space, process, number, time."""
     folder.mkdir(parents=True, exist_ok=True)
-    return folder / f"{socket.gethostname()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
+    return folder / f"{_owner()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
 
 
-def place(data: bytes | memoryview, final: Path, tmp: Path) -> Written:
-    """Write `data` durably under a new name, or keep the file that has that name."""
+@cache
+def _owner() -> str:
+    """Where process numbers mean what they mean here: containers may share a host's name, but not its processes."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text()[:8]
+        space = f"{boot}{Path('/proc/self/ns/pid').stat().st_ino:x}"
+    except OSError:  # not Linux, hence no containers: the host's name must do
+        space = "0"
+    return f"{socket.gethostname()}-{space}"
+
+
+def place(data: bytes | memoryview, final: Path, tmp: Path, *, replace: bool = False) -> bool:
+    """Write `data` durably under a new name; False if the name was taken, which keeps what is there.
+
+    With `replace` it is written in any case, and takes the place of what is there at once.
+    """
     partial = temporary(tmp)
     try:
         with partial.open("xb") as stream:
             stream.write(data)
             stream.flush()
             os.fdatasync(stream.fileno())
+        if replace:
+            partial.replace(final)
+            return True
         try:
             os.link(partial, final)
-            return Written(len(data), hashlib.sha256(data).hexdigest(), placed=True)
         except FileExistsError:
-            kept = final.read_bytes()
-            return Written(len(kept), hashlib.sha256(kept).hexdigest(), placed=False)
+            return False
+        return True
     finally:
         partial.unlink(missing_ok=True)
 
 
 def place_json(document: dict[str, Any], final: Path, tmp: Path) -> bool:
     """Write a JSON document durably under a new name; False if the name was taken, which keeps what is there."""
-    final.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(final.parent)
     data = (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode()
-    placed = place(data, final, tmp).placed
+    placed = place(data, final, tmp)
     sync_folder(final.parent)
     return placed
 
@@ -93,7 +100,7 @@ def place_json(document: dict[str, Any], final: Path, tmp: Path) -> bool:
 def place_folder(built: Path, final: Path) -> bool:
     """Rename a folder that was built aside to its final name; False if another is there already."""
     sync_tree(built)
-    final.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(final.parent)
     try:
         built.rename(final)  # fails on a folder that is there, since none of ours is ever empty
     except OSError:
@@ -102,6 +109,13 @@ def place_folder(built: Path, final: Path) -> bool:
         return False
     sync_folder(final.parent)
     return True
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder, durably, if it is not there."""
+    if not folder.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        sync_folder(folder.parent)
 
 
 def sync_folder(folder: Path) -> None:
@@ -125,38 +139,34 @@ def sync_tree(folder: Path) -> None:
         sync_folder(Path(path))
 
 
-def describe_tree(folder: Path, relative_to: Path) -> dict[str, dict[str, Any]]:
-    """Size and SHA-256 of every file below a folder, by its path below another."""
-    return {
-        str(path.relative_to(relative_to)): {
-            "size": path.stat().st_size,
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-        }
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+def describe(files: Iterable[Path], relative_to: Path) -> dict[str, dict[str, Any]]:
+    """Size and SHA-256 of files as they lie on disk, by path below a folder."""
+    described = {}
+    for path in sorted(files):
+        data = path.read_bytes()
+        name = str(path.relative_to(relative_to))
+        described[name] = {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    return described
 
 
 class DurableStore(LocalStore):
-    """Zarr's local store for chunks that are written once, by whoever comes first; `written` tells what lies there now.
+    """Zarr's local store for chunks that are written once, by whoever comes first; `kept` names those that were there.
 
-    Nothing is replaced through it. The caller syncs `folders` before announcing the files.
+    Nothing is replaced through it, unless `replace` is set. The caller syncs the folders before announcing the files.
     """
 
-    def __init__(self, root: Path | str, *, tmp: Path, read_only: bool = False) -> None:
+    def __init__(self, root: Path | str, *, tmp: Path, replace: bool = False, read_only: bool = False) -> None:
         super().__init__(root, read_only=read_only)
         self._tmp = tmp
-        self.written: dict[str, Written] = {}
-
-    @property
-    def folders(self) -> set[Path]:
-        """The folders that hold what was written."""
-        return {(self.root / key).parent for key in self.written}
+        self._replace = replace
+        self.kept: set[str] = set()
 
     def set_sync(self, key: str, value: Buffer) -> None:
-        """Write one chunk, durably; a name that exists keeps its file."""
+        """Write one chunk, durably."""
         self._check_writable()
-        self.written[key] = place(memoryview(value.as_buffer_like()), self.root / key, self._tmp)
+        data = memoryview(value.as_buffer_like())
+        if not place(data, self.root / key, self._tmp, replace=self._replace):
+            self.kept.add(key)
 
     async def get(
         self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
@@ -184,12 +194,11 @@ def sweep(tmp: Path, *, now_s: float, stray_age_s: float = STRAY_AGE_S) -> int:
 
 
 def _is_of_the_dead(name: str) -> bool:
-    host, separator, rest = name.partition(f"{socket.gethostname()}-")
-    if host or not separator:
-        return False  # of another machine
-    process = rest.split("-")[0]
+    owner, *numbers = name.rsplit("-", 3)  # from the right: a host's name may hold any number of -
+    if owner != _owner():
+        return False  # of another machine or container
     try:
-        os.kill(int(process), 0)
+        os.kill(int(numbers[0]), 0)
     except ProcessLookupError:
         return True
     except (PermissionError, ValueError):

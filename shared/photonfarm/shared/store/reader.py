@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.keys import Key
+from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
@@ -65,10 +65,15 @@ class SceneReader:
         """The rows of all samples that were complete at the last refresh, ascending."""
         return np.flatnonzero(self._complete)
 
+    @property
+    def planned(self) -> int:
+        """The number of samples in all plans at the last refresh, complete or not."""
+        return sum(plan.samples for plan in self._plans)
+
     def refresh(self) -> NDArray[np.int64]:
         """The rows of the samples that have become complete since the last refresh; none while nothing is there.
 
-        Costs one listing of the markers. Raises StoreError for a store of another format.
+        Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
         """
         if self._spec is None and not (self._folder / "spec.json").is_file():
             if (self._root / writer.FORMAT_FILE).is_file():
@@ -76,13 +81,13 @@ class SceneReader:
             return np.zeros(0, np.int64)
         _ = self.spec
         committed = writer.committed_jobs(self._folder)  # before the plans: each one's plan is there by now
+        self._plans = writer.load_plans(self._folder, self._plans)
         if committed == self._committed:
             return np.zeros(0, np.int64)
-        found = writer.load_plans(self._folder, self._plans)
-        complete = plans.complete_rows(found, committed)
+        complete = plans.complete_rows(self._plans, committed)
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
-        self._plans, self._committed, self._complete = found, committed, complete
+        self._committed, self._complete = committed, complete
         return np.flatnonzero(complete & ~before)
 
     # ---------------------------------------------------------------------------------------------------------- samples
@@ -113,6 +118,11 @@ class SceneReader:
     def modification_key(self, row: int) -> Key:
         """The content key of a sample's configuration, by whose hash samples are held out."""
         return plans.modification_at(self._plans, self.modification_row(row)).key(self._scene_id)
+
+    def view_key(self, row: int) -> Key:
+        """The content key of a sample's configuration and view: equal for all passes of one view."""
+        view = plans.view_at(self._plans, self._sample(row).view_row)
+        return make_key("view", self.modification_key(row), view.vector)
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud; raises StoreError while they are not there."""

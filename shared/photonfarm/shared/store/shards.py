@@ -39,12 +39,6 @@ def read_row(path: Path, schema: ArraySchema, shard_rows: int, row: int) -> NDAr
         os.close(descriptor)
 
 
-def check(path: Path, schema: ArraySchema, shard_rows: int) -> None:
-    """Read a whole shard; raises CorruptError if any of it is not what was written."""
-    for row in range(shard_rows):
-        read_row(path, schema, shard_rows, row)
-
-
 def _read_index(descriptor: int, path: Path, shard_rows: int) -> NDArray[np.uint64]:
     size = os.fstat(descriptor).st_size
     wanted = 16 * shard_rows + _CRC_BYTES

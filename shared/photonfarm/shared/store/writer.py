@@ -10,7 +10,7 @@ import contextlib
 import json
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from photonfarm.shared.errors import CorruptError, SpecError, StoreError
+from photonfarm.shared.errors import CorruptError, IncompleteError, SpecError, StoreError
 from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Known, Request, expand
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
 from photonfarm.shared.scene import SceneSpec
@@ -75,6 +75,7 @@ class Store:
     def __init__(self, root: str | Path, *, create: bool = False) -> None:
         """Open a store, or make one where there is none; raises StoreError if that cannot be."""
         self.root = Path(root)
+        self._opened: dict[str, SceneStore] = {}
         if create:
             self._create()
         self._check_format()
@@ -85,10 +86,10 @@ class Store:
             foreign = [path.name for path in self.root.iterdir() if path.name not in (FORMAT_FILE, "scenes", "tmp")]
             if foreign and not (self.root / FORMAT_FILE).exists():
                 raise StoreError(f"{self.root}: is neither empty nor a store (it holds {foreign[0]!r})")
-            self._scenes.mkdir(exist_ok=True)
-            if not (self.root / FORMAT_FILE).exists():
+            if not (self.root / FORMAT_FILE).exists():  # before all else: who looks in between must find a store
                 document = {"format": schema.FORMAT, "version": schema.VERSION}
                 durable.place_json(document, self.root / FORMAT_FILE, self.root / "tmp")
+            self._scenes.mkdir(exist_ok=True)
 
     def _check_format(self) -> None:
         file = self.root / FORMAT_FILE
@@ -113,16 +114,19 @@ class Store:
 
     def scene_ids(self) -> list[str]:
         """The scenes that are there, in order of their ids."""
-        with store_errors("list the scenes", self._scenes):
+        with store_errors("list the scenes", self._scenes), contextlib.suppress(FileNotFoundError):
             return sorted(path.name for path in self._scenes.iterdir() if (path / "spec.json").is_file())
+        return []
 
     def scene(self, scene_id: str) -> SceneStore:
-        """One scene of the store; raises StoreError if it is not there."""
-        return SceneStore(self._scenes / scene_id)
+        """One scene of the store, the same object each time; raises StoreError if it is not there."""
+        if scene_id not in self._opened:
+            self._opened[scene_id] = SceneStore(self._scenes / scene_id)
+        return self._opened[scene_id]
 
-    def scenes(self) -> list[SceneStore]:
-        """Every scene of the store."""
-        return [self.scene(scene_id) for scene_id in self.scene_ids()]
+    def scenes(self, only: str | None = None) -> list[SceneStore]:
+        """Every scene of the store, or the one that is named; raises StoreError if that is not there."""
+        return [self.scene(scene_id) for scene_id in (self.scene_ids() if only is None else [only])]
 
     def add(self, spec: SceneSpec) -> SceneStore:
         """The scene of a spec, made if it is new; the first spec written for a scene id stays."""
@@ -146,7 +150,7 @@ class Store:
     def sweep(self, *, stray_age_s: float = durable.STRAY_AGE_S) -> int:
         """Remove temporary files that dead writers left; how many."""
         with store_errors("sweep temporary files", self.root):
-            folders = [self.root / "tmp", *(path / "tmp" for path in self._scenes.iterdir())]
+            folders = [self.root / "tmp", *(self._scenes / scene_id / "tmp" for scene_id in self.scene_ids())]
             return sum(durable.sweep(tmp, now_s=time.time(), stray_age_s=stray_age_s) for tmp in folders)
 
 
@@ -269,7 +273,7 @@ class SceneStore:
                 durable.place_folder(built, self.folder / "base")
             finally:
                 shutil.rmtree(built, ignore_errors=True)
-            files = durable.describe_tree(self.folder / "base", self.folder)
+            files = durable.describe((p for p in (self.folder / "base").rglob("*") if p.is_file()), self.folder)
             durable.place_json({"files": files}, self.folder / "base.json", self._tmp)
 
     # ----------------------------------------------------------------------------------------------------------- commit
@@ -277,7 +281,9 @@ class SceneStore:
     def commit(self, job: int, outputs: JobOutputs, figures: Figures) -> bool:
         """Make a job's outputs part of the store, all or nothing; False if another worker's commit came first.
 
-        Raises StoreError for outputs that are not exactly the job's or not finite, and if the disk refuses.
+        Files that another writer left are kept where every row of the job can be read from them and ours, and are
+        replaced by ours otherwise. Raises IncompleteError for outputs that are not exactly the job's or not finite,
+        StoreError if the disk refuses.
         """
         rows = self.job_rows(job)
         if self.is_committed(job):
@@ -286,31 +292,66 @@ class SceneStore:
         blocks = _blocks(self.spec, rows, outputs, plan.shard_rows)
         with store_errors(f"commit job {job}", self.folder):
             store = durable.DurableStore(plan.folder, tmp=self._tmp)
-            for name, block in blocks.items():
-                self._write_shard(store, plan, job, name, block)
-            for folder in store.folders:
-                durable.sync_folder(folder)
-            document = {"job": job, "files": _described(store, plan, self.folder), "figures": asdict(figures)}
+            _write_shards(store, plan, job, blocks)
+            if store.kept and not self._is_readable(plan, rows):
+                # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
+                if self.is_committed(job):
+                    return False
+                _write_shards(durable.DurableStore(plan.folder, tmp=self._tmp, replace=True), plan, job, blocks)
+                self._check_readable(plan, rows)
+            files = [path for name in self._arrays if (path := self._shard(plan, job, name)).exists()]
+            for file in files:
+                durable.sync_folder(file.parent)
+            document = {"job": job, "files": durable.describe(files, self.folder), "figures": asdict(figures)}
             return durable.place_json(document, marker_path(self.folder, job), self._tmp)
 
-    def _write_shard(
-        self, store: durable.DurableStore, plan: StoredPlan, job: int, name: str, block: NDArray[Any]
-    ) -> None:
-        import zarr
+    @property
+    def _arrays(self) -> dict[str, schema.ArraySchema]:
+        return schema.output_arrays(self.spec)
 
-        array = schema.output_arrays(self.spec)[name]
-        first = (job - plan.first_job) * plan.shard_rows
+    def _shard(self, plan: StoredPlan, job: int, name: str) -> Path:
+        return plan.folder / name / self._arrays[name].shard_name(job - plan.first_job)
+
+    def _is_readable(self, plan: StoredPlan, rows: JobRows) -> bool:
+        try:
+            self._check_readable(plan, rows)
+        except CorruptError:
+            return False
+        return True
+
+    def _check_readable(self, plan: StoredPlan, rows: JobRows) -> None:
+        """Read every row of a job from the files that are there; raises CorruptError if one is damaged or missing."""
+        wanted = {"view": rows.new_views, "modification": rows.new_modifications}
+        for name, array in self._arrays.items():
+            if array.kind != "sample":
+                self._check_rows(plan, rows.job, name, wanted[array.kind])
+        missing = self._check_rows(plan, rows.job, "radiance", {s.row for s in rows.samples}, may_be_missing=True)
+        self._check_rows(plan, rows.job, "radiance_wide", missing)
+
+    def _check_rows(
+        self, plan: StoredPlan, job: int, name: str, wanted: Set[int], *, may_be_missing: bool = False
+    ) -> set[int]:
+        """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
+        path, array, missing = self._shard(plan, job, name), self._arrays[name], set()
+        if may_be_missing and not path.exists():
+            return set(wanted)
+        for row in wanted:
+            if shards.read_row(path, array, plan.shard_rows, row % plan.shard_rows) is None:
+                missing.add(row)
+        if missing and not may_be_missing:
+            raise CorruptError(f"{path}: row {min(missing)} is missing")
+        return missing
+
+
+def _write_shards(store: durable.DurableStore, plan: StoredPlan, job: int, blocks: Mapping[str, NDArray[Any]]) -> None:
+    import zarr
+
+    first = (job - plan.first_job) * plan.shard_rows
+    for name, block in blocks.items():
         # An unused row is NaN and is left out; without one, zarr need not look for it, nor take empty photons for it.
         full = block.dtype.kind != "f" or not np.isnan(block.reshape(len(block), -1)[:, 0]).any()
         target = zarr.open_array(store, path=name, mode="r+", zarr_format=3).with_config({"write_empty_chunks": full})
         target[first : first + plan.shard_rows] = block
-        key = f"{name}/{array.shard_name(job - plan.first_job)}"
-        if not store.written[key].placed:
-            try:
-                shards.check(plan.folder / key, array, plan.shard_rows)
-            except CorruptError:  # left by a crash and damaged since; not committed, so not yet anyone's
-                (plan.folder / key).unlink(missing_ok=True)
-                target[first : first + plan.shard_rows] = block
 
 
 # ---------------------------------------------------------------------------------------- files that readers share
@@ -366,7 +407,7 @@ def _blocks(spec: SceneSpec, rows: JobRows, outputs: JobOutputs, shard_rows: int
     for row, name, values in _values(spec, outputs):
         array = arrays[name]
         if values.shape != array.shape:
-            raise StoreError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
+            raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
         if name not in blocks:
             blocks[name] = array.block(shard_rows)
         blocks[name][row % shard_rows] = _cast(values, array, row)
@@ -376,7 +417,7 @@ def _blocks(spec: SceneSpec, rows: JobRows, outputs: JobOutputs, shard_rows: int
 def _check_rows(what: str, expected: set[int] | frozenset[int], given: Mapping[int, object], job: int) -> None:
     if set(given) != expected:
         wrong = sorted(set(given) ^ expected)[0]
-        raise StoreError(f"{what} of job {job}: row {wrong} is missing or not the job's")
+        raise IncompleteError(f"{what} of job {job}: row {wrong} is missing or not the job's")
 
 
 def _values(spec: SceneSpec, outputs: JobOutputs) -> Iterator[tuple[int, str, NDArray[Any]]]:
@@ -404,15 +445,8 @@ def _cast(values: NDArray[Any], array: schema.ArraySchema, row: int) -> NDArray[
     with np.errstate(over="ignore", under="ignore"):
         stored = values.astype(array.dtype, copy=False)
     if stored.dtype.kind == "f" and not np.isfinite(stored).all():
-        raise StoreError(f"{array.name} of row {row} holds a value that is not finite in {array.dtype.name}")
+        raise IncompleteError(f"{array.name} of row {row} holds a value that is not finite in {array.dtype.name}")
     return stored
-
-
-def _described(store: durable.DurableStore, plan: StoredPlan, folder: Path) -> dict[str, dict[str, Any]]:
-    return {
-        str((plan.folder / key).relative_to(folder)): {"size": file.size, "sha256": file.sha256}
-        for key, file in sorted(store.written.items())
-    }
 
 
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:

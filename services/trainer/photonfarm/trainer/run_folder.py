@@ -1,0 +1,31 @@
+"""The folder of a training run, held by one trainer at a time."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.store.durable import store_errors
+
+LOCK = "lock"
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make the folder and lock it; raises StoreError if another trainer has it or it cannot be written.
+
+    The system lets go of the lock when its process ends, however it ends.
+    """
+    with store_errors("keep a training run here", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("ab")
+    with file:
+        with store_errors("lock the training run", folder):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StoreError(f"{folder}: another trainer is at work on this run; use another run folder") from error
+        yield

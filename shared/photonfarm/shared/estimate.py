@@ -21,7 +21,7 @@ class Estimate:
     """A mean and its standard error, from `count` independent samples; `group_means` makes dependent ones so."""
 
     mean: float
-    standard_error: float  # nan for one sample
+    standard_error: float | None  # unknown of one sample
     count: int
 
     @classmethod
@@ -30,8 +30,13 @@ class Estimate:
         count = len(per_sample)
         if count == 0:
             raise ValueError("per_sample is empty; an estimate needs at least one sample")
-        error = float(np.std(per_sample, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
+        error = float(np.std(per_sample, ddof=1) / np.sqrt(count)) if count > 1 else None
         return cls(float(np.mean(per_sample)), error, count)
+
+
+def stated(mean: float, standard_error: float | None) -> str:
+    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown."""
+    return f"{mean:.5f}" if standard_error is None else f"{mean:.5f} ± {standard_error:.5f}"
 
 
 def group_means(values: NDArray[np.float64], groups: Sequence[Hashable]) -> NDArray[np.float64]:

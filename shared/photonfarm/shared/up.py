@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from photonfarm.shared.errors import IncompleteError
+from photonfarm.shared.estimate import stated
 from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import SCENES_VARIABLE, find_spec
@@ -136,7 +137,7 @@ class _Farm:
         for record in self._records():
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
-                self.note = f", held-out error {record['error']:.5f} ± {record['standard_error']:.5f}"
+                self.note = f", held-out error {stated(record['error'], record['standard_error'])}"
         progress = self.scene.progress()
         return progress.committed_samples, progress.planned_samples
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -117,7 +116,7 @@ def production(store: Path, scene_id: str) -> SceneStatus:
 def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: SceneStatus) -> dict[str, Any]:
     """The figures of report.json."""
     state = checkpoint.load(run / CHECKPOINT)
-    following, spread = state["following"], evaluation.last.error.standard_error
+    following = state["following"]
     return {
         "scene": status.name,
         "scene_id": status.scene_id,
@@ -133,7 +132,7 @@ def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: 
         "draws_per_sample": state["step"] * settings.batch / max(len(following["sampler"]["rows"]), 1),
         "val_error_first": evaluation.first.error.mean,
         "val_error_last": evaluation.last.error.mean,
-        "val_error_last_standard_error": spread if math.isfinite(spread) else None,
+        "val_error_last_standard_error": evaluation.last.error.standard_error,
         "val_error_mean_colour": evaluation.mean_colour.error.mean,
         "noise_floor": evaluation.last.floor,
         "parameters": evaluation.parameters,

@@ -14,6 +14,7 @@ import click
 from pydantic import ValidationError
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.estimate import stated
 from photonfarm.shared.scene import load_spec, sentences
 from photonfarm.shared.store import Store
 from photonfarm.trainer.settings import TrainSettings, small
@@ -130,7 +131,7 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 def _tell(record: dict[str, Any]) -> None:
     if record["kind"] == "validation":
         click.echo(
-            f"step {record['step']}: held-out error {record['error']:.5f} ± {record['standard_error']:.5f}, "
-            f"{record['samples']} samples",
+            f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
+            f"on {record['held_out']} of {record['samples']} samples",
             err=True,
         )

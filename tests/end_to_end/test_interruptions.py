@@ -36,30 +36,34 @@ def wait_until(reached: Callable[[], object], seconds: float = 120) -> None:
 def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_behind(
     tmp_path: Path, small_room: Path
 ) -> None:
-    command = [sys.executable, "-m", "photonfarm.shared.cli", "up", small_room.name, "--workers", "2"]
-    command += ["--modifications", "60", "--views", "2", "--shard-rows", "4", "--train-steps", "120"]
-
-    def start() -> subprocess.Popen[bytes]:
+    def start(modifications: int, steps: int) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "photonfarm.shared.cli", "up", small_room.name, "--shard-rows", "4"]
+        command += ["--modifications", str(modifications), "--train-steps", str(steps)]
         return subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
 
-    def markers() -> set[Path]:
-        return set(tmp_path.glob("store/scenes/*/committed/*.json"))
+    def markers() -> int:
+        return len(list(tmp_path.glob("store/scenes/*/committed/*.json")))
+
+    def logged() -> int:
+        log = tmp_path / "run/metrics.jsonl"
+        return log.stat().st_mtime_ns if log.exists() else 0
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-        before = len(markers())
-        farm = start()
-        wait_until(lambda least=before: len(markers()) > least)
+        before = logged()
+        farm = start(60, steps=1_000_000)
+        wait_until(lambda earlier=before: logged() > earlier)  # the trainer is at work
         farm.send_signal(number)
         farm.wait(60)
         assert farm.returncode != 0
         wait_until(lambda: not processes_in(tmp_path), 60)
 
-    before = markers()
-    farm = start()
-    wait_until(lambda: len(markers()) > len(before))
+    so_far = [json.loads(line)["step"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    committed = markers()
+    farm = start(200, steps=max(so_far) + 200)
+    wait_until(lambda: markers() > committed)
     (redis,) = processes_in(tmp_path / "run/redis")
     os.kill(redis, signal.SIGKILL)
     assert farm.wait(300) == 0
-    assert len(markers()) == 30
-    assert json.loads((tmp_path / "out/report.json").read_text())["train_steps"] == 120
+    assert markers() == 100
+    assert json.loads((tmp_path / "out/report.json").read_text())["train_steps"] == max(so_far) + 200
     assert not processes_in(tmp_path)

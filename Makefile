@@ -31,6 +31,14 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# What only this benchmark needs: the peers it is about, and plots.
+$(VENV)/.bench-ready: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[bench]'
+	@touch $@
+
+bench-render: $(VENV)/.bench-ready
+	$(BIN)/python bench/render.py
+
 bench-%: $(STAMP)
 	$(BIN)/python bench/$(subst -,_,$*).py
 

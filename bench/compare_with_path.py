@@ -14,15 +14,15 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import os
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from scene_loading import load
 
 Z_LIMIT = 4.5
 MEAN_LIMIT = 0.005
@@ -75,47 +75,6 @@ class Row:
     path_wall_s: float
     bdpt_wall_s: float
     verdict: str
-
-
-def scene_loaders() -> dict[str, Callable[[int], Any]]:
-    """Name → function of the image size that loads the scene. Other packages' scenes are added here."""
-    import mitsuba as mi
-
-    from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
-
-    def loader(build: Callable[[int], Any]) -> Callable[[int], Any]:
-        return lambda size: mi.load_dict(build(size), optimize=False)
-
-    return {name: loader(build) for name, build in HARD_SCENES.items()} | {"room": loader(_room)}
-
-
-def _room(size: int) -> dict[str, Any]:
-    """The built-in room as modelled, seen from a corner."""
-    import mitsuba as mi
-
-    from photonfarm.renderer import rooms
-
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    to_world = mi.ScalarTransform4f().look_at(origin=[2.3, 1.6, 1.9], target=[-0.8, 0.8, -0.8], up=[0, 1, 0])
-    sensor = {"type": "perspective", "fov": 70, "near_clip": 0.05, "to_world": to_world, "film": film}
-    return {"type": "scene", **rooms.describe("room"), "sensor": sensor}
-
-
-def load(name: str, size: int) -> Any:
-    """The scene of this name, folder or path. Raises ValueError if there is none."""
-    import mitsuba as mi
-
-    loaders = scene_loaders()
-    if name in loaders:
-        return loaders[name](size)
-    folder = Path(os.environ.get("PHOTONFARM_SCENES", "."))
-    for path in (Path(name), folder / name / "scene.xml"):
-        if path.is_file():
-            return mi.load_file(str(path), optimize=False, resx=size, resy=size)
-    raise ValueError(
-        f"scene {name!r} is neither one of {sorted(loaders)}, nor a file, nor a folder with a scene.xml under "
-        f"PHOTONFARM_SCENES ({folder})"
-    )
 
 
 def render(scene: Any, integrator: dict[str, Any], seeds: range, spp: int) -> tuple[Any, float]:

@@ -9,7 +9,7 @@ trap 'rm -rf "$venv"' EXIT
 "${PYTHON:-python3}" -m venv "$venv"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
   drjit==1.5.0 mitsuba==3.9.1 torch==2.13.0 zarr==3.1.6 \
-  -e 'shared[embedded,dev]' -e services/renderer -e services/trainer
+  -e 'shared[embedded,dev,bench]' -e services/renderer -e services/trainer
 {
   echo "# Exact versions, made by: make lock"
   "$venv/bin/python" -m pip freeze --exclude-editable | sed -E 's/^([A-Za-z0-9._-]+)==([^+ ]+)\+.*$/\1==\2/'

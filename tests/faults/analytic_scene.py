@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -52,6 +52,9 @@ class AnalyticScene:
 
     def _level(self, view: View) -> float:
         return float(np.abs(self.modification.vector).sum() + np.abs(view.vector).sum())
+
+    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
+        return np.stack([self.render_half(view, seed) for seed in seeds])
 
     def render_half(self, view: View, seed: int) -> F32:
         time.sleep(self.pause_s)

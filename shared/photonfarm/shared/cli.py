@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -16,26 +14,9 @@ from rich.console import Console
 
 from photonfarm.shared.errors import PhotonfarmError, StoreError
 from photonfarm.shared.settings import file_defaults
+from photonfarm.shared.verbs import Umbrella, options_by_command
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-
-
-@cache
-def _verbs() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group="photonfarm.commands")}
-
-
-class Umbrella(click.Group):
-    """A group whose verbs are those of the services that are installed."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        """The installed verbs."""
-        return sorted(_verbs())
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        """The verb, imported only now."""
-        entry = _verbs().get(cmd_name)
-        return None if entry is None else entry.load()
 
 
 @click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -52,18 +33,7 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     """
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():
-        ctx.default_map = file_defaults(config, {verb: _options(verb) for verb in _verbs()})
-
-
-def _options(verb: str) -> dict[str, str]:
-    """Names of a verb's options as they are written, without dashes, and what click calls them."""
-    parameters = _verbs()[verb].load().params
-    return {
-        flag.lstrip("-"): str(option.name)
-        for option in parameters
-        if isinstance(option, click.Option)
-        for flag in option.opts
-    }
+        ctx.default_map = file_defaults(config, options_by_command(umbrella))
 
 
 def main(args: list[str] | None = None) -> None:

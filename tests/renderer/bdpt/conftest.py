@@ -62,26 +62,6 @@ def assert_equal_means(request: pytest.FixtureRequest) -> Callable[..., None]:
     return check
 
 
-@pytest.fixture
-def assert_mean_is(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """Function that fails unless the mean of images is a known number, within 4.5 standard errors and 0.05 %."""
-
-    def check(images: Any, truth: float) -> None:
-        means = np.asarray(images, dtype=np.float64).reshape(len(images), -1).mean(axis=1)
-        tolerance = (
-            Z_LIMIT * 1.3 * means.std(ddof=1) / np.sqrt(len(means)) + 5e-4 * truth
-        )  # 1.3: Student's t of 8 renders
-        if abs(means.mean() - truth) <= tolerance:
-            return
-        folder = save(request, bdpt=images)
-        pytest.fail(
-            f"mean {means.mean():.5f}, expected {truth:.5f} ± {tolerance:.5f}\nimages: {folder}\n"
-            f"repeat: python -m pytest '{request.node.nodeid}'"
-        )
-
-    return check
-
-
 def save(request: pytest.FixtureRequest, **images: Any) -> Path:
     folder = FAILURES / request.node.name
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,12 +10,13 @@ from photonfarm.renderer.bdpt import weights
 class RandomPath:
     """A path of k edges with made-up densities, v₀ on the light and v_k on the lens.
 
-    Its weights can be written down directly.
+    Its weights can be written down directly. Paths of two edges are made by s=0 and s=1 alone: light paths are not
+    joined to the lens at their first vertex.
     """
 
     def __init__(self, k: int, n: float, n_t: float, seed: int) -> None:
         u = np.random.default_rng(seed).uniform(0.2, 2.0, (6, k + 1))
-        self.k, self.n, self.n_t = k, n, n_t
+        self.k, self.n, self.n_t = k, n, n_t  # edges; technique counts of connections and of light tracing
         self.r2, self.cos_left, self.cos_right = u[0] ** 2, u[1] / 2, u[2] / 2  # of edge i: cosines at vᵢ and vᵢ₊₁
         self.light, self.eye = (
             u[3],
@@ -38,7 +39,14 @@ class RandomPath:
             p *= self.p_cam * self.cos_left[k - 1] / self.r2[k - 1]
             for j in range(k - 1, k - t + 1, -1):
                 p *= self.eye[j] * self.cos_left[j - 1] / self.r2[j - 1]
-        return p * (1 if s <= 1 else self.n_t if t == 1 else self.n)
+        return p * self.count(s)
+
+    def count(self, s: int) -> float:
+        if s <= 1:
+            return 1
+        if s == self.k:
+            return self.n_t if self.k > 2 else 0
+        return self.n
 
     def light_state(self, vertices: int) -> tuple[float, float]:
         """(dVCM, dVC) on arriving at v_j, j = vertices − 1."""
@@ -54,10 +62,12 @@ class RandomPath:
     def eye_state(self, last: int) -> tuple[float, float]:
         """(dVCM, dVC) on arriving at v_last; at the light itself, dVCM from before the arrival."""
         k = self.k
-        dvcm = weights.eye_start(
-            mi.Float(self.n_t), mi.Float(self.p_cam / self.r2[k - 1]), mi.Float(self.cos_left[k - 1])
-        )[0]
-        dvc = 0.0
+        dvcm, dvc = weights.arrive(
+            float(weights.eye_start(mi.Float(self.n_t), mi.Float(self.p_cam))[0]),
+            0.0,
+            self.r2[k - 1],
+            self.cos_left[k - 1],
+        )
         for j in range(k - 1, last, -1):
             count = 1 if j == k - 1 else self.n
             before = weights.scatter(dvcm, dvc, count, self.cos_right[j - 1], self.eye[j], self.light[j])
@@ -70,13 +80,16 @@ class RandomPath:
         k = self.k
         nee_direction = self.nee_area * self.r2[0] / self.cos_left[0]
         if s == 0:
-            return weights.hit_emitter(nee_direction, self.emission, *self.eye_state(0))
+            dvcm, dvc = self.eye_state(0)
+            return weights.hit_emitter(nee_direction, self.emission, dvcm, dvc if k > 2 else 0.0)
         if s == 1:
             ratio = self.emission * self.cos_right[0] / (nee_direction * self.cos_left[0])
-            count = 1 if k == 2 else self.n
+            count = 0 if k == 2 else self.n
             return weights.next_event(self.eye[1] / nee_direction, ratio, count, self.light[1], *self.eye_state(1))
         if s == k:
-            count = 1 if k == 2 else self.n
+            if k == 2:
+                return 0.0
+            count = self.n
             camera = self.p_cam * self.cos_left[k - 1] / self.r2[k - 1]
             return weights.light_tracing(camera, self.n_t, count, self.eye[k - 1], *self.light_state(k))
         y, x = s - 1, s  # the joined vertices
@@ -93,13 +106,17 @@ def test_weights_are_the_balance_heuristic_of_the_densities(k: int, n: float, n_
     path = RandomPath(k, n, n_t, seed=k)
     densities = [path.density(s) for s in range(k + 1)]
     for s in range(k + 1):
-        assert path.weight(s) == pytest.approx(densities[s] / sum(densities), rel=1e-4)
+        assert path.weight(s) == pytest.approx(densities[s] / sum(densities), rel=1e-5)
 
 
 @pytest.mark.parametrize("k", [2, 3, 6])
 def test_weights_of_one_path_sum_to_one(k: int) -> None:
     path = RandomPath(k, 0.5, 0.7, seed=99)
-    assert sum(path.weight(s) for s in range(k + 1)) == pytest.approx(1, rel=1e-4)
+    assert sum(path.weight(s) for s in range(k + 1)) == pytest.approx(1, rel=1e-5)
+
+
+def test_a_sensor_that_cannot_be_hit_leaves_out_light_tracing() -> None:
+    assert weights.eye_start(mi.Float(1.0), mi.Float(0.0))[0] == 0
 
 
 def test_a_connection_of_touching_vertices_has_a_finite_weight() -> None:

@@ -16,17 +16,22 @@ ALIGNMENT_BYTES = 64
 
 
 def floats(values: NDArray[Any]) -> Any:
-    """All values, in order, as mi.Float in memory that is aligned.
+    """All values, in order, as mi.Float in Dr.Jit's own memory.
 
-    Dr.Jit takes numpy's memory as it is and compiles a kernel anew for each combination of inputs that happen to lie on
-    odd addresses; numpy aligns to 16 bytes only.
+    Dr.Jit takes numpy's memory as it is, compiles a kernel anew for each combination of inputs that happen to lie on
+    odd addresses (numpy aligns to 16 bytes only), and `dr.freeze` does not notice when a mesh gets other such memory.
     """
-    return mi.Float(_aligned(values, np.float32))
+    return _owned(mi.Float(_aligned(values, np.float32)) * dr.opaque(mi.Float, 1))
 
 
 def integers(values: NDArray[Any]) -> Any:
     """The same for mi.UInt32."""
-    return mi.UInt32(_aligned(values, np.uint32))
+    return _owned(mi.UInt32(_aligned(values, np.uint32)) * dr.opaque(mi.UInt32, 1))
+
+
+def _owned(product: Any) -> Any:
+    dr.eval(product)
+    return product
 
 
 def _aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:

@@ -1,8 +1,10 @@
-"""The verbs of the render service: doctor, preview, work."""
+"""The verbs of the render service: doctor, preview, scene plan, work."""
 
 from __future__ import annotations
 
+import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import click
@@ -54,3 +56,54 @@ def preview(spec: str, store: Path, count: int, out: Path) -> None:
 
     write_contact_sheet(SceneReader(store, load_spec(spec).scene_id), count, out)
     click.echo(out)
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--seconds", type=click.FloatRange(1), default=60.0, show_default=True, help="CPU time to measure for.")
+@click.option("--write", is_flag=True, help="Put the settings into SPEC's file; samples planned before keep theirs.")
+@click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@json_option
+def scene_plan(spec: str, seconds: float, write: bool, again: bool, as_json: bool) -> None:
+    """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
+    from photonfarm.renderer import backend
+    from photonfarm.shared.scene import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.strategy import spec_file
+    from photonfarm.renderer.strategy.plan import lines, make_plan
+
+    file = spec_file.writable(spec) if write else find_spec(spec)
+    plan = make_plan(loaded, file.parent, seconds=seconds, again=again, talk=partial(click.echo, err=True))
+    click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))
+    if write:
+        spec_file.write(file, plan.settings)
+        click.echo(f"written into {file}", err=True)
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small images, mostly one pair of settings: about two minutes.")
+@click.option("--only", multiple=True, metavar="ROW", help="This row (1 … 36) or scene alone; may be repeated.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="First seed; 0 is a seed.")
+@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
+              help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
+def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
+    """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
+    from photonfarm.renderer import backend
+
+    backend.load(threads)
+    from photonfarm.renderer.stability import report, rows
+
+    try:
+        scenes = rows.chosen(only, quick=quick)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
+    found = report.examine(
+        scenes, quick=quick, seed=seed, failures=out / "failures", tell=partial(click.echo, err=True)
+    )
+    arguments = ["--quick"] * quick + [f"--only {row}" for row in only] + [f"--seed {seed}"] * (seed != 0)
+    report.write(found, out, " ".join(["photonfarm report stability", *arguments]))
+    click.echo(out / "stability.md")
+    sys.exit(0 if found.passed else 1)

@@ -45,10 +45,9 @@ class MeshPlacement:
 
     def _put(self, vertices: F32) -> None:
         self._parameters["vertex_positions"] = floats(vertices)
-        self._parameters.update()
-        if self._normals is not None:  # Mitsuba has just computed others, from the faces
+        if self._normals is not None:  # in the same update: alone, new positions make Mitsuba compute others from faces
             self._parameters["vertex_normals"] = floats(self._normals)
-            self._parameters.update()
+        self._parameters.update()
 
 
 class TransformPlacement:

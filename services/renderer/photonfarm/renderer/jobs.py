@@ -9,10 +9,10 @@ from __future__ import annotations
 import gc
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from itertools import groupby
+from itertools import count, groupby, islice
 from typing import Protocol
 
 import numpy as np
@@ -42,8 +42,8 @@ class SceneRenderer(Protocol):
     def apply(self, modification: Modification) -> None:
         """Put the scene into a configuration."""
 
-    def render_half(self, view: View, seed: int) -> F32:
-        """One noisy estimate of radiance, (H, W, 3) linear."""
+    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
+        """Independent noisy estimates of radiance, one for each seed, (K, H, W, 3) linear."""
 
     def buffers(self, view: View) -> ViewBuffers:
         """The image-space buffers of a view."""
@@ -201,20 +201,27 @@ class _Rendering:
 
     def _halves(self, sample: SampleRow, view: View) -> F32:
         """Two independent estimates, (2, H, W, 3)."""
-        seed_a, a = self._half(sample.key, "half A", view, taken=None)
-        _, b = self._half(sample.key, "half B", view, taken=seed_a)
-        return np.stack([a, b])
+        purposes = ("half A", "half B")
+        seed_a = next(_seeds(sample.key, purposes[0], ()))
+        seed_b = next(_seeds(sample.key, purposes[1], (seed_a,)))
+        halves = self._scene.render_halves(view, (seed_a, seed_b))
+        for half, purpose in enumerate(purposes):
+            if not np.isfinite(halves[half]).all():
+                halves[half] = self._again(sample.key, purpose, view, (seed_a, seed_b))
+        return halves
 
-    def _half(self, key: Key, purpose: str, view: View, taken: int | None) -> tuple[int, F32]:
-        for seed in _seeds(key, purpose, taken):
-            image = self._scene.render_half(view, seed)
+    def _again(self, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> F32:
+        """Another estimate for one that came out non-finite; other seeds than those that are `taken`."""
+        self._throw_away(key, purpose)
+        for seed in islice(_seeds(key, purpose, taken), ATTEMPTS - 1):
+            image = self._scene.render_halves(view, (seed,))[0]
             if np.isfinite(image).all():
-                return seed, image
+                return image
             self._throw_away(key, purpose)
         raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
     def _photons(self, key: Key) -> Photons | None:
-        for seed in _seeds(key, "photons", None):
+        for seed in islice(_seeds(key, "photons", ()), ATTEMPTS):
             photons = self._scene.photons(seed)
             if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
                 return photons
@@ -226,12 +233,9 @@ class _Rendering:
         log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
 
 
-def _seeds(key: Key, purpose: str, taken: int | None) -> Iterator[int]:
-    """The seeds to try in turn, none of them `taken`: equal seeds would make the halves equal."""
-    attempt = found = 0
-    while found < ATTEMPTS:
+def _seeds(key: Key, purpose: str, taken: tuple[int, ...]) -> Iterator[int]:
+    """The seeds to try in turn, without end, none of them `taken`: equal seeds would make the halves equal."""
+    for attempt in count():
         seed = seed_of(key, purpose if attempt == 0 else f"{purpose}, attempt {attempt}")
-        attempt += 1
-        if seed != taken:
-            found += 1
+        if seed not in taken:
             yield seed

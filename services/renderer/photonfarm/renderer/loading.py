@@ -28,7 +28,7 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
     """
     scene = _builtin(spec) if spec.scene.builtin else _from_file(spec, beside)
     try:
-        check_scene(scene)
+        check_scene(scene, light_paths=bool(spec.transport.light_ratio or spec.photons.paths))
     except ValueError as error:
         raise SpecError(f"{spec.name}: {error}") from error
     _check_lights(spec, scene)

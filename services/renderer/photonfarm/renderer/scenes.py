@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -46,9 +47,12 @@ class LoadedScene:
         movable group has been parked and brought back once, so that what this compiles is compiled.
         """
         backend.load()
+        from photonfarm.renderer.acceleration import expect_changes
         from photonfarm.renderer.loading import load_scene
 
         loaded = cls(spec, load_scene(spec, beside))
+        if spec.groups:
+            expect_changes(loaded.scene)
         at_rest = rest(spec)
         loaded.apply(Modification(at_rest.translation, np.zeros_like(at_rest.present)))
         loaded.apply(at_rest)
@@ -77,9 +81,14 @@ class LoadedScene:
             for emitter in self._distant:
                 emitter.set_scene(self.scene)
 
+    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
+        """Half-estimates of linear radiance for each seed, (K, H, W, 3): the spec's integrator and `half_spp`."""
+        images = self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, self.spec.transport.half_spp)
+        return np.array(images, np.float32)
+
     def render_half(self, view: View, seed: int) -> F32:
-        """One half-estimate of linear radiance, (H, W, 3), with the spec's integrator and `half_spp`."""
-        return self.render(view, seed)
+        """One of them, (H, W, 3)."""
+        return self.render_halves(view, (seed,))[0]
 
     def render(self, view: View, seed: int, integrator: Any = None, spp: int | None = None) -> F32:
         """Linear radiance (H, W, 3), with another Mitsuba integrator or number of samples per pixel if given."""
@@ -128,7 +137,7 @@ def integrator_of(transport: Transport) -> Any:
 
     parameters = transport.model_dump(exclude={"half_spp"})
     try:
-        return mi.load_dict({"type": "bdpt", **parameters})
+        return mi.load_dict({"type": "bdpt", "record": True, **parameters})
     except (RuntimeError, ValueError) as error:
         raise SpecError(f"transport: {' '.join(str(error).split())}") from error
 

@@ -16,7 +16,7 @@ class SensorSample:
     """The lens seen from a surface point."""
 
     d: Any  # Vector3f: unit direction to the lens
-    position: Any  # Point2f: where the film is hit, in pixels of the whole film
+    position: Any  # Point2f: where the film is hit, in pixels of the crop window
     weight: Any  # Spectrum: importance/r², normalised over the crop window
     area_density_over_cos: Any  # Float: p_cam/r², by which primary rays would find the surface, without its cosine
     start: Any  # Point3f: where primary rays through this film position begin (the near plane)
@@ -48,9 +48,35 @@ def check_sensor(sensor: Any, *, light_tracing: bool) -> None:
         )
 
 
-def primary_importance(sensor: Any, si: Any, aperture: Any, active: Any) -> Any:
-    """p_cam/r² at a first hit (Float), for the point of the aperture its ray came from; 0 outside the crop window."""
-    return sensor.sample_direction(si, aperture, active)[1][0]
+@dataclass(slots=True)
+class EyeStart:
+    """Primary rays."""
+
+    ray: Any  # Ray3f
+    weight: Any  # Spectrum: the sensor's
+    density: Any  # Float: of the direction, in solid angle over the crop window; 0 where light cannot hit the sensor
+    before_ray: Any  # Float: distance from the pinhole (or the point of the aperture) to the ray's origin
+
+
+def primary_rays(sensor: Any, rng: Any, pixel: Any, *, joined: bool) -> EyeStart:
+    """Rays through uniform points of the given pixels (UInt32, row by row in the crop window).
+
+    Densities are found where light is ``joined`` to the lens. The box filter counts a sample for the pixel it was drawn
+    in.
+    """
+    size = mi.ScalarVector2u(sensor.film().crop_size())
+    row = pixel // size[0]
+    corner = mi.Point2f(mi.Float(pixel - row * size[0]), mi.Float(row))
+    position = corner + rng.next_2d()
+    aperture = rng.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, weight = sensor.sample_ray(0, 0, position / mi.ScalarVector2f(size), aperture)
+    if not joined:
+        return EyeStart(ray, weight, mi.Float(0), mi.Float(0))
+    ahead = dr.minimum(sensor.near_clip(), 0.5 * ray.maxt)
+    point = dr.zeros(mi.Interaction3f)
+    point.p = dr.fma(ray.d, ahead, ray.o)
+    ds, importance = sensor.sample_direction(point, aperture)
+    return EyeStart(ray, weight, importance[0] * dr.square(ds.dist), dr.maximum(ds.dist - ahead, 0))
 
 
 def sample_sensor(sensor: Any, si: Any, aperture: Any, active: Any) -> SensorSample:
@@ -65,7 +91,7 @@ def sample_sensor(sensor: Any, si: Any, aperture: Any, active: Any) -> SensorSam
     along = dr.dot(si.p - ray.o, ray.d)
     return SensorSample(
         d=ds.d,
-        position=ds.uv + mi.ScalarVector2f(film.crop_offset()),
+        position=ds.uv,
         weight=weight,
         area_density_over_cos=weight[0],
         start=ray.o,

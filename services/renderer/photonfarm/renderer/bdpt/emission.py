@@ -25,6 +25,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .randomness import along_curve
+from .selection import Selection, read_selection
+
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
 """How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""
 
@@ -52,9 +55,9 @@ class Lights:
     count: int  # N
     kinds: tuple[int, ...]  # kind of each light, N; fixed while the scene's topology is
     kind: Any  # UInt32, N: the same as data
-    nee_cdf: Any  # Float, N: running sum of the weights for next event estimation, not normalised
-    nee: Any  # Float, by id: probability of selection for next event estimation
-    emit_cdf: Any  # Float, N: the same for light paths; it differs from nee only where there are EYE_ONLY lights
+    selection: Selection | None  # probabilities for next event estimation; None for a single light
+    alive: Any  # Float, by id: whether a single light shines, 1 or 0
+    emit_cdf: Any  # Float, N: running sum of the probabilities for light paths, not normalised
     emission: Any  # Float, by id: ê of the table above, 0 where light paths never start
     axis: Any  # Vector3f, N: axis of a spot light's cone
     cos_cutoff: Any  # Float, N: −1 for lights that shine everywhere
@@ -77,9 +80,11 @@ class Lights:
             return mi.Bool(True)
         return dr.gather(mi.UInt32, self.kind, index) == kind
 
-    def nee_probability(self, emitter: Any) -> Any:
-        """Probability of choosing the given emitters for next event estimation (0 for the null pointer)."""
-        return dr.gather(mi.Float, self.nee, dr.reinterpret_array(mi.UInt32, emitter))
+    def nee_probability(self, emitter: Any, p: Any) -> Any:
+        """Probability of choosing ``emitter`` for next event estimation at points ``p`` (0 for the null pointer)."""
+        if self.selection is None:
+            return dr.gather(mi.Float, self.alive, dr.reinterpret_array(mi.UInt32, emitter))
+        return self.selection.probability(p, emitter)
 
     def emission_factor(self, emitter: Any) -> Any:
         """ê of the given emitters (0 for the null pointer)."""
@@ -107,24 +112,24 @@ def read_lights(scene: Any) -> Lights:
             weights[i] = dr.select(is_flat(shapes[key]), weights[i], 0)
     weight = _column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
-    emit_weight = dr.select(kind == EYE_ONLY, 0, weight)
-    nee_cdf, nee = _normalise(weight, n)
+    selection = read_selection(pointers, ids, weight, _box(scene)) if n > 1 else None
+    emit_weight = dr.select(kind == EYE_ONLY, 0, weight if selection is None else selection.overall)
     emit_cdf, emit = _normalise(emit_weight, n)
     axis, cos_cutoff = _cones(parameters, emitters)
 
     emission = emit / (dr.two_pi * (1 - cos_cutoff))  # positions; π·R² for lights at infinity, A·π for areas
     emission = dr.select((kind == INFINITE) | (kind == DIRECTION), emit / (dr.pi * dr.square(radius)), emission)
     if AREA in kinds:
-        area = pointers.get_shape().surface_area()
+        area = _column(n, [shapes[key].surface_area() if kinds[i] == AREA else 0 for i, key in enumerate(ids)])
         emission = dr.select(kind == AREA, dr.select(area > 0, emit / (area * dr.pi), 0), emission)
 
     index = mi.UInt32(ids)
-    nee_by_id, emission_by_id = dr.zeros(mi.Float, max(ids) + 1), dr.zeros(mi.Float, max(ids) + 1)
-    dr.scatter(nee_by_id, nee, index)
+    alive, emission_by_id = dr.zeros(mi.Float, max(ids) + 1), dr.zeros(mi.Float, max(ids) + 1)
+    dr.scatter(alive, dr.select(weight > 0, mi.Float(1), 0), index)
     dr.scatter(emission_by_id, emission, index)
-    dr.eval(nee_cdf, nee_by_id, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
+    dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
-        pointers, n, kinds, kind, nee_cdf, nee_by_id, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
+        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
     )  # fmt: skip
 
 
@@ -219,15 +224,18 @@ def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
     return mi.Vector3f(*(_column(n, [axis[k] for axis in axes]) for k in range(3))), _column(n, cosines)
 
 
+def _box(scene: Any) -> Any:
+    """The scene's bounding box, or that of a unit sphere where there is no shape."""
+    box = scene.bbox()
+    return box if box.valid() and scene.shapes() else mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])
+
+
 def _scene_sphere(scene: Any) -> tuple[Any, Any]:
     """Centre and radius of a sphere around everything, as data.
 
     Moving an object past the old box recompiles nothing.
     """
-    box = scene.bbox()
-    if not box.valid() or not scene.shapes():
-        return mi.Point3f(dr.opaque(mi.Float, 0)), dr.opaque(mi.Float, 1)
-    sphere = box.bounding_sphere()
+    sphere = _box(scene).bounding_sphere()
     radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
     return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
 
@@ -250,23 +258,24 @@ class DirectSample:
     valid: Any  # Bool
 
 
-def choose(lights: Lights, cdf: Any, u: Any) -> Any:
-    """Index of a light (UInt32) by inversion of a running sum: the smallest i with cdf(i) > u·cdf(N−1).
-
-    A dead one is never chosen.
-    """
+def _choose_start(lights: Lights, rng: Any) -> Any:
+    """Lights (UInt32) for light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
     if lights.count == 1:
-        return dr.zeros(mi.UInt32, dr.width(u))
-    target = u * dr.gather(mi.Float, cdf, mi.UInt32(lights.count - 1))
-    return dr.binary_search(0, lights.count - 1, lambda i: dr.gather(mi.Float, cdf, i) <= target)
+        return dr.zeros(mi.UInt32, dr.width(rng.index))
+    cdf, last = lights.emit_cdf, lights.count - 1
+    target = rng.next_1d() * dr.gather(mi.Float, cdf, mi.UInt32(last))
+    return dr.binary_search(0, last, lambda i: dr.gather(mi.Float, cdf, i) <= target)
 
 
 def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSample:
     """Choose a light and a point of it, as seen from ``si``."""
-    index = choose(lights, lights.nee_cdf, rng.next_float32() if lights.count > 1 else mi.Float(0))
+    if lights.selection is None:
+        index = dr.zeros(mi.UInt32, dr.width(si))
+        selection = dr.gather(mi.Float, lights.alive, dr.reinterpret_array(mi.UInt32, lights.pointers))
+    else:
+        index, selection = lights.selection.choose(si.p, rng.next_1d())
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
-    ds, weight = emitter.sample_direction(si, next_2d(rng), active)
-    selection = lights.nee_probability(emitter)
+    ds, weight = emitter.sample_direction(si, rng.next_2d(), active)
     density = selection * ds.pdf
     valid = active & (density > 0) & (dr.max(weight) > 0)
 
@@ -295,7 +304,7 @@ def hit_densities(scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
     factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
-    return lights.nee_probability(emitter) * p_direction, lights.emission_factor(emitter) * factor
+    return lights.nee_probability(emitter, origin) * p_direction, lights.emission_factor(emitter) * factor
 
 
 # ------------------------------------------------ Emission (from y₀) ------------------------------------------------
@@ -317,12 +326,13 @@ class Emission:
     valid: Any  # Bool
 
 
-def sample_emission(lights: Lights, rng: Any, n: int) -> Emission:
-    """Start n light paths."""
-    index = choose(lights, lights.emit_cdf, rng.next_float32() if lights.count > 1 else dr.zeros(mi.Float, n))
+def sample_emission(lights: Lights, rng: Any, path: Any, paths: Any) -> Emission:
+    """Start light paths, number ``path`` (UInt32) of ``paths``: neighbours in number set out in like directions."""
+    n = dr.width(rng.index)
+    index = _choose_start(lights, rng)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
     factor = lights.emission_factor(emitter)
-    u_position, u_direction = next_2d(rng), next_2d(rng)
+    u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng.next_1d())
     out = Emission(
         ray=dr.zeros(mi.Ray3f, n),
         throughput=mi.Spectrum(0),
@@ -382,9 +392,3 @@ def _start_at_point(out: Emission, lights: Lights, index: Any, u: Any, mask: Any
     ds, weight = out.emitter.sample_direction(reference, mi.Point2f(0.5), mask)
     out.throughput[mask] = weight * dr.square(ds.dist)
     out.ray = dr.select(mask, mi.Ray3f(position, d), out.ray)
-
-
-def next_2d(rng: Any) -> Any:
-    """Two uniform numbers in [0, 1) as a Point2f."""
-    first = rng.next_float32()
-    return mi.Point2f(first, rng.next_float32())

@@ -13,10 +13,11 @@ import drjit as dr
 import mitsuba as mi
 
 from . import weights
-from .camera import primary_importance
-from .emission import Lights, hit_densities, next_2d, sample_direct
+from .camera import EyeStart
+from .emission import Lights, hit_densities, sample_direct
 from .light_paths import LightVertices, PathOptions
 from .loops import traced_once
+from .randomness import SHIFTS
 
 _MAX_THROUGHPUT_KEPT = 0.95
 
@@ -26,15 +27,16 @@ class EyeState:
     """Loop variables of an eye path."""
 
     active: Any  # Bool: this path goes on
-    rng: Any  # PCG32
-    ray: Any  # Ray3f: to the next vertex
+    rng: Any  # Sampler
+    ray: Any  # Ray3f: to this vertex, or out of the scene
+    arrival: Any  # PreliminaryIntersection3f: where it arrives
+    before_ray: Any  # Float: distance from the pinhole to the ray's origin at the first vertex, later 0
     throughput: Any  # Spectrum
     radiance: Any  # Spectrum: the estimate so far
     eta: Any  # Float: product of relative refractive indices, for Russian roulette
-    dvcm: Any  # Float: see weights.py
+    dvcm: Any  # Float: see weights.py, as they left the vertex before
     dvc: Any  # Float
-    depth: Any  # UInt32: edges so far
-    hit: Any  # Bool: the first ray hit something (alpha)
+    depth: Any  # UInt32: edges up to this vertex
 
 
 @dataclass(slots=True)
@@ -43,79 +45,63 @@ class Connectable:
 
     vertices: LightVertices
     seen: Any  # UInt32: number each was drawn from
-    paths: Any  # UInt32, 1: how many there are
-    pairing: Any  # UInt32, 1: seed of the shifts
+    paths: Any  # UInt32, 1: how many there are for each image
+    image: Any  # UInt32: image of the launch that a lane belongs to
+    lane: Any  # UInt32: lane's number within its image
+    shifts: Any  # UInt32: see randomness.shifts
 
 
 def trace_eye_paths(
     scene: Any,
-    sensor: Any,
     lights: Lights | None,
     options: PathOptions,
     *,
     rng: Any,
-    ray: Any,
-    weight: Any,
-    aperture: Any,
+    start: EyeStart,
     connectable: Connectable | None,
 ) -> tuple[Any, Any]:
-    """(radiance: Spectrum, whether the first ray hit anything: Bool) of eye paths that start with ``ray``."""
-    n = dr.width(ray)
+    """(radiance: Spectrum, whether the first ray hit anything: Bool) of the eye paths that begin with ``start``."""
+    n = dr.width(start.ray)
+    active = dr.full(mi.Bool, options.max_depth > 0, n)
+    # Neighbouring lanes are samples of one pixel, so that Embree may trace them as a bundle
+    arrival = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
+    reached = arrival.is_valid()
     state = EyeState(
-        active=dr.full(mi.Bool, options.max_depth > 0, n),
+        active=active,
         rng=rng,
-        ray=mi.Ray3f(ray),
-        throughput=mi.Spectrum(weight),
+        ray=mi.Ray3f(start.ray),
+        arrival=arrival,
+        before_ray=mi.Float(start.before_ray),
+        throughput=mi.Spectrum(start.weight),
         radiance=mi.Spectrum(0),
         eta=mi.Float(1),
-        dvcm=mi.Float(0),
+        dvcm=weights.eye_start(options.light_ratio, start.density) if options.traces_light else mi.Float(0),
         dvc=mi.Float(0),
-        depth=mi.UInt32(0),
-        hit=mi.Bool(False),
+        depth=mi.UInt32(1),
     )
     (state,) = traced_once(
         state=(state,),
         cond=lambda s: s.active,
-        body=partial(
-            _bounce,
-            scene=scene,
-            sensor=sensor,
-            lights=lights,
-            options=options,
-            aperture=aperture,
-            connectable=connectable,
-        ),
+        body=partial(_bounce, scene=scene, lights=lights, options=options, connectable=connectable),
         labels=("eye path",),
         label="bdpt eye paths",
     )
-    return state.radiance, state.hit
+    return state.radiance, reached
 
 
 def _bounce(
-    s: EyeState,
-    *,
-    scene: Any,
-    sensor: Any,
-    lights: Lights | None,
-    options: PathOptions,
-    aperture: Any,
-    connectable: Connectable | None,
+    s: EyeState, *, scene: Any, lights: Lights | None, options: PathOptions, connectable: Connectable | None
 ) -> tuple[EyeState]:
     """One vertex of an eye path: light it shines by itself, light from a light, light from light paths, scatter."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
 
-    si = scene.ray_intersect(s.ray, active=s.active)
-    depth = s.depth + 1
+    si = s.arrival.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
+    depth = s.depth
     first = depth == 1
-    hit = s.hit | (first & s.active & si.is_valid())
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
-    r2 = dr.square(si.t)
-    dvcm, dvc = weights.arrive(s.dvcm, s.dvc, r2, cos_in)
-    if options.traces_light:
-        importance = primary_importance(sensor, si, aperture, s.active & first)
-        dvcm = dr.select(first, weights.eye_start(options.light_ratio, importance, cos_in), dvcm)
+    dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t + s.before_ray), cos_in)
     count = mi.Float(dr.select(first, 1, options.count))
     radiance = mi.Spectrum(s.radiance)
 
@@ -124,9 +110,10 @@ def _bounce(
     if lights is not None:
         emitter = si.emitter(scene, s.active)
         p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.active & ~first)
-        w = weights.hit_emitter(p_direct, p_emission, s.dvcm, dr.select(si.is_valid(), dvc, s.dvc))
+        arrived_dvc = dr.select(depth == 2, 0, dr.select(si.is_valid(), dvc, s.dvc))  # no t=1 for direct light
+        w = dr.select(first, 1, weights.hit_emitter(p_direct, p_emission, s.dvcm, arrived_dvc))
         emitted = emitter.eval(si, s.active)
-        radiance += dr.select(dr.max(emitted) > 0, s.throughput * emitted * dr.select(first, 1, w), 0)
+        radiance += dr.select(dr.max(emitted) > 0, s.throughput * emitted * w, 0)
 
     active = s.active & si.is_valid() & (cos_in > 0) & (depth < options.max_depth)
     bsdf = si.bsdf()
@@ -139,7 +126,7 @@ def _bounce(
         wo = si.to_local(light.d)
     else:
         wo = mi.Vector3f(0, 0, 1)
-    value, p_forward, bs, bs_weight = bsdf.eval_pdf_sample(ctx, si, wo, s.rng.next_float32(), next_2d(s.rng), active)
+    value, p_forward, bs, bs_weight = bsdf.eval_pdf_sample(ctx, si, wo, s.rng.next_1d(), s.rng.next_2d(), active)
     if lights is not None:
         joined = light.valid & (dr.max(value) > 0)
         shadow = si.spawn_ray_to(light.p)
@@ -149,7 +136,7 @@ def _bounce(
         w = weights.next_event(
             dr.select(light.delta, 0, p_forward / light.density),
             light.ratio_over_cos * dr.abs(dr.dot(si.n, light.d)),
-            count,
+            dr.select(first, 0, count),  # no t=1 for direct light
             p_reverse,
             dvcm,
             dvc,
@@ -164,9 +151,10 @@ def _bounce(
 
     # ----------------------------------- Scatter -----------------------------------
 
-    state = replace(s, active=active, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth, hit=hit)
+    state = replace(s, active=active, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth + 1, before_ray=mi.Float(0))
     _scatter(state, ctx, si, bsdf, bs, bs_weight, count)
     _roulette(state, options)
+    state.arrival = scene.ray_intersect_preliminary(state.ray, active=state.active)
     return (state,)
 
 
@@ -199,8 +187,8 @@ def _roulette(s: EyeState, options: PathOptions) -> None:
     Paths are kept by their throughput without refraction's scaling.
     """
     kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
-    roulette = s.depth >= options.rr_depth
-    s.active &= ~roulette | (s.rng.next_float32() < kept)
+    roulette = s.depth > options.rr_depth
+    s.active &= ~roulette | (s.rng.next_independent() < kept)
     s.throughput[roulette] *= dr.rcp(kept)
 
 
@@ -224,10 +212,10 @@ class OwnVertex:
 def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex) -> Any:
     """Sum over n_C connections to kept vertices of n_C light paths, as radiance (Spectrum)."""
     total = mi.Spectrum(0)
-    lane = dr.arange(mi.UInt32, dr.width(own.si))
     for k in range(options.connections):
-        shift = mi.sample_tea_32(connectable.pairing, own.depth * options.connections + k)[0]
-        path = (lane + (shift & 0x3FFFFFFF)) % connectable.paths
+        row = connectable.image * SHIFTS + own.depth % SHIFTS
+        shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, own.active)
+        path = connectable.image * connectable.paths + (connectable.lane + shift) % connectable.paths
         total += _connect(scene, options, connectable, own, path)
     return total / options.connections
 

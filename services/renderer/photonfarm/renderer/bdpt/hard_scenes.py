@@ -16,7 +16,8 @@ import numpy as np
 Scene = dict[str, Any]
 
 
-def _camera(size: int, origin: list[float], target: list[float], fov: float, **more: Any) -> Scene:
+def camera(size: int, origin: list[float], target: list[float], fov: float, **more: Any) -> Scene:
+    """A perspective camera with an independent sampler and a box filter; ``more`` overrides."""
     up = (
         [0, 0, 1]
         if abs(origin[2] - target[2]) < 0.9 * float(np.linalg.norm(np.subtract(origin, target)))
@@ -32,37 +33,50 @@ def _camera(size: int, origin: list[float], target: list[float], fov: float, **m
     }
 
 
-def _grey(value: float) -> Scene:
+def grey(value: float) -> Scene:
+    """A diffuse material of this reflectance."""
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
 
 
-def _rectangle(half: list[float], at: list[float], facing: list[float], **more: Any) -> Scene:
+def rectangle(half: list[float], at: list[float], facing: list[float], **more: Any) -> Scene:
     """A rectangle of half sizes ``half`` around ``at`` whose front looks along ``facing``."""
     up = [0, 1, 0] if abs(facing[1]) < 0.9 else [0, 0, 1]
     frame = mi.ScalarTransform4f().look_at(origin=at, target=list(np.add(at, facing)), up=up)
     return {"type": "rectangle", "to_world": frame @ mi.ScalarTransform4f().scale([half[0], half[1], 1]), **more}
 
 
-def _shining(radiance: float | list[float]) -> Scene:
+def shining(radiance: float | list[float]) -> Scene:
+    """An area emitter of this radiance, grey or RGB."""
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
 
 
-def _room(reflectance: float = 0.6) -> Scene:
+def room(reflectance: float = 0.6) -> Scene:
     """Inside of the box [−1, 1]²×[0, 2], without its wall at y = −1."""
     return {
-        "floor": _rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=_grey(reflectance)),
-        "ceiling": _rectangle([1, 1], [0, 0, 2], [0, 0, -1], bsdf=_grey(reflectance)),
-        "back": _rectangle([1, 1], [0, 1, 1], [0, -1, 0], bsdf=_grey(reflectance)),
-        "left": _rectangle([1, 1], [-1, 0, 1], [1, 0, 0], bsdf=_grey(reflectance)),
-        "right": _rectangle([1, 1], [1, 0, 1], [-1, 0, 0], bsdf=_grey(reflectance)),
+        "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=grey(reflectance)),
+        "ceiling": rectangle([1, 1], [0, 0, 2], [0, 0, -1], bsdf=grey(reflectance)),
+        "back": rectangle([1, 1], [0, 1, 1], [0, -1, 0], bsdf=grey(reflectance)),
+        "left": rectangle([1, 1], [-1, 0, 1], [1, 0, 0], bsdf=grey(reflectance)),
+        "right": rectangle([1, 1], [1, 0, 1], [-1, 0, 0], bsdf=grey(reflectance)),
     }
 
 
-def _bumps(size: int = 16) -> Any:
+def lit_room(size: int) -> Scene:
+    """The open room with a rectangle light under its ceiling, just out of the picture (its rim would be noise)."""
+    return {
+        "type": "scene",
+        "sensor": camera(size, [0, -3.2, 0.8], [0, 0, 0.8], 36),
+        **room(),
+        "light": rectangle([0.3, 0.3], [0, 0, 1.95], [0, 0, -1], emitter=shining([8.0, 7.0, 6.0])),
+    }
+
+
+def bumps(size: int = 16) -> Any:
+    """[size, size, 1] random heights in [0, 1)."""
     return np.random.default_rng(1).random((size, size, 1)).astype(np.float32)
 
 
-def _environment(width: int = 32) -> Any:
+def environment(width: int = 32) -> Any:
     """A concentrated environment: a bright spot on a dim gradient."""
     image = np.full((width // 2, width, 3), 0.2, np.float32)
     image[:, :, 2] += np.linspace(0, 0.3, width, dtype=np.float32)
@@ -84,15 +98,15 @@ def glass_caustic(size: int) -> Scene:
     """A glass sphere between a small area light and a floor: the caustic is hardly found from the camera."""
     return {
         "type": "scene",
-        "sensor": _camera(size, [0, -4, 2.2], [0, 0.2, 0.3], 35),
-        "floor": _rectangle([2, 2], [0, 0, 0], [0, 0, 1], bsdf=_grey(0.6)),
+        "sensor": camera(size, [0, -4, 2.2], [0, 0.2, 0.3], 35),
+        "floor": rectangle([2, 2], [0, 0, 0], [0, 0, 1], bsdf=grey(0.6)),
         "ball": {
             "type": "sphere",
             "center": [0, 0, 0.6],
             "radius": 0.5,
             "bsdf": {"type": "dielectric", "int_ior": 1.5},
         },
-        "light": _rectangle([0.1, 0.1], [0.7, 0, 2.8], [-0.25, 0, -1], emitter=_shining(60.0)),
+        "light": rectangle([0.1, 0.1], [0.7, 0, 2.8], [-0.25, 0, -1], emitter=shining(60.0)),
     }
 
 
@@ -100,10 +114,10 @@ def cove(size: int) -> Scene:
     """A room lit by a light that shines at the ceiling from above a shelf: all light in the image is indirect."""
     return {
         "type": "scene",
-        "sensor": _camera(size, [0, -3.2, 1], [0, 0, 1], 40),
-        **_room(),
-        "shelf": _rectangle([0.5, 0.5], [0, 0, 1.5], [0, 0, -1], bsdf={"type": "twosided", "b": _grey(0.5)}),
-        "light": _rectangle([0.15, 0.15], [0, 0, 1.55], [0, 0, 1], emitter=_shining([20.0, 18.0, 15.0])),
+        "sensor": camera(size, [0, -3.2, 1], [0, 0, 1], 40),
+        **room(),
+        "shelf": rectangle([0.5, 0.5], [0, 0, 1.5], [0, 0, -1], bsdf={"type": "twosided", "b": grey(0.5)}),
+        "light": rectangle([0.15, 0.15], [0, 0, 1.55], [0, 0, 1], emitter=shining([20.0, 18.0, 15.0])),
     }
 
 
@@ -112,10 +126,10 @@ def rotated_envmap(size: int) -> Scene:
     turn = mi.ScalarTransform4f().rotate([1, 0, 0], 70) @ mi.ScalarTransform4f().rotate([0, 1, 0], 130)
     return {
         "type": "scene",
-        "sensor": _camera(size, [0, -4, 2], [0, 0, 0.3], 40),
-        "floor": _rectangle([1.5, 1.5], [0, 0, 0], [0, 0, 1], bsdf=_grey(0.5)),
-        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5, "bsdf": _grey(0.7)},
-        "sky": {"type": "envmap", "bitmap": _environment(), "to_world": turn},
+        "sensor": camera(size, [0, -4, 2], [0, 0, 0.3], 40),
+        "floor": rectangle([1.5, 1.5], [0, 0, 0], [0, 0, 1], bsdf=grey(0.5)),
+        "ball": {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.5, "bsdf": grey(0.7)},
+        "sky": {"type": "envmap", "bitmap": environment(), "to_world": turn},
     }
 
 
@@ -124,8 +138,8 @@ def constant_environment(size: int) -> Scene:
     ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.2}}
     return {
         "type": "scene",
-        "sensor": _camera(size, [0, -3.2, 1], [0, 0, 1], 40),
-        **_room(),
+        "sensor": camera(size, [0, -3.2, 1], [0, 0, 1], 40),
+        **room(),
         "ball": ball,
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.7, 1.0]}},
     }
@@ -138,48 +152,48 @@ def bump_floor(size: int) -> Scene:
     """
     bumped = {
         "type": "bumpmap",
-        "texture": {"type": "bitmap", "raw": True, "data": mi.TensorXf(_bumps())},
+        "texture": {"type": "bitmap", "raw": True, "data": mi.TensorXf(bumps())},
         "scale": 0.06,
         "bsdf": {"type": "roughplastic", "alpha": 0.2},
     }
-    return {**_lit_room(size), "floor": _rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=bumped)}
+    return {**lit_room(size), "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=bumped)}
 
 
 def normal_floor(size: int) -> Scene:
     """The same with a normal map."""
-    slope = (_bumps()[..., 0] - 0.5) * 0.9
+    slope = (bumps()[..., 0] - 0.5) * 0.9
     normals = np.stack([slope, slope.T, np.sqrt(1 - slope**2 - slope.T**2)], axis=-1) * 0.5 + 0.5
     mapped = {
         "type": "normalmap",
         "normalmap": {"type": "bitmap", "raw": True, "data": mi.TensorXf(normals.astype(np.float32))},
-        "bsdf": _grey(0.7),
+        "bsdf": grey(0.7),
     }
-    return {**_lit_room(size), "floor": _rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=mapped)}
+    return {**lit_room(size), "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=mapped)}
 
 
 def rough_dielectric(size: int) -> Scene:
     """A ball of rough glass in a lit room."""
     glass = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.5, "distribution": "ggx"}
-    return {**_lit_room(size), "ball": {"type": "sphere", "center": [0, -0.2, 0.5], "radius": 0.45, "bsdf": glass}}
+    return {**lit_room(size), "ball": {"type": "sphere", "center": [0, -0.2, 0.5], "radius": 0.45, "bsdf": glass}}
 
 
 def mask(size: int) -> Scene:
     """A half-transparent screen before the light and another before the camera."""
-    veil = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "b": _grey(0.5)}}
+    veil = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "b": grey(0.5)}}
     return {
-        **_lit_room(size),
-        "light_veil": _rectangle([0.5, 0.5], [0, 0, 1.7], [0, 0, -1], bsdf=veil),
-        "camera_veil": _rectangle([0.6, 0.6], [0, -1.5, 1], [0, -1, 0], bsdf=veil),
+        **lit_room(size),
+        "light_veil": rectangle([0.5, 0.5], [0, 0, 1.7], [0, 0, -1], bsdf=veil),
+        "camera_veil": rectangle([0.6, 0.6], [0, -1.5, 1], [0, -1, 0], bsdf=veil),
     }
 
 
 def twosided(size: int) -> Scene:
     """Thin two-sided sheets with different sides, and a coarse ball with smooth normals."""
-    sheet = {"type": "twosided", "front": _grey(0.8), "back": {"type": "roughconductor", "alpha": 0.3}}
+    sheet = {"type": "twosided", "front": grey(0.8), "back": {"type": "roughconductor", "alpha": 0.3}}
     return {
-        **_lit_room(size),
-        "sheet": _rectangle([0.4, 0.4], [-0.4, 0.2, 0.9], [0.5, -1, 0.4], bsdf=sheet),
-        "second": _rectangle([0.3, 0.3], [0.5, 0, 0.6], [0.3, 1, 0.2], bsdf=sheet),
+        **lit_room(size),
+        "sheet": rectangle([0.4, 0.4], [-0.4, 0.2, 0.9], [0.5, -1, 0.4], bsdf=sheet),
+        "second": rectangle([0.3, 0.3], [0.5, 0, 0.6], [0.3, 1, 0.2], bsdf=sheet),
     }
 
 
@@ -188,9 +202,9 @@ def plastics(size: int) -> Scene:
     balls = {
         "plastic": {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.1, 0.3, 0.6]}},
         "principled": {"type": "principled", "roughness": 0.3, "metallic": 0.3, "clearcoat": 0.5, "spec_trans": 0.4},
-        "blend": {"type": "blendbsdf", "weight": 0.4, "a": _grey(0.6), "b": {"type": "conductor"}},
+        "blend": {"type": "blendbsdf", "weight": 0.4, "a": grey(0.6), "b": {"type": "conductor"}},
     }
-    scene = _lit_room(size)
+    scene = lit_room(size)
     for k, (name, bsdf) in enumerate(balls.items()):
         scene[name] = {"type": "sphere", "center": [-0.6 + 0.6 * k, 0, 0.3], "radius": 0.27, "bsdf": bsdf}
     return scene
@@ -201,7 +215,7 @@ def textured_light(size: int) -> Scene:
     pattern = np.zeros((4, 4, 3), np.float32)
     pattern[0, 1], pattern[2, 3], pattern[3, 0] = [40.0, 10.0, 5.0], [5.0, 30.0, 10.0], [5.0, 5.0, 50.0]
     radiance = {"type": "bitmap", "raw": True, "data": mi.TensorXf(pattern), "filter_type": "nearest"}
-    scene = _lit_room(size)
+    scene = lit_room(size)
     scene["light"]["emitter"] = {"type": "area", "radiance": radiance}
     return scene
 
@@ -214,15 +228,15 @@ def many_lights(size: int) -> Scene:
         origin=[0, 0.9, 0.8], target=[0, 0, 0.8], up=[0, 0, 1]
     ) @ mi.ScalarTransform4f().scale(0.1)
     return {
-        **_lit_room(size),
+        **lit_room(size),
         "ball_light": {
             "type": "sphere",
             "center": [-0.6, 0.3, 0.4],
             "radius": 0.1,
-            "emitter": _shining([1.0, 4.0, 1.0]),
+            "emitter": shining([1.0, 4.0, 1.0]),
         },
-        "disk_light": {"type": "disk", "to_world": disk, "emitter": _shining([6.0, 1.0, 1.0])},
-        "mesh_light": {"type": "cube", "to_world": light_cube, "emitter": _shining([1.0, 1.0, 5.0])},
+        "disk_light": {"type": "disk", "to_world": disk, "emitter": shining([6.0, 1.0, 1.0])},
+        "mesh_light": {"type": "cube", "to_world": light_cube, "emitter": shining([1.0, 1.0, 5.0])},
         "bulb": {"type": "point", "position": [0.5, -0.6, 0.7], "intensity": {"type": "rgb", "value": 0.3}},
         "beam": {"type": "spot", "to_world": beam, "cutoff_angle": 20, "intensity": {"type": "rgb", "value": 1.0}},
         "sun": {"type": "directional", "direction": [0.3, 1, -0.4], "irradiance": {"type": "rgb", "value": 0.4}},
@@ -230,13 +244,51 @@ def many_lights(size: int) -> Scene:
     }
 
 
-def _lit_room(size: int) -> Scene:
+def door_gap(size: int) -> Scene:
+    """A room lit through a narrow gap in its right wall; the light in the hall beyond shines away from the gap."""
     return {
         "type": "scene",
-        "sensor": _camera(size, [0, -3.2, 1], [0, 0, 1], 40),
-        **_room(),
-        "light": _rectangle([0.3, 0.3], [0, 0, 1.95], [0, 0, -1], emitter=_shining([8.0, 7.0, 6.0])),
+        "sensor": camera(size, [0, -3.2, 1], [0, 0, 1], 40),
+        **{name: wall for name, wall in room().items() if name != "right"},
+        "right": rectangle([0.75, 1], [1, -0.25, 1], [-1, 0, 0], bsdf=grey(0.6)),
+        "door": rectangle([0.2, 1], [1, 0.8, 1], [-1, 0, 0], bsdf=grey(0.6)),  # the gap: 0.5 < y < 0.6
+        **_hall(),
+        "light": rectangle([0.15, 0.15], [1.7, -0.4, 1.2], [1, -0.3, 0.3], emitter=shining([60.0, 55.0, 45.0])),
     }
+
+
+def _hall(reflectance: float = 0.7) -> Scene:
+    """The hall 1 < x < 3 beside the room of `door_gap`, closed but for the gap."""
+    return {
+        "hall_floor": rectangle([1, 1], [2, 0, 0], [0, 0, 1], bsdf=grey(reflectance)),
+        "hall_ceiling": rectangle([1, 1], [2, 0, 2], [0, 0, -1], bsdf=grey(reflectance)),
+        "hall_end": rectangle([1, 1], [3, 0, 1], [-1, 0, 0], bsdf=grey(reflectance)),
+        "hall_front": rectangle([1, 1], [2, -1, 1], [0, 1, 0], bsdf=grey(reflectance)),
+        "hall_back": rectangle([1, 1], [2, 1, 1], [0, -1, 0], bsdf=grey(reflectance)),
+    }
+
+
+def mirror_room(size: int) -> Scene:
+    """A corridor between two mirrors, with a small light: most light arrives by several mirrorings."""
+    mirror = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.9}}
+    scene = lit_room(size)
+    scene["left"]["bsdf"] = scene["right"]["bsdf"] = mirror
+    scene["back"]["bsdf"] = {"type": "roughconductor", "alpha": 0.15}
+    scene["ball"] = {"type": "sphere", "center": [0.3, -0.2, 0.35], "radius": 0.3, "bsdf": grey(0.7)}
+    scene["light"] = rectangle([0.1, 0.1], [-0.3, 0.1, 1.6], [0.2, -0.1, 1], emitter=shining([50.0, 45.0, 40.0]))
+    return scene
+
+
+def hundred_lights(size: int) -> Scene:
+    """A room under a hundred small lights whose radiances span 1:10⁴; every tenth is dead (radiance 0)."""
+    scene = lit_room(size)
+    del scene["light"]
+    radiance = 10 ** np.random.default_rng(7).uniform(-2, 2, 100)
+    for k in range(100):
+        at = [-0.9 + 0.2 * (k % 10), -0.9 + 0.1 * (k // 10), 1.9]  # out of the picture, as in `lit_room`
+        value = 0.0 if k % 10 == 3 else float(radiance[k])
+        scene[f"light_{k:02d}"] = rectangle([0.04, 0.04], at, [0, 0, -1], emitter=shining(value))
+    return scene
 
 
 HARD_SCENES: dict[str, Callable[[int], Scene]] = {
@@ -255,6 +307,9 @@ HARD_SCENES: dict[str, Callable[[int], Scene]] = {
         plastics,
         textured_light,
         many_lights,
+        door_gap,
+        mirror_room,
+        hundred_lights,
     )
 }
 """Every scene above by its name."""

@@ -1,4 +1,7 @@
-"""Light sub-paths: from a light into the scene, each vertex joined to the lens (t=1), one of each path kept.
+"""Light sub-paths: from a light into the scene, each vertex but the first joined to the lens (t=1), one of each kept.
+
+The first vertex is not joined: direct light is next event estimation's, whose noise is less than that of splats, and
+which is complete for it (lights that it cannot sample start no light paths either).
 
 The vertex kept for connections is drawn uniformly among those a connection can reach, by reservoir sampling (Vitter,
 *Random Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each path
@@ -20,9 +23,10 @@ import mitsuba as mi
 
 from . import weights
 from .camera import sample_sensor
-from .emission import AREA, Emission, Lights, next_2d, sample_emission
+from .emission import AREA, Emission, Lights, sample_emission
+from .film import Splat
 from .loops import traced_once
-from .randomness import generator
+from .randomness import Sampler
 
 _MAX_THROUGHPUT_KEPT = 0.95
 
@@ -65,12 +69,13 @@ class LightState:
     """Loop variables of a light path."""
 
     active: Any  # Bool: this path goes on
-    rng: Any  # PCG32
-    ray: Any  # Ray3f: to the next vertex
+    rng: Any  # Sampler
+    ray: Any  # Ray3f: to this vertex
+    hit: Any  # PreliminaryIntersection3f: where it arrives
     throughput: Any  # Spectrum
-    dvcm: Any  # Float: see weights.py
+    dvcm: Any  # Float: see weights.py; at the first vertex as arrived, later as left
     dvc: Any  # Float
-    depth: Any  # UInt32: edges so far
+    depth: Any  # UInt32: edges up to this vertex
     seen: Any  # UInt32: vertices a connection could reach so far
 
 
@@ -86,31 +91,23 @@ def empty_vertices(n: int) -> LightVertices:
 
 
 def trace_light_paths(
-    scene: Any, sensor: Any, lights: Lights, options: PathOptions, *, seed: Any, n: int, splat: Any, block: Any
+    scene: Any, sensor: Any, lights: Lights, options: PathOptions, *, rng: Sampler, path: Any, paths: Any, splat: Splat
 ) -> tuple[LightVertices | None, Any]:
-    """Trace n light paths and put their images on the lens into ``block``, each value times ``splat``.
+    """Trace a light path for each of n points of ``rng`` and add their images on the lens by ``splat``.
 
-    ``splat`` is the number of eye paths per light path. Returns (kept vertices, number each was drawn from: UInt32
-    [n]), or (None, ·) where no connections are wanted.
+    ``path`` is a path's number among the ``paths`` (UInt32, 1) of its image in this launch.
+
+    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) where no connections are wanted.
     """
-    rng = generator(seed, n)
-    start = sample_emission(lights, rng, n)
+    n = dr.width(rng.index)
+    start = sample_emission(lights, rng, path, paths)
     vertices = empty_vertices(n) if options.connects else None
-    body = partial(
-        vertex_bounce,
-        scene=scene,
-        sensor=sensor,
-        lights=lights,
-        options=options,
-        start=start,
-        splat=splat,
-        block=block,
-        vertices=vertices,
-    )
     (state,) = traced_once(
-        state=(first_state(start, rng),),
+        state=(first_state(scene, lights, start, rng),),
         cond=lambda s: s.active,
-        body=body,
+        body=partial(
+            vertex_bounce, scene=scene, sensor=sensor, options=options, start=start, splat=splat, vertices=vertices
+        ),
         labels=("light path",),
         label="bdpt light paths",
     )
@@ -120,18 +117,16 @@ def trace_light_paths(
     return vertices, state.seen
 
 
-def first_state(start: Emission, rng: Any) -> LightState:
-    """Loop variables before the first hit."""
-    zero = mi.Float(0)
+def first_state(scene: Any, lights: Lights, start: Emission, rng: Any) -> LightState:
+    """Loop variables at the first hit."""
+    active = mi.Bool(start.valid)
+    hit = scene.ray_intersect_preliminary(start.ray, active=active)
+    si = hit.compute_surface_interaction(start.ray, mi.RayFlags.Minimal, active)
+    active &= si.is_valid()
+    cos_in = dr.abs(dr.dot(si.n, start.ray.d))
+    dvcm, dvc = start_weights(start, lights, si, cos_in, active)
     return LightState(
-        mi.Bool(start.valid),
-        rng,
-        start.ray,
-        mi.Spectrum(start.throughput),
-        zero,
-        mi.Float(0),
-        mi.UInt32(0),
-        mi.UInt32(0),
+        active & (cos_in > 0), rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0)
     )
 
 
@@ -140,11 +135,9 @@ def vertex_bounce(
     *,
     scene: Any,
     sensor: Any,
-    lights: Lights,
     options: PathOptions,
     start: Emission,
-    splat: Any,
-    block: Any,
+    splat: Splat,
     vertices: LightVertices | None,
 ) -> tuple[LightState]:
     """One vertex of a light path: arrive, join to the lens, keep it perhaps, scatter."""
@@ -152,15 +145,13 @@ def vertex_bounce(
 
     # ------------------------------------ Arrive ------------------------------------
 
-    pi = scene.ray_intersect_preliminary(s.ray, active=s.active)
-    si = pi.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
-    depth = s.depth + 1
-    cos_in = dr.abs(dr.dot(si.n, s.ray.d))
-    active = s.active & si.is_valid() & (cos_in > 0)
+    si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
+    depth = s.depth
     first = depth == 1
+    cos_in = dr.abs(dr.dot(si.n, s.ray.d))
+    active = s.active & (cos_in > 0)
     dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t), cos_in)
-    start_dvcm, start_dvc = start_weights(start, lights, si, cos_in, active & first)
-    dvcm, dvc = dr.select(first, start_dvcm, dvcm), dr.select(first, start_dvc, dvc)
+    dvcm, dvc = dr.select(first, s.dvcm, dvcm), dr.select(first, s.dvc, dvc)
     count = mi.Float(dr.select(first, 1, options.count))
     bsdf = si.bsdf()
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -168,8 +159,8 @@ def vertex_bounce(
     # ------------------------------ Join to the lens (t=1) ------------------------------
 
     if options.traces_light:
-        aperture = next_2d(s.rng) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        seen = sample_sensor(sensor, si, aperture, active & smooth)
+        aperture = s.rng.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        seen = sample_sensor(sensor, si, aperture, active & smooth & ~first)
         value, p_reverse = _exchanged(ctx, bsdf, si, si.to_local(seen.d), seen.valid)
         cos_out = dr.abs(dr.dot(si.n, seen.d))
         w = weights.light_tracing(
@@ -177,8 +168,7 @@ def vertex_bounce(
         )
         joined = seen.valid & (dr.max(value) > 0)
         joined &= ~scene.ray_test(si.spawn_ray_to(seen.start), joined)
-        image = s.throughput * value * seen.weight * (w * splat * cos_out / cos_in)
-        block.put(seen.position, [], dr.select(joined, image, 0), mi.Float(0), mi.Float(0), joined)
+        splat.add(seen.position, s.throughput * value * seen.weight * (w * cos_out / cos_in), joined)
 
     # ----------------------------- Keep for connections -----------------------------
 
@@ -186,17 +176,17 @@ def vertex_bounce(
     if vertices is not None:
         reachable = active & smooth & (depth + 1 < options.max_depth)
         count_seen[reachable] += 1
-        keep = reachable & (s.rng.next_float32() * mi.Float(count_seen) < 1)
-        record = _record(pi, s, dvcm, dvc, depth)
-        dr.scatter(vertices, record, dr.arange(mi.UInt32, dr.width(start.valid)), keep)
+        keep = reachable & (s.rng.next_independent() * mi.Float(count_seen) < 1)
+        dr.scatter(vertices, _record(s, dvcm, dvc), dr.arange(mi.UInt32, dr.width(start.valid)), keep)
 
     # ----------------------------------- Scatter -----------------------------------
 
-    state = replace(
-        s, active=active & (depth + 1 < options.max_depth), dvcm=dvcm, dvc=dvc, depth=depth, seen=count_seen
-    )
+    goes_on = active & (depth + 1 < options.max_depth)
+    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=count_seen)
     scatter(state, si, bsdf, cos_in, count)
     roulette(state, start, options)
+    state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
+    state.active &= state.hit.is_valid()
     return (state,)
 
 
@@ -204,7 +194,7 @@ def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
     """Sample the next direction. Delta lobes: importance-mode weight times Veach's factor (Veach 1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
-    bs, delta_weight = bsdf.sample(importance, si, s.rng.next_float32(), next_2d(s.rng), s.active)
+    bs, delta_weight = bsdf.sample(importance, si, s.rng.next_1d(), s.rng.next_2d(), s.active)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     d = si.to_world(bs.wo)
     cos_out = dr.abs(dr.dot(si.n, d))
@@ -223,15 +213,14 @@ def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
 
 
 def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
-    """Russian roulette after ``rr_depth`` edges, as Mitsuba's ``path`` does.
+    """Russian roulette by the throughput relative to the start: after ``rr_depth`` edges as in Mitsuba's ``path``.
 
-    Paths are kept by their throughput relative to the start.
+    Before, only of paths that have lost more than two thirds of it: they cost as much as others and carry less.
     """
-    kept = dr.minimum(dr.max(s.throughput) / dr.max(start.throughput), _MAX_THROUGHPUT_KEPT)
-    thins = s.depth >= options.rr_depth
-    s.active &= ~thins | (s.rng.next_float32() < kept)
-    s.throughput[thins] *= dr.rcp(kept)
-    s.active &= dr.max(s.throughput) > 0
+    left = dr.max(s.throughput) / dr.max(start.throughput)
+    kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
+    s.active &= (s.rng.next_independent() < kept) & (kept > 0)
+    s.throughput *= dr.rcp(kept)
 
 
 def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
@@ -247,7 +236,7 @@ def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any,
 
 def start_weights(start: Emission, lights: Lights, si: Any, cos_in: Any, mask: Any) -> tuple[Any, Any]:
     """(dVCM, dVC) at the first hit; see weights.py. Lanes outside ``mask`` may hold anything."""
-    selection = lights.nee_probability(start.emitter)
+    selection = lights.nee_probability(start.emitter, si.p)
     dvcm, dvc = mi.Float(0), mi.Float(0)
     if lights.has(AREA):
         ds = mi.DirectionSample3f(start.sample)
@@ -266,17 +255,17 @@ def start_weights(start: Emission, lights: Lights, si: Any, cos_in: Any, mask: A
     return dvcm, dr.select(start.delta, 0, dvc)
 
 
-def _record(pi: Any, s: LightState, dvcm: Any, dvc: Any, depth: Any) -> LightVertices:
+def _record(s: LightState, dvcm: Any, dvc: Any) -> LightVertices:
     return LightVertices(
         s.ray.o,
         s.ray.d,
-        pi.t,
-        pi.prim_uv,
-        pi.prim_index,
-        dr.reinterpret_array(mi.UInt32, pi.shape),
-        dr.reinterpret_array(mi.UInt32, pi.instance),
+        s.hit.t,
+        s.hit.prim_uv,
+        s.hit.prim_index,
+        dr.reinterpret_array(mi.UInt32, s.hit.shape),
+        dr.reinterpret_array(mi.UInt32, s.hit.instance),
         s.throughput,
         dvcm,
         dvc,
-        depth,
+        s.depth,
     )

@@ -47,15 +47,17 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int) -> Photons:
     """
     if paths < 1 or depth < 1:
         raise ValueError(f"trace_photons: paths is {paths} and depth {depth}; each must be at least 1")
-    check_scene(scene)
+    check_scene(scene, light_paths=True)
     slots = paths * depth
     if not scene.emitters():
         zeros = np.zeros((slots, 3), np.float32)
         return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(slots, -1, np.int32))
     with dr.suspend_grad():
         lights = read_lights(scene)
-        rng = randomness.generator(randomness.stream_seed(seed, 0, randomness.PHOTONS), paths)
-        start = sample_emission(lights, rng, paths)
+        sequence = randomness.stream(randomness.image_keys([seed & 0xFFFFFFFF]), randomness.PHOTONS)
+        path = dr.arange(mi.UInt32, paths)
+        rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, paths), path)
+        start = sample_emission(lights, rng, path, dr.opaque(mi.UInt32, paths))
         out = (
             dr.zeros(mi.Point3f, slots),
             dr.zeros(mi.Vector3f, slots),
@@ -66,7 +68,7 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int) -> Photons:
         zero = dr.opaque(mi.Float, 0)
         options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
         traced_once(
-            state=(first_state(start, rng),),
+            state=(first_state(scene, lights, start, rng),),
             cond=lambda s: s.active,
             body=partial(
                 _hit,
@@ -86,14 +88,15 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int) -> Photons:
 
 def _hit(s: LightState, *, scene: Any, options: PathOptions, out: Any, bounce: Any, paths: Any) -> tuple[LightState]:
     """One vertex of a light path: write it down, scatter."""
-    si = scene.ray_intersect(s.ray, active=s.active)
+    si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
-    active = s.active & si.is_valid() & (cos_in > 0)
-    slot = s.depth * paths + dr.arange(mi.UInt32, dr.width(s.active))
+    active = s.active & (cos_in > 0)
+    slot = (s.depth - 1) * paths + dr.arange(mi.UInt32, dr.width(s.active))
     for column, value in zip(out, (si.p, s.ray.d, si.n, s.throughput), strict=True):
         dr.scatter(column, value, slot, active)
-    dr.scatter(bounce, mi.Int32(s.depth), slot, active)
-    depth = s.depth + 1
-    state = replace(s, active=active & (depth + 1 < options.max_depth), depth=depth)
+    dr.scatter(bounce, mi.Int32(s.depth) - 1, slot, active)
+    state = replace(s, active=active & (s.depth + 1 < options.max_depth), depth=s.depth + 1)
     scatter(state, si, si.bsdf(), cos_in, mi.Float(1))
+    state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
+    state.active &= state.hit.is_valid()
     return (state,)

@@ -7,15 +7,29 @@ from typing import Any
 UNBOUNDED = 0xFFFFFFFF
 
 
-def check_scene(scene: Any) -> None:
-    """Raise ValueError for scenes with participating media."""
-    for shape in scene.shapes():
+def check_scene(scene: Any, *, light_paths: bool) -> None:
+    """Raise ValueError for media, for lights that shine along their normal only, and for lit instances.
+
+    The last only where there are ``light_paths``.
+    """
+    shapes = scene.shapes()
+    for shape in shapes:
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             raise ValueError(
                 f"bdpt: shape {shape.id()!r} bounds a participating medium; only surfaces are allowed, because "
-                f"neither sub-path "
-                "samples distances in a medium; remove the medium, or render with 'volpath'"
+                "neither sub-path samples distances in a medium; remove the medium, or render with 'volpath'"
             )
+        if shape.is_emitter() and shape.emitter().class_name() == "DirectionalArea":
+            raise ValueError(
+                f"bdpt: shape {shape.id()!r} is a 'directionalarea' light; no camera path can find it, and light "
+                "paths would need a density of their own; use 'directional', or render with 'ptracer'"
+            )
+    instanced = any(shape.class_name() == "Instance" for shape in shapes)
+    if light_paths and instanced and any(shape.is_emitter() for shape in shapes):
+        raise ValueError(
+            "bdpt: the scene has instances and area lights; light paths cannot start in it, because Mitsuba cannot "
+            "sample a shape's surface where some shapes are instances; use light_ratio=0 and connections=0"
+        )
 
 
 def depth_limit(max_depth: int) -> int:

@@ -51,12 +51,12 @@ def light_start_dvc(cos_0_over_emission: Any, cos_in: Any) -> Any:
     return dr.minimum(cos_0_over_emission / cos_in, LARGEST)
 
 
-def eye_start(light_ratio: Any, sensor_weight: Any, cos_in: Any) -> Any:
-    """dVCM at x₁: n_T/p_cam · r²/cos_in (eq. 31), with Mitsuba's sensor weight = p_cam/r².
+def eye_start(light_ratio: Any, p_camera: Any) -> Any:
+    """dVCM of a primary ray: n_T/p_cam (eq. 31), completed on arrival; 0 where the sensor cannot be hit.
 
-    0 where the sensor cannot be hit.
+    ``p_camera``: density of the ray's direction in solid angle, normalised over the crop window.
     """
-    return dr.select(sensor_weight > 0, dr.minimum(light_ratio / (sensor_weight * cos_in), LARGEST), 0)
+    return dr.select(p_camera > 0, dr.minimum(light_ratio / p_camera, LARGEST), 0)
 
 
 def arrive(dvcm: Any, dvc: Any, r2: Any, cos_in: Any) -> tuple[Any, Any]:

@@ -1,0 +1,51 @@
+"""Which scenes are measured, how deep, and against what reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+METHODS = ("path", "ptracer", "bdpt", "chosen", "pyluxcore")
+BASELINE = "path"
+BUDGETS = (1 / 16, 1 / 4, 1.0)
+"""Shares of the time budget that images are rendered at; longer times are averages of the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """One line of the benchmark."""
+
+    scene: str  # name for scene_loading.load
+    max_depth: int  # longest path in edges
+    reference: tuple[str, ...] = ("bdpt", "path")  # methods whose long renders make the reference
+    note: str = ""
+
+
+PLANS: dict[str, ScenePlan] = {
+    "cornell": ScenePlan("cornell", 8),
+    "room": ScenePlan("room", 8, note="the built-in room"),
+    "kitchen": ScenePlan("kitchen", 8),
+    "bathroom": ScenePlan("bathroom", 8),
+    "living-room-2": ScenePlan("living-room-2", 8),
+    "veach-ajar": ScenePlan("veach-ajar", 12, note="light behind a door"),
+    "cove": ScenePlan("cove", 8, note="all light in the image is indirect"),
+    "door_gap": ScenePlan("door_gap", 8),
+    "glass_caustic": ScenePlan(
+        "glass_caustic", 8, ("bdpt",), "light seen twice through the ball is found by chance alone, by every method"
+    ),
+    "glass_caustic_5": ScenePlan(
+        "glass_caustic", 5, ("bdpt",), "the same without light seen twice through the ball (6 edges)"
+    ),
+    "mirror_room": ScenePlan("mirror_room", 8),
+    "hundred_lights": ScenePlan("hundred_lights", 8),
+}
+"""Every line by its name. `path` is left out of references where its noise is far above that of `bdpt`."""
+
+
+def estimated_seconds(lines: int, methods: int, seeds: int, seconds: float, reference: float, *, pilot: bool) -> float:
+    """Expected duration of a run, rather too long: every method counts for every scene, also pyluxcore.
+
+    Per method: `seeds` images at each budget, about four for calibration; two long references per scene; half a
+    minute per scene to load and to compile, and 45 s for a pilot (a quarter of that in small scenes, twice in large).
+    """
+    per_method = (seeds * sum(BUDGETS) + 4) * seconds
+    return lines * (methods * per_method + 2 * reference * seconds + 30 + 45 * pilot)

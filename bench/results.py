@@ -1,0 +1,62 @@
+"""Where the benchmarks put their tables: docs/results/NAME.md and NAME.json, with the command that made them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import statistics
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parents[1] / "docs/results"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options that every table has."""
+    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the Markdown and JSON (docs/results)")
+
+
+def write(name: str, text: str, values: dict[str, Any], out: Path) -> None:
+    """Write NAME.md and NAME.json into `out`, and print the Markdown."""
+    out.mkdir(parents=True, exist_ok=True)
+    document = {"command": command(name), "machine": machine(), **values}
+    (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
+    (out / f"{name}.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    print(text)
+
+
+def command(name: str) -> str:
+    """How to make the table again."""
+    given = iter(sys.argv[1:])
+    told = [argument for argument in given if not (argument == "--out" and next(given))]
+    return shlex.join(["python", f"bench/{name}.py", *told]) if told else f"make bench-{name}"
+
+
+def machine() -> dict[str, Any]:
+    """What the figures depend on, with the load average that says whether the machine was quiet."""
+    packages = {name: version(name) for name in ("mitsuba", "drjit")}
+    load = round(os.getloadavg()[0], 1)
+    return {"cores": os.cpu_count(), "architecture": platform.machine(), "load_average": load, **packages}
+
+
+def footer(name: str) -> str:
+    """Command and machine, as the last line of a page."""
+    made_on = ", ".join(f"{key} {value}" for key, value in machine().items())
+    return f"Made by `{command(name)}` ({made_on})."
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def median_and_mean(values: Sequence[float], digits: int = 1) -> str:
+    """As "median (mean)"."""
+    return f"{statistics.median(values):.{digits}f} ({statistics.fmean(values):.{digits}f})"

@@ -1,0 +1,64 @@
+"""Where estimates go: sums over the pixels of several images in device memory, and Mitsuba's film at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass(slots=True)
+class Splat:
+    """Adds images of light paths on the lens to a stack of images."""
+
+    image: Any  # Spectrum, K·H·W: sums, image after image
+    scale: Any  # Float, 1: eye paths per light path over samples per pixel
+    offset: Any  # UInt32: first pixel of the image that a lane's light path belongs to
+    width: int  # of the crop window, pixels
+    height: int
+
+    def add(self, position: Any, value: Any, active: Any) -> None:
+        """Add ``value`` (Spectrum) at ``position`` (Point2f, pixels of the crop window); what falls outside is lost."""
+        inside = active & dr.all((position >= 0) & (position < mi.ScalarVector2f(self.width, self.height)))
+        pixel = mi.UInt32(position.y) * self.width + mi.UInt32(position.x)
+        dr.scatter_add(self.image, value * self.scale, self.offset + pixel, inside)
+
+
+@dataclass(slots=True)
+class Images:
+    """K images of one view."""
+
+    radiance: Any  # Spectrum, K·H·W: mean over the samples of a pixel, with the light paths' share
+    hit: Any  # Float, K·H·W: share of primary rays that hit a surface
+
+    @classmethod
+    def black(cls, pixels: int) -> Images:
+        """Black images with so many pixels in all."""
+        return cls(dr.zeros(mi.Spectrum, pixels), dr.zeros(mi.Float, pixels))
+
+    def add(self, part: Images, first_pixel: int) -> None:
+        """Add a part of the samples, to the pixels from ``first_pixel`` on."""
+        if dr.width(part.hit) == dr.width(self.hit):
+            self.radiance += part.radiance
+            self.hit += part.hit
+        else:
+            pixel = dr.arange(mi.UInt32, dr.width(part.hit)) + dr.opaque(mi.UInt32, first_pixel)
+            dr.scatter_add(self.radiance, part.radiance, pixel)
+            dr.scatter_add(self.hit, part.hit, pixel)
+        dr.eval(self.radiance, self.hit)
+
+    def tensor(self, width: int, height: int) -> Any:
+        """TensorXf [K, H, W, 3]."""
+        return mi.TensorXf(dr.ravel(self.radiance), (dr.width(self.hit) // (width * height), height, width, 3))
+
+    def put(self, film: Any) -> None:
+        """Put the one image into a film, each pixel with weight 1."""
+        width, height = film.crop_size()
+        channels = [*self.radiance]
+        if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+            channels.append(self.hit)
+        channels.append(dr.ones(mi.Float, width * height))
+        block = mi.TensorXf(dr.ravel(mi.ArrayXf(channels)), (height, width, len(channels)))
+        film.put_block(mi.ImageBlock(block, film.crop_offset(), film.rfilter()))

@@ -1,0 +1,99 @@
+"""Which eye and light paths are traced in one launch, and which lane is which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+LAUNCH_PATHS = 1 << 18
+"""Most eye paths traced at once, unless an image has more pixels: about 140 bytes for each with its light path."""
+
+
+@dataclass(frozen=True, slots=True)
+class Launch:
+    """Some images, and some samples of every pixel of each."""
+
+    images: int
+    first_image: int
+    samples: int  # of one pixel
+    first_sample: int
+    light_paths: int  # for one image
+    first_light_path: int
+
+
+def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator[Launch]:
+    """Several images together where they are small, each by itself in several launches where they are not."""
+    together = max(1, min(images, LAUNCH_PATHS // (pixels * spp)))
+    samples = max(1, min(spp, LAUNCH_PATHS // pixels))
+    for first_image in range(0, images, together):
+        for first_sample in range(0, spp, samples):
+            last_sample = min(first_sample + samples, spp)
+            first_light, last_light = (_light_paths(pixels * s, light_ratio) for s in (first_sample, last_sample))
+            yield Launch(
+                min(together, images - first_image), first_image, last_sample - first_sample, first_sample,
+                last_light - first_light, first_light,
+            )  # fmt: skip
+
+
+def _light_paths(eye_paths: int, light_ratio: float) -> int:
+    """Light paths that belong to the first eye paths of an image: at least one for any of them."""
+    return max(int(eye_paths > 0), round(eye_paths * light_ratio)) if light_ratio else 0
+
+
+@dataclass(slots=True)
+class Lanes:
+    """A launch as its kernels see it: what shapes them as integers, what may differ between launches as data.
+
+    Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, and the
+    samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
+    """
+
+    images: int
+    width: int  # of the crop window, pixels
+    height: int
+    samples: int  # of one pixel
+    light_paths: int  # for one image
+    keys: Any  # UInt32, one for each image: see randomness.image_keys
+    shifts: Any  # UInt32: see randomness.shifts; None without connections
+    counts: Any  # UInt32, (pixels, samples, light paths): the integers above once more
+    first_sample: Any  # UInt32, 1
+    first_light_path: Any  # UInt32, 1
+    eye_scale: Any  # Float, 1: 1 over all samples per pixel
+    splat_scale: Any  # Float, 1: eye paths per light path over all samples per pixel
+
+    @classmethod
+    def of(cls, launch: Launch, size: tuple[int, int], spp: int, keys: Any, shifts: Any) -> Lanes:
+        """The lanes of a launch of images of ``size`` (W, H) that get ``spp`` samples per pixel in all."""
+        pixels = size[0] * size[1]
+        ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
+        return cls(
+            launch.images, *size, launch.samples, launch.light_paths, keys, shifts,
+            counts=[dr.opaque(mi.UInt32, n) for n in (pixels, launch.samples, launch.light_paths)],
+            first_sample=dr.opaque(mi.UInt32, launch.first_sample),
+            first_light_path=dr.opaque(mi.UInt32, launch.first_light_path),
+            eye_scale=dr.opaque(mi.Float, 1 / spp),
+            splat_scale=dr.opaque(mi.Float, ratio / spp),
+        )  # fmt: skip
+
+    @property
+    def pixels(self) -> int:
+        """Of one image."""
+        return self.width * self.height
+
+    def eye(self) -> tuple[Any, Any, Any]:
+        """(image, sample, pixel) of each lane of the eye paths, UInt32."""
+        lane = dr.arange(mi.UInt32, self.images * self.samples * self.pixels)
+        pixels, samples, _ = self.counts
+        layer = lane // pixels
+        image = layer // samples if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
+        return image, layer - image * samples, lane - layer * pixels
+
+    def light(self) -> tuple[Any, Any]:
+        """(image, number within it) of each lane of the light paths, UInt32."""
+        lane = dr.arange(mi.UInt32, self.images * self.light_paths)
+        image = lane // self.counts[2] if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
+        return image, lane - image * self.counts[2]

@@ -1,0 +1,98 @@
+"""Which light to choose: a table of probabilities over a coarse grid of the scene, made from the lights as they are.
+
+In each cell a light is chosen in proportion to the irradiance it would cast there if nothing stood between, estimated
+from a few samples of the light seen from points of the cell; a share stays with the lights' own sampling weights, since
+what is not in between is not known. The table is data: it is made on the device at the start of each render, and any
+positive probabilities leave the estimate unbiased (cf. Shirley, Wang and Zimmerman, *Monte Carlo Techniques for Direct
+Lighting Calculations*, 1996, who choose by an unshadowed estimate at each point).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from . import randomness
+
+CELLS = 8  # of the grid, along each axis
+_SAMPLES = 4  # of each light in each cell
+_DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
+_GRID_KEY = 0x5E1EC7
+
+
+@dataclass(slots=True)
+class Selection:
+    """Probabilities of N lights in C = CELLS³ cells."""
+
+    count: int  # N
+    lower: Any  # Point3f, 1: corner of the grid
+    cells_per_length: Any  # Vector3f, 1
+    cdf: Any  # Float, C·N: running sums, cell after cell
+    pmf: Any  # Float, C·N
+    slot: Any  # UInt32, by Dr.Jit's registry id of the emitter: its number among the N
+    overall: Any  # Float, N: mean of pmf over the cells
+
+    def choose(self, p: Any, u: Any) -> tuple[Any, Any]:
+        """(number of a light: UInt32, its probability: Float) at points ``p``, by inversion of the running sum at u."""
+        first = self._cell(p) * self.count
+        target = u * dr.gather(mi.Float, self.cdf, first + (self.count - 1))
+        last = self.count - 1
+        light = dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self.cdf, first + i) <= target)
+        return light, dr.gather(mi.Float, self.pmf, first + light)
+
+    def probability(self, p: Any, emitter: Any) -> Any:
+        """Probability of choosing ``emitter`` at points ``p``; 0 for the null pointer."""
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        slot = dr.gather(mi.UInt32, self.slot, number)
+        return dr.gather(mi.Float, self.pmf, self._cell(p) * self.count + slot, number != 0)
+
+    def _cell(self, p: Any) -> Any:
+        place = dr.clip((p - self.lower) * self.cells_per_length, 0, CELLS - 0.5)
+        x, y, z = (mi.UInt32(place[k]) for k in range(3))
+        return (z * CELLS + y) * CELLS + x
+
+
+def read_selection(pointers: Any, ids: list[int], base: Any, box: Any) -> Selection:
+    """The table for N ≥ 2 lights (EmitterPtr) with registry ids ``ids`` and sampling weights ``base`` (Float, N).
+
+    ``box`` is the scene's bounding box. Lights with weight 0 are never chosen.
+    """
+    n, cells = len(ids), CELLS**3
+    low, high = box.min, box.max
+    lower = mi.Point3f(*(dr.opaque(mi.Float, float(low[k])) for k in range(3)))
+    size = mi.Vector3f(*(dr.opaque(mi.Float, max(float(high[k] - low[k]), 1e-6) / CELLS) for k in range(3)))
+
+    pair = dr.arange(mi.UInt32, cells * n * _SAMPLES) // _SAMPLES
+    cell, light = pair // n, pair % n
+    rng = randomness.sampler(
+        randomness.stream(mi.UInt32(_GRID_KEY), 0, pair), dr.arange(mi.UInt32, cells * n * _SAMPLES) % _SAMPLES
+    )
+    corner = mi.Point3f(cell % CELLS, cell // CELLS % CELLS, cell // (CELLS * CELLS))
+    xy = rng.next_2d()
+    seen_from = dr.zeros(mi.Interaction3f)
+    seen_from.p = lower + size * (corner + mi.Vector3f(xy.x, xy.y, rng.next_1d()))
+    alive = dr.gather(mi.Float, base, light) > 0
+    emitter = dr.gather(mi.EmitterPtr, pointers, light)
+    cast = dr.max(emitter.sample_direction(seen_from, rng.next_2d(), alive)[1])
+    cast = dr.block_sum(dr.select(alive & dr.isfinite(cast) & (cast > 0), cast, 0), _SAMPLES)
+
+    light = dr.arange(mi.UInt32, cells * n) % n
+    weight = dr.gather(mi.Float, base, light)
+    own, total = weight / _over_cell(weight, n), _over_cell(cast, n)
+    pmf = dr.select(total > 0, (1 - _DEFENSIVE) * cast / total + _DEFENSIVE * own, own)
+    pmf = dr.select(weight > 0, pmf, 0)
+    cdf = dr.block_prefix_sum(pmf, n, exclusive=False)
+    overall = dr.zeros(mi.Float, n)
+    dr.scatter_add(overall, pmf / cells, light)
+    slot = dr.zeros(mi.UInt32, max(ids) + 1)
+    dr.scatter(slot, dr.arange(mi.UInt32, n), mi.UInt32(ids))
+    dr.eval(cdf, pmf, slot, overall)
+    return Selection(n, lower, dr.rcp(size), cdf, pmf, slot, overall)
+
+
+def _over_cell(value: Any, n: int) -> Any:
+    """Sum over each cell's n entries, at every entry."""
+    return dr.repeat(dr.block_sum(value, n), n)

@@ -1,0 +1,104 @@
+"""What a hard scene is: how it is built, what its image must be, and how much work it takes to tell.
+
+Shape letters: K renders, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Scene = dict[str, Any]
+"""A dictionary for ``mi.load_dict``."""
+Images = NDArray[np.floating[Any]]
+"""[K, H, W, 3] linear radiance of K independent renders; K = 1 stands for an image that is known exactly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Technique counts of `bdpt`."""
+
+    connections: int
+    light_ratio: float
+
+    def __str__(self) -> str:
+        return f"{self.connections},{self.light_ratio:g}"
+
+
+FIRST = Settings(1, 1.0)
+"""What the quick version tries."""
+ALL = (FIRST, Settings(0, 0.0), Settings(0, 1.0), Settings(4, 0.25))
+"""What the long version tries; each is complete where paths from the eye find everything."""
+EYE_ALONE = (Settings(0, 0.0),)
+"""A path tracer: what is left where nothing can be done from the light side."""
+WITH_LIGHT_PATHS = tuple(settings for settings in ALL if settings.light_ratio > 0)
+"""Complete also where light must be followed from its source."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is rendered, and how sharp the answer must be."""
+
+    size: int  # pixels, square
+    blocks: int  # the image is compared in blocks × blocks
+    seeds: int  # independent renders, of bdpt and of the truth
+    spp: int  # samples per pixel of one render of bdpt
+    truth_spp: int  # samples per pixel of one render of the truth
+    resolution: float  # largest standard error of the mean ratio with which a pass counts
+
+
+QUICK = Effort(size=16, blocks=4, seeds=12, spp=64, truth_spp=128, resolution=0.01)
+LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=384, resolution=0.003)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What an image is compared with."""
+
+    said: str  # in words, for the table
+    images: Callable[[HardScene, Effort, int], Images]  # of a scene, an effort and a seed
+
+
+@dataclass(frozen=True, slots=True)
+class HardScene:
+    """One scene that breaks bidirectional path tracers, with its truth."""
+
+    row: int  # number in the table of hard scenes, 1 … 36
+    name: str
+    hard: str  # what is hard about it
+    build: Callable[[int], Scene]  # of the image size
+    truth: Truth
+    max_depth: int = 6
+    rr_depth: int = 5
+    settings: tuple[Settings, ...] = ALL
+    quick_settings: tuple[Settings, ...] = (FIRST,)  # some of them
+    quick: Effort | None = QUICK  # None: the long version only
+    long: Effort = LONG
+    edit: Callable[[Any], None] | None = None  # changes the loaded scene in place before it is rendered
+    max_over_mean: float | None = None  # largest pixel of any render over the mean, where the row bounds it
+
+    @property
+    def label(self) -> str:
+        """Number and name, as `--only` takes them."""
+        return f"{self.row:02d}-{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Something that would be rendered wrongly, and is refused instead."""
+
+    row: int | None  # number in the table of hard scenes, None where it has none
+    name: str
+    build: Callable[[int], Scene]
+    sentence: str  # what the message must contain
+    settings: Settings = FIRST
+    allowed: Settings | None = None  # settings with which it is rendered all the same
+
+    @property
+    def label(self) -> str:
+        """Number and name, as `--only` takes them."""
+        return f"{self.row:02d}-{self.name}" if self.row else self.name

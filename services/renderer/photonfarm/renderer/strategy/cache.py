@@ -1,0 +1,59 @@
+"""Measurements kept on this machine, one JSON file each, under a digest of all that they depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from photonfarm.renderer.jobs import versions
+from photonfarm.renderer.strategy.measurement import GRID, Measurement
+from photonfarm.shared.keys import make_key
+from photonfarm.shared.scene import PhotonSpec, SceneSpec, Transport
+
+_DECIDED = ("connections", "light_ratio", "half_spp")
+
+
+def digest(spec: SceneSpec) -> str:
+    """32 hexadecimal digits: the scene without what a plan decides, the candidates, and all code that renders.
+
+    So a plan that is written into its spec does not call for another one.
+    """
+    default = Transport()
+    undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
+    scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
+    scene = SceneSpec.model_validate(scene.model_dump())  # without the id that the copy has kept
+    return make_key("scene plan", scene.scene_id, repr(GRID), repr(sorted(versions().items())), _revision()).hex()
+
+
+def _revision() -> bytes:
+    """A digest of the renderer's source: a checkout has one version for many renderers."""
+    hashed = hashlib.sha256()
+    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
+        hashed.update(file.read_bytes())
+    return hashed.digest()
+
+
+def _file(spec: SceneSpec) -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "photonfarm/plans" / f"{digest(spec)}.json"
+
+
+def find(spec: SceneSpec) -> Measurement | None:
+    """The measurement of this scene, unless there is none, or one that cannot be read or used."""
+    try:
+        return Measurement.model_validate_json(_file(spec).read_bytes())
+    except (OSError, ValidationError):
+        return None
+
+
+def keep(spec: SceneSpec, measurement: Measurement) -> Path:
+    """Keep a measurement; returns its file, which appears whole. Raises OSError where it cannot be written."""
+    file = _file(spec)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    aside = file.with_suffix(f".{os.getpid()}.part")
+    aside.write_text(measurement.model_dump_json(indent=1) + "\n")
+    aside.replace(file)
+    return file

@@ -1,0 +1,116 @@
+"""What a scene contains, and what follows from that alone, without measuring."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from photonfarm.renderer.strategy.pilot import PLAIN, Candidate
+
+_LIGHTS = {
+    "AreaLight": "area",
+    "ConstantBackgroundEmitter": "constant environment",
+    "EnvironmentMapEmitter": "environment map",
+    "PointLight": "point",
+    "SpotLight": "spot",
+    "Projector": "projector",
+    "DirectionalEmitter": "directional",
+}
+_BRIGHTNESS = ("radiance.", "intensity.", "irradiance.", "data", "scale")
+_CAMERAS = {"PerspectiveCamera": "pinhole", "ThinLensCamera": "thin lens"}
+"""Cameras that light paths can be joined to."""
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """The facts of one loaded scene, as it stands."""
+
+    lights: Mapping[str, int]  # that shine, by kind
+    dark: int  # lights of radiance 0: they are never selected
+    surfaces: int
+    specular: int  # of them, those that only reflect or refract like a mirror or clear glass
+    camera: str  # "pinhole", "thin lens", or Mitsuba's name of another
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """Something that is not modelled, and why."""
+
+    what: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.why}"
+
+
+def read(scene: Any, camera: Any) -> Content:
+    """What a Mitsuba scene contains, seen by one of Mitsuba's sensors."""
+    shining = [emitter for emitter in scene.emitters() if _shines(emitter)]
+    kinds = Counter(_LIGHTS.get(emitter.class_name(), emitter.class_name()) for emitter in shining)
+    return Content(
+        lights=dict(kinds),
+        dark=len(scene.emitters()) - len(shining),
+        surfaces=len(scene.shapes()),
+        specular=sum(map(_is_specular, scene.shapes())),
+        camera=_CAMERAS.get(camera.class_name(), camera.class_name()),
+    )
+
+
+def _shines(emitter: Any) -> bool:
+    """Whether none of the parameters that scale a light is zero all over."""
+    import mitsuba as mi
+
+    parameters = mi.traverse(emitter)
+    names = [name for name in parameters.keys() if name.startswith(_BRIGHTNESS) and not name.endswith("to_uv")]  # noqa: SIM118 - no mapping
+    return all(np.any(np.array(parameters[name], np.float64) > 0) for name in names)
+
+
+def _is_specular(shape: Any) -> bool:
+    import mitsuba as mi
+
+    return shape.bsdf() is not None and not mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Smooth)
+
+
+def restrict(
+    content: Content, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
+) -> tuple[list[Candidate], list[LeftOut]]:
+    """The candidates that may help, and what is left out. `hit_share`: of the light paths, those that hit a surface."""
+    candidates = list(candidates)
+    reason = _why_no_light_paths(content, max_depth, hit_share)
+    if reason:
+        return [PLAIN], [LeftOut("light paths, and with them connections", reason)]
+    if max_depth == 2:
+        reason = "max_depth is 2, and a path with a connection has 3 edges at least"
+        return [c for c in candidates if not c.connections], [LeftOut("connections", reason)]
+    return candidates, []
+
+
+def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> str | None:
+    if not content.lights:
+        return "there is no light that shines"
+    if max_depth in (0, 1):
+        return f"max_depth is {max_depth}: only lights themselves are seen"
+    if content.camera not in _CAMERAS.values():
+        return f"they cannot be joined to a camera of type {content.camera}"
+    if content.specular == content.surfaces:
+        return "every surface is a mirror or clear glass, where they can be joined to nothing"
+    if hit_share == 0:
+        return "none can start from the lights there are, or none of them hits a surface"
+    return None
+
+
+def sentences(content: Content, max_depth: int) -> Sequence[str]:
+    """What is modelled in any case, and what lights that are off cost."""
+    lights = ", ".join(f"{count} {kind}" for kind, count in sorted(content.lights.items())) or "none"
+    found = [
+        f"lights: {lights}",
+        f"surfaces: {content.surfaces}, of which {content.specular} are mirrors or clear glass alone",
+        f"camera: {content.camera}; paths of {'any number of' if max_depth < 0 else f'up to {max_depth}'} edges",
+    ]
+    if content.dark:
+        found.append(f"lights that do not shine: {content.dark}, selected with probability 0")
+    return found

@@ -1,0 +1,44 @@
+"""The 36 rows of hard scenes, each against its truth: the quick version of `make bench-stability`."""
+
+from __future__ import annotations
+
+import pytest
+
+from photonfarm.renderer.stability.case import HardScene, Refusal
+from photonfarm.renderer.stability.pictures import keep
+from photonfarm.renderer.stability.report import FAILURES
+from photonfarm.renderer.stability.rows import REFUSALS, ROWS, SCENES
+from photonfarm.renderer.stability.runner import message_of, run
+
+QUICK = [scene for scene in SCENES if scene.quick is not None]
+
+
+# One right scene fails by chance with probability 4e-6 per settings; the seeds are fixed.
+@pytest.mark.parametrize("scene", QUICK, ids=lambda scene: scene.label)
+def test_a_hard_scene_looks_like_its_truth(scene: HardScene) -> None:
+    for outcome in run(scene, quick=True):
+        if outcome.result.faults:
+            folder = keep(outcome, FAILURES).resolve()
+            pytest.fail(
+                f"{scene.label} ({outcome.result.settings}), {scene.hard}; truth: {scene.truth.said}\n"
+                f"{'; '.join(outcome.result.faults)}\nmean ratio {outcome.result.mean_ratio} ± "
+                f"{outcome.result.mean_ratio_standard_error}\nagain: {outcome.result.command}\nrenders: {folder}"
+            )
+
+
+@pytest.mark.parametrize("refusal", REFUSALS, ids=lambda refusal: refusal.label)
+def test_what_would_be_wrong_is_refused_with_the_reason(refusal: Refusal) -> None:
+    (outcome,) = run(refusal, quick=True)
+    assert outcome.result.faults == ()
+    said = message_of(refusal)
+    assert said.startswith("bdpt: ")
+    assert "because" in said
+
+
+def test_every_row_has_a_quick_version() -> None:
+    assert {item.row for item in (*QUICK, *REFUSALS)} - {None} == set(range(1, ROWS + 1))
+
+
+def test_labels_are_unique() -> None:
+    labels = [item.label for item in (*SCENES, *REFUSALS)]
+    assert len(set(labels)) == len(labels)

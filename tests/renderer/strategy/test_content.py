@@ -1,0 +1,128 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.renderer import backend
+
+mi = backend.load(threads=1)
+
+from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy import content, light_reach  # noqa: E402
+from photonfarm.renderer.strategy.measurement import GRID  # noqa: E402
+from photonfarm.renderer.strategy.pilot import PLAIN  # noqa: E402
+from photonfarm.shared.scene import Box, PhotonSpec, ViewSpec  # noqa: E402
+
+MIRROR = {"type": "sphere", "bsdf": {"type": "conductor"}}
+BULB = {"type": "point", "intensity": {"type": "rgb", "value": 1.0}}
+
+
+def read(description: dict[str, Any]) -> content.Content:
+    scene = mi.load_dict({"type": "scene", "camera": {"type": "perspective"}, **description}, optimize=False)
+    return content.read(scene, scene.sensors()[0])
+
+
+def test_the_lights_of_a_scene_are_counted_by_kind() -> None:
+    scene = mi.load_dict(HARD_SCENES["many_lights"](16), optimize=False)
+    found = content.read(scene, scene.sensors()[0])
+    assert found.lights == {"area": 4, "point": 1, "spot": 1, "directional": 1, "constant environment": 1}
+    assert (found.dark, found.specular, found.camera) == (0, 0, "pinhole")
+
+
+def test_lights_that_do_not_shine_are_counted_apart_whatever_makes_them_dark() -> None:
+    dark = {"type": "point", "intensity": {"type": "rgb", "value": 0.0}}
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((8, 16, 3), np.float32))}
+    off = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((8, 16, 3), np.float32)), "scale": 0.0}
+    assert read({"ball": MIRROR, "a": BULB, "b": dark, "sky": sky}).dark == 2
+    assert read({"ball": MIRROR, "a": BULB, "sky": off}).dark == 1
+
+
+@pytest.mark.parametrize("kind", ["conductor", "dielectric", "thindielectric", "null"])
+def test_what_only_mirrors_is_told_from_what_scatters(kind: str) -> None:
+    assert read({"ball": {"type": "sphere", "bsdf": {"type": kind}}, "bulb": BULB}).specular == 1
+    assert read({"ball": {"type": "sphere", "bsdf": {"type": "roughconductor"}}, "bulb": BULB}).specular == 0
+    assert read({"ball": {"type": "sphere", "bsdf": {"type": "plastic"}}, "bulb": BULB}).specular == 0
+
+
+@pytest.mark.parametrize(
+    ("description", "max_depth", "hit_share", "reason"),
+    [
+        ({"ball": {"type": "sphere"}}, 8, 1.0, "there is no light that shines"),
+        ({"ball": {"type": "sphere"}, "bulb": BULB}, 1, 1.0, "only lights themselves are seen"),
+        ({"ball": MIRROR, "bulb": BULB}, 8, 1.0, "joined to nothing"),
+        ({"ball": {"type": "sphere"}, "bulb": BULB}, 8, 0.0, "none of them hits a surface"),
+        (
+            {"ball": {"type": "sphere"}, "bulb": BULB, "camera": {"type": "orthographic"}},
+            8,
+            1.0,
+            "joined to a camera of type OrthographicCamera",
+        ),
+    ],
+)
+def test_light_paths_that_could_not_help_are_left_out_with_a_reason(
+    description: dict[str, Any], max_depth: int, hit_share: float, reason: str
+) -> None:
+    candidates, left_out = content.restrict(read(description), max_depth, hit_share, GRID)
+    assert candidates == [PLAIN]
+    assert reason in str(left_out[0])
+
+
+def test_two_edges_leave_no_place_for_a_connection() -> None:
+    found = read({"ball": {"type": "sphere"}, "bulb": BULB})
+    candidates, left_out = content.restrict(found, 2, 1.0, GRID)
+    assert {c.connections for c in candidates} == {0}
+    assert len(candidates) == 5
+    assert "max_depth is 2" in str(left_out[0])
+    assert content.restrict(found, 3, 1.0, GRID) == (list(GRID), [])
+    assert content.restrict(found, -1, 1.0, GRID) == (list(GRID), [])
+
+
+# ----------------------------------------------------------------------------------------------------------- photons
+
+AROUND = ViewSpec(origin=Box(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5)), look_at=Box(min=(0, 0, 0), max=(0, 0, 0)))
+
+
+def test_light_in_a_closed_sphere_loses_what_it_absorbs_at_each_bounce() -> None:
+    """Albedo 0.5 keeps half of the power at each hit; a light in the middle misses nothing."""
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    sphere = {"type": "sphere", "radius": 0.5, "flip_normals": True, "bsdf": grey}
+    scene = mi.load_dict({"type": "scene", "sphere": sphere, "bulb": BULB}, optimize=False)
+    reach = light_reach.measure([scene, scene], AROUND, seed=1)
+    assert reach.hit == 1
+    assert reach.filled == reach.near
+    expected = 0.5 ** np.arange(16)
+    np.testing.assert_allclose(reach.power, expected / expected.sum(), rtol=1e-4)
+
+
+def test_hits_far_from_the_cameras_do_not_count() -> None:
+    far = {"type": "sphere", "center": [50, 0, 0], "radius": 40, "flip_normals": True}
+    scene = mi.load_dict({"type": "scene", "sphere": far, "bulb": {**BULB, "position": [50, 0, 0]}}, optimize=False)
+    reach = light_reach.measure([scene], AROUND, seed=1)
+    assert reach.hit == 1
+    assert max(reach.near) == 0
+    assert sum(reach.power) == 0
+    photons, reason = light_reach.recommend(PhotonSpec(), reach.near, reach.power, max_depth=8)
+    assert photons.paths == 0
+    assert "0.0% of the light paths reach" in reason
+
+
+@pytest.mark.parametrize(
+    ("wanted", "power", "max_depth", "depth"),
+    [
+        (4, (0.6, 0.3, 0.1, 0.0), 8, 3),  # nothing beyond the third
+        (4, (0.9, 0.095, 0.004, 0.001), 8, 2),  # half a per cent
+        (2, (0.4, 0.3, 0.2, 0.1), 8, 2),  # never more than the spec wants
+        (4, (0.4, 0.3, 0.2, 0.1), 3, 2),  # a third hit lies on paths of four edges
+        (4, (0.4, 0.3, 0.2, 0.1), -1, 4),
+    ],
+)
+def test_bounces_that_carry_next_to_nothing_are_not_stored(
+    wanted: int, power: tuple[float, ...], max_depth: int, depth: int
+) -> None:
+    photons, _ = light_reach.recommend(PhotonSpec(paths=64, depth=wanted), (0.9, 0.8, 0.7, 0.6), power, max_depth)
+    assert photons == PhotonSpec(paths=64, depth=depth)
+
+
+def test_no_photons_stay_no_photons() -> None:
+    assert light_reach.recommend(PhotonSpec(paths=0), (1.0,), (1.0,), 8)[0].paths == 0
+    assert light_reach.recommend(PhotonSpec(), (1.0,), (1.0,), 1)[0].paths == 0

@@ -1,0 +1,96 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from photonfarm.renderer.strategy import spec_file
+from photonfarm.shared.errors import SpecError
+
+SETTINGS = {"transport": {"connections": 0, "light_ratio": 4.0, "half_spp": 9}, "photons": {"paths": 0, "depth": 2}}
+
+SPEC = """# A room.
+name = "a"   # of mine
+
+[transport]  # [photons]
+  max_depth = 8
+half_spp=4# few
+light_ratio  = 1.0    # as many as eye paths
+
+# what is stored
+[photons]
+depth = 4
+
+[[objects]]
+name = "[transport]"
+"""
+
+
+def test_numbers_change_and_all_else_stays_byte_for_byte() -> None:
+    assert spec_file.put(SPEC, SETTINGS, where="spec") == SPEC.replace("half_spp=4#", "half_spp=9#").replace(
+        "= 1.0    #", "= 4.0    #"
+    ).replace("eye paths\n", "eye paths\nconnections = 0\n").replace("depth = 4\n", "depth = 2\npaths = 0\n")
+
+
+def test_what_is_written_twice_is_written_once() -> None:
+    once = spec_file.put(SPEC, SETTINGS, where="spec")
+    assert spec_file.put(once, SETTINGS, where="spec") == once
+
+
+@pytest.mark.parametrize(
+    "text", ["", 'name = "a"', 'name = "a"\r\n[film]\r\nwidth = 8\r\n', "[transport]", "[photons]\n"]
+)
+def test_tables_that_are_not_there_are_added_with_the_file_s_line_ends(text: str) -> None:
+    changed = spec_file.put(text, SETTINGS, where="spec")
+    assert changed.startswith(text)
+    assert tomllib.loads(changed) == tomllib.loads(text) | SETTINGS
+    assert changed.count("\r\n") == (changed.count("\n") if "\r\n" in text else 0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "transport = { half_spp = 4 }\n",
+        "transport.half_spp = 4\n",
+        '["transport"]\nhalf_spp = 4\n',
+        '[transport]\n"half_spp" = 4\n',
+        'text = """\n[transport]\n"""\n',
+    ],
+)
+def test_a_table_that_cannot_be_edited_in_place_is_refused(text: str) -> None:
+    with pytest.raises(SpecError, match=r"spec: write \[transport\] and \[photons\] as tables with a line per key"):
+        spec_file.put(text, SETTINGS, where="spec")
+
+
+def test_a_file_is_replaced_whole_and_keeps_its_mode(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text(SPEC)
+    file.chmod(0o640)
+    spec_file.write(file, SETTINGS)
+    assert tomllib.loads(file.read_text())["transport"]["half_spp"] == 9
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_refused_file_stays_as_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("transport = { half_spp = 4 }\n")
+    with pytest.raises(SpecError):
+        spec_file.write(file, SETTINGS)
+    assert file.read_text() == "transport = { half_spp = 4 }\n"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_built_in_spec_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SpecError, match=r"cornell: is built in and cannot be written; copy cornell\.toml"):
+        spec_file.writable("cornell")
+
+
+def test_a_read_only_file_is_refused_before_anything_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text(SPEC)
+    monkeypatch.setattr(spec_file.os, "access", lambda *_: False)  # root may write anything
+    with pytest.raises(SpecError, match="cannot be written; allow writing to it"):
+        spec_file.writable(str(file))

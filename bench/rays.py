@@ -163,6 +163,7 @@ def measure(name: str, options: argparse.Namespace) -> Row:
     integrator = mi.load_dict(
         {
             "type": "bdpt",
+            "record": True,
             "max_depth": options.max_depth,
             "connections": options.connections,
             "light_ratio": options.light_ratio,

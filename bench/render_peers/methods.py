@@ -61,8 +61,8 @@ def integrator(name: str, max_depth: int, chosen: dict[str, Any]) -> Any:
     parameters: dict[str, dict[str, Any]] = {
         "path": {"type": "path"},
         "ptracer": {"type": "ptracer"},
-        "bdpt": {"type": "bdpt", "connections": 1, "light_ratio": 1.0},
-        "chosen": {"type": "bdpt", **chosen},
+        "bdpt": {"type": "bdpt", "record": True, "connections": 1, "light_ratio": 1.0},
+        "chosen": {"type": "bdpt", "record": True, **chosen},
     }
     return mi.load_dict({**common, **parameters[name]})
 

@@ -97,6 +97,20 @@ def test_the_way_to_a_configuration_leaves_no_trace(room: LoadedScene) -> None:
     assert mesh_state(room) == direct
 
 
+def test_recorded_renders_follow_every_edit(room: LoadedScene) -> None:
+    """`dr.freeze` replays kernels with what the scene holds now: bit by bit as when Python traces them again."""
+    anew = backend.load(1).load_dict({"type": "bdpt", **room.spec.transport.model_dump(exclude={"half_spp"})})
+    at_rest = rest(room.spec)
+    for group in range(len(room.spec.groups)):
+        moved, present = at_rest.translation.copy(), at_rest.present.copy()
+        moved[group] += np.array([0.1, 0, 0.1], np.float32)
+        present[group] = False
+        for edit in (Modification(moved, at_rest.present), Modification(at_rest.translation, present), at_rest):
+            room.apply(edit)
+            traced = room.render(SOMEWHERE, 9, anew)
+            np.testing.assert_array_equal(room.render_halves(SOMEWHERE, (9, 10))[0], traced)
+
+
 def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene) -> None:
     room.apply(rest(room.spec))
     first, again, other = (room.render_half(SOMEWHERE, seed) for seed in (0, 0, 1))

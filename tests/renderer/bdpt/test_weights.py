@@ -51,8 +51,8 @@ class RandomPath:
     def light_state(self, vertices: int) -> tuple[float, float]:
         """(dVCM, dVC) on arriving at v_j, j = vertices − 1."""
         cos_in = self.cos_right[0]
-        dvcm = weights.light_start_finite(self.nee_area, self.emission, self.r2[0], cos_in)
-        dvc = weights.light_start_dvc(self.cos_left[0] / self.emission, cos_in)
+        before = weights.light_start(self.nee_area, self.emission), self.cos_left[0] / self.emission
+        dvcm, dvc = weights.arrive(*before, self.r2[0], cos_in)
         for j in range(1, vertices - 1):
             count = 1 if j == 1 else self.n
             dvcm, dvc = weights.scatter(dvcm, dvc, count, self.cos_left[j], self.light[j], self.eye[j])

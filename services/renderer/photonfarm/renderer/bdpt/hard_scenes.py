@@ -110,6 +110,25 @@ def glass_caustic(size: int) -> Scene:
     }
 
 
+def floor_caustic(size: int) -> Scene:
+    """The caustic of a glass sphere in the light of a small area light, with the sphere out of the picture.
+
+    So every path to the light that the image needs has one diffuse vertex at which a light path can be joined to the
+    lens; in `glass_caustic` some are seen twice through glass, which no joining reaches.
+    """
+    return {
+        **glass_caustic(size),
+        "light": rectangle([0.03, 0.03], [0.7, 0, 2.8], [-0.25, 0, -1], emitter=shining(660.0)),
+        "sensor": camera(size, [-1.5, -2, 0.9], [-0.4, 0, 0], 18),
+        "ball": {
+            "type": "sphere",
+            "center": [0, 0, 1.0],
+            "radius": 0.5,
+            "bsdf": {"type": "dielectric", "int_ior": 1.5},
+        },
+    }
+
+
 def cove(size: int) -> Scene:
     """A room lit by a light that shines at the ceiling from above a shelf: all light in the image is indirect."""
     return {
@@ -296,6 +315,7 @@ HARD_SCENES: dict[str, Callable[[int], Scene]] = {
     for scene in (
         cornell,
         glass_caustic,
+        floor_caustic,
         cove,
         rotated_envmap,
         constant_environment,

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-LAUNCH_PATHS = 1 << 18
+LAUNCH_PATHS = 1 << 20
 """Most eye paths traced at once, unless an image has more pixels: about 140 bytes for each with its light path."""
 
 

@@ -73,7 +73,7 @@ class LightState:
     ray: Any  # Ray3f: to this vertex
     hit: Any  # PreliminaryIntersection3f: where it arrives
     throughput: Any  # Spectrum
-    dvcm: Any  # Float: see weights.py; at the first vertex as arrived, later as left
+    dvcm: Any  # Float: see weights.py, as they left the vertex before
     dvc: Any  # Float
     depth: Any  # UInt32: edges up to this vertex
     seen: Any  # UInt32: vertices a connection could reach so far
@@ -120,14 +120,10 @@ def trace_light_paths(
 def first_state(scene: Any, lights: Lights, start: Emission, rng: Any) -> LightState:
     """Loop variables at the first hit."""
     active = mi.Bool(start.valid)
-    hit = scene.ray_intersect_preliminary(start.ray, active=active)
-    si = hit.compute_surface_interaction(start.ray, mi.RayFlags.Minimal, active)
-    active &= si.is_valid()
-    cos_in = dr.abs(dr.dot(si.n, start.ray.d))
-    dvcm, dvc = start_weights(start, lights, si, cos_in, active)
-    return LightState(
-        active & (cos_in > 0), rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0)
-    )
+    hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
+    active &= hit.is_valid()
+    dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
+    return LightState(active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0))
 
 
 def vertex_bounce(
@@ -151,7 +147,6 @@ def vertex_bounce(
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & (cos_in > 0)
     dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t), cos_in)
-    dvcm, dvc = dr.select(first, s.dvcm, dvcm), dr.select(first, s.dvc, dvc)
     count = mi.Float(dr.select(first, 1, options.count))
     bsdf = si.bsdf()
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -234,24 +229,24 @@ def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any,
     return bsdf.eval_pdf(ctx, exchanged, wi, active)
 
 
-def start_weights(start: Emission, lights: Lights, si: Any, cos_in: Any, mask: Any) -> tuple[Any, Any]:
-    """(dVCM, dVC) at the first hit; see weights.py. Lanes outside ``mask`` may hold anything."""
-    selection = lights.nee_probability(start.emitter, si.p)
-    dvcm, dvc = mi.Float(0), mi.Float(0)
+def start_weights(start: Emission, lights: Lights, p: Any, r2: Any, mask: Any) -> tuple[Any, Any]:
+    """(dVCM, dVC) of light paths' first rays, which arrive at ``p`` over the squared distance ``r2``; see weights.py.
+
+    Lanes outside ``mask`` may hold anything. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ an area light's cos₀ cancels.
+    """
+    selection = lights.nee_probability(start.emitter, p)
+    dvcm, dvc = weights.light_start(selection, start.factor), mi.Float(0)
     if lights.has(AREA):
+        seen_from = dr.zeros(mi.Interaction3f)
+        seen_from.p = p
         ds = mi.DirectionSample3f(start.sample)
-        offset = start.sample.p - si.p
-        ds.dist = dr.norm(offset)
-        ds.d = offset / ds.dist
-        p_direction = selection * start.emitter.pdf_direction(si, ds, mask & start.is_area)
-        dvcm = weights.light_start_area(p_direction, start.factor, cos_in)
-        dvc = weights.light_start_dvc(dr.rcp(start.factor), cos_in)
-    dvcm = dr.select(
-        start.at_infinity,
-        weights.light_start_infinite(selection, start.factor, cos_in),
-        dr.select(start.is_area, dvcm, weights.light_start_finite(selection, start.factor, dr.square(si.t), cos_in)),
-    )
-    dvc = dr.select(start.at_infinity, weights.light_start_dvc(dr.rcp(start.factor * start.p_direction), cos_in), dvc)
+        ds.dist = dr.sqrt(r2)
+        ds.d = (start.sample.p - p) / ds.dist
+        p_direction = selection * start.emitter.pdf_direction(seen_from, ds, mask & start.is_area)
+        dvcm = dr.select(start.is_area, weights.light_start(p_direction / r2, start.factor), dvcm)
+        dvc = dr.rcp(start.factor)
+    dvcm = dr.select(start.at_infinity, weights.light_start(selection / r2, start.factor), dvcm)
+    dvc = dr.select(start.at_infinity, dr.rcp(start.factor * start.p_direction), dvc)
     return dvcm, dr.select(start.delta, 0, dvc)
 
 

@@ -25,30 +25,13 @@ LARGEST = 1e30
 """Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
 
 
-def light_start_finite(nee_area_density: Any, emission: Any, r2: Any, cos_in: Any) -> Any:
-    """dVCM at y₁ of a light with a position: p_NEE(y₀)/e · r²/cos_in (Georgiev 2012, eq. 31, completed on arrival)."""
-    return dr.minimum(nee_area_density / emission * r2 / cos_in, LARGEST)
+def light_start(nee_density: Any, emission: Any) -> Any:
+    """dVCM of a light path's first ray: p_NEE(y₀)/e (Georgiev 2012, eq. 31), completed on arrival.
 
-
-def light_start_area(nee_direction_density: Any, emission_per_cos: Any, cos_in: Any) -> Any:
-    """dVCM at y₁ of an area light, p_ω/(ê·cos_in).
-
-    With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ both cos₀ and r² cancel.
+    ``nee_density``: in area at y₀; for a light at infinity, whose "position" is a direction, in solid angle over the r²
+    that arriving multiplies with (§5.1, last paragraph).
     """
-    return dr.minimum(nee_direction_density / (emission_per_cos * cos_in), LARGEST)
-
-
-def light_start_infinite(nee_direction_density: Any, emission: Any, cos_in: Any) -> Any:
-    """dVCM at y₁ of a light at infinity (Georgiev 2012, §5.1, last paragraph).
-
-    There is no r², since its "position" is a direction.
-    """
-    return dr.minimum(nee_direction_density / emission / cos_in, LARGEST)
-
-
-def light_start_dvc(cos_0_over_emission: Any, cos_in: Any) -> Any:
-    """dVC at y₁: cos₀/e/cos_in (eq. 32); the caller passes 0 for delta lights, and 1/e for lights at infinity."""
-    return dr.minimum(cos_0_over_emission / cos_in, LARGEST)
+    return dr.minimum(nee_density / emission, LARGEST)
 
 
 def eye_start(light_ratio: Any, p_camera: Any) -> Any:

@@ -7,7 +7,9 @@ density in the sum over all techniques (Veach, *Robust Monte Carlo Methods for L
 §8.2.2, §9.2.4, §10.2.1).
 
 Of a mirror or a smooth interface both directions' densities are infinite, in a fixed proportion, and nothing joins
-there. The proportion is 1 for reflection; for refraction dω' cosθ' n'² = dω cosθ n² gives it (Veach 1997, §5.2).
+there. The proportion is 1 for reflection; for refraction it is dω/dω' with dω cosθ n² = dω' cosθ' n'² (Veach 1997,
+§5.2). The integrator leaves it out (as all do who follow Georgiev): weights still sum to 1, and over a body that light
+enters and leaves alike, such as a sphere or a pane, it is 1 again.
 
 Shape letters: N paths, k edges; arrays by vertex have k + 1 columns, arrays by edge k.
 """
@@ -35,7 +37,7 @@ class Paths:
     to_light: F64  # [N, k + 1]: solid-angle density of the BSDF's sampling from the eye's side towards the light
     to_eye: F64  # [N, k + 1]: the other way round
     delta: Mask  # [N, k + 1]: scattered by a mirror or a smooth interface here
-    eta: F64  # [N, k + 1]: at a refraction, refractive index on the light's side over that on the eye's; elsewhere 1
+    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror, see above
     infinite: Mask  # [N]: the light is at infinity: v₀ stands for a direction
     distant: F64  # [N, 3]: direction to it
     hittable: Mask  # [N]: a ray can find the light
@@ -63,24 +65,22 @@ def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64
 
 
 def weights(paths: Paths, counts: F64) -> F64:
-    """[N, k + 1]: weight of each technique; 0 for those that cannot make the path."""
-    weighted = np.exp(log_densities(paths)) * counts
+    """[N, k + 1]: weight of each technique; 0 for those that cannot make the path, NaN where none can."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = log_densities(paths) + np.log(counts)
+        weighted = np.exp(logs - logs.max(axis=1, keepdims=True))
     total: F64 = weighted.sum(axis=1, keepdims=True)
     return weighted / total
 
 
 def log_densities(paths: Paths) -> F64:
-    """[N, k + 1]: log of each technique's density, up to a constant for each path; −∞ where it cannot make it."""
+    """[N, k + 1]: log of each technique's density; −∞ where it cannot make the path."""
     k = paths.edges
     r2, at_light_end, at_eye_end = _edges(paths)
     area_from_light, area_from_eye = at_eye_end / r2, at_light_end / r2  # of an edge: density per solid angle → area
     area_from_light[:, 0] = np.where(paths.infinite, at_eye_end[:, 0], area_from_light[:, 0])
     area_from_eye[:, 0] = np.where(paths.infinite, 1, area_from_eye[:, 0])
-    to_light, to_eye = paths.to_light.copy(), paths.to_eye.copy()
-    for j in range(1, k):
-        refracted = at_light_end[:, j] / (at_eye_end[:, j - 1] * paths.eta[:, j] ** 2)
-        to_light[:, j] = np.where(paths.delta[:, j], 1, to_light[:, j])
-        to_eye[:, j] = np.where(paths.delta[:, j], refracted, to_eye[:, j])
+    to_light, to_eye = np.where(paths.delta, 1, paths.to_light), np.where(paths.delta, paths.turn, paths.to_eye)
 
     with np.errstate(divide="ignore"):
         from_light = _log_from_light(paths, np.log(to_eye), np.log(area_from_light), at_light_end[:, 0])
@@ -89,8 +89,7 @@ def log_densities(paths: Paths) -> F64:
     for s in range(1, k + 1):  # both ends of the edge that is joined must scatter in other directions, too
         logs[:, s] = np.where(paths.delta[:, s - 1] | paths.delta[:, s], -np.inf, logs[:, s])
     logs[:, 0] = np.where(paths.hittable, logs[:, 0], -np.inf)
-    relative: F64 = logs - logs.max(axis=1, keepdims=True)
-    return relative
+    return logs
 
 
 def _edges(paths: Paths) -> tuple[F64, F64, F64]:

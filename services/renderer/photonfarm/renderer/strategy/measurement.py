@@ -19,7 +19,7 @@ DEFAULT = Candidate(1, 1.0)
 
 GRID = tuple(
     Candidate(c, r)
-    for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25), (1, 1.0), (2, 1.0), (4, 1.0))
+    for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25), (1, 1.0), (2, 1.0), (4, 1.0), (8, 1.0))
 )
 """The candidates of every pilot; those that a scene's content makes pointless are left out."""
 

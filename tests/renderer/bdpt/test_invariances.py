@@ -1,0 +1,62 @@
+"""Quick versions of the invariances; the long ones run in `make bench-stability`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from photonfarm.renderer.bdpt import launches
+from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
+from photonfarm.renderer.stability.invariances import COUNTS, Check, checks
+
+# The oracle's have tests of their own, and more of them: test_oracle.py
+QUICK = [check for check in checks(long=False) if not check.name.startswith("weights-")]
+
+
+# Each right check fails by chance with probability 4e-6 per comparison; the seeds are fixed.
+@pytest.mark.parametrize("check", QUICK, ids=lambda check: check.name)
+def test_an_image_does_not_change_with_what_must_not_matter(check: Check) -> None:
+    found = check.run()
+    assert found.faults == (), f"{check.said}: {found.figures}\nagain: {check.command}"
+
+
+def test_names_are_unique_and_the_long_version_has_all_quick_checks() -> None:
+    long = [check.name for check in checks(long=True)]
+    assert len(set(long)) == len(long)
+    assert {check.name for check in checks(long=False)} <= set(long)
+
+
+def test_all_counts_are_tried() -> None:
+    assert len(COUNTS) == 3 * 4 - 2
+
+
+@pytest.mark.parametrize("connections", [1, 4])
+def test_connections_without_light_paths_are_refused(connections: int) -> None:
+    with pytest.raises((ValueError, RuntimeError), match="connections need light paths"):
+        mi.load_dict({"type": "bdpt", "connections": connections, "light_ratio": 0.0})
+
+
+# ------------------------------------------------ Several launches ------------------------------------------------
+
+
+def test_images_in_one_launch_or_in_several_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = mi.load_dict(HARD_SCENES["plastics"](16), optimize=False)
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4, "light_ratio": 0.3})
+    each = np.concatenate([np.array(bdpt.render_seeds(scene, scene.sensors()[0], [seed], 4)) for seed in range(5)])
+    monkeypatch.setattr(launches, "LAUNCH_PATHS", 2 * 16 * 16 * 4)  # two images at a time, and one left over
+    together = np.array(bdpt.render_seeds(scene, scene.sensors()[0], range(5), 4))
+    np.testing.assert_array_equal(together, each)
+
+
+@pytest.mark.parametrize("light_ratio", [0.3, 1.0])
+def test_an_image_in_parts_has_the_mean_of_the_whole(
+    light_ratio: float, monkeypatch: pytest.MonkeyPatch, renders: Any, assert_equal_means: Any
+) -> None:
+    scene = mi.load_dict(HARD_SCENES["plastics"](16), optimize=False)
+    bdpt = {"type": "bdpt", "max_depth": 4, "light_ratio": light_ratio}
+    whole = renders(scene, bdpt, 32, range(8))
+    monkeypatch.setattr(launches, "LAUNCH_PATHS", 5 * 16 * 16)  # 5 samples of 32, the last launch shorter
+    assert_equal_means(renders(scene, bdpt, 32, range(100, 108)), whole)

@@ -195,8 +195,9 @@ def test_probabilities_do_not_depend_on_the_image_seed() -> None:
 @pytest.mark.parametrize("facing", [1, -1])
 @pytest.mark.parametrize("counts", [(0, 0.0), (1, 1.0)])
 def test_a_wall_between_two_layers_of_cells_is_as_bright_as_it_should_be(
-    facing: int, counts: tuple[int, float], renders: Any, assert_equal_means: Any
+    facing: int, counts: tuple[int, float], renders: Any, assert_equal_means: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(selection, "_MARGIN", (0.0, 0.0))  # so that the wall does lie there
     black = grey(0.0)
     scene = load(
         {

@@ -297,14 +297,19 @@ def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSampl
     )
 
 
-def hit_densities(scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any, active: Any) -> tuple[Any, Any]:
-    """(p_NEE in solid angle, e): this hit's densities under next event estimation at ``origin`` and under emission."""
+def hit_densities(
+    scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any, vertex: Any, active: Any
+) -> tuple[Any, Any]:
+    """(p_NEE in solid angle, e) of this hit of a ray from ``origin``, which was spawned at ``vertex``.
+
+    The light would have been chosen at the vertex itself: the ray's origin may lie in another cell.
+    """
     reference = dr.zeros(mi.Interaction3f)
     reference.p = origin
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
     factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
-    return lights.nee_probability(emitter, origin) * p_direction, lights.emission_factor(emitter) * factor
+    return lights.nee_probability(emitter, vertex) * p_direction, lights.emission_factor(emitter) * factor
 
 
 # ------------------------------------------------ Emission (from y₀) ------------------------------------------------

@@ -30,6 +30,7 @@ class EyeState:
     rng: Any  # Sampler
     ray: Any  # Ray3f: to this vertex, or out of the scene
     arrival: Any  # PreliminaryIntersection3f: where it arrives
+    before: Any  # Point3f: the vertex before, where next event estimation would have chosen its light
     before_ray: Any  # Float: distance from the pinhole to the ray's origin at the first vertex, later 0
     throughput: Any  # Spectrum
     radiance: Any  # Spectrum: the estimate so far
@@ -71,6 +72,7 @@ def trace_eye_paths(
         rng=rng,
         ray=mi.Ray3f(start.ray),
         arrival=arrival,
+        before=mi.Point3f(start.ray.o),
         before_ray=mi.Float(start.before_ray),
         throughput=mi.Spectrum(start.weight),
         radiance=mi.Spectrum(0),
@@ -109,7 +111,7 @@ def _bounce(
 
     if lights is not None:
         emitter = si.emitter(scene, s.active)
-        p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.active & ~first)
+        p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.before, s.active & ~first)
         arrived_dvc = dr.select(depth == 2, 0, dr.select(si.is_valid(), dvc, s.dvc))  # no t=1 for direct light
         w = dr.select(first, 1, weights.hit_emitter(p_direct, p_emission, s.dvcm, arrived_dvc))
         emitted = emitter.eval(si, s.active)
@@ -151,7 +153,9 @@ def _bounce(
 
     # ----------------------------------- Scatter -----------------------------------
 
-    state = replace(s, active=active, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth + 1, before_ray=mi.Float(0))
+    state = replace(
+        s, active=active, before=si.p, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth + 1, before_ray=mi.Float(0)
+    )
     _scatter(state, ctx, si, bsdf, bs, bs_weight, count)
     _roulette(state, options)
     state.arrival = scene.ray_intersect_preliminary(state.ray, active=state.active)

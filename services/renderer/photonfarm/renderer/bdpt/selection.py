@@ -21,6 +21,7 @@ CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell
 _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
+_MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: no wall lies between two cells by its design
 
 
 @dataclass(slots=True)
@@ -61,9 +62,10 @@ def read_selection(pointers: Any, ids: list[int], base: Any, box: Any) -> Select
     ``box`` is the scene's bounding box. Lights with weight 0 are never chosen.
     """
     n, cells = len(ids), CELLS**3
-    low, high = box.min, box.max
-    lower = mi.Point3f(*(dr.opaque(mi.Float, float(low[k])) for k in range(3)))
-    size = mi.Vector3f(*(dr.opaque(mi.Float, max(float(high[k] - low[k]), 1e-6) / CELLS) for k in range(3)))
+    low, extent = box.min, box.extents()
+    lower = mi.Point3f(*(dr.opaque(mi.Float, float(low[k] - _MARGIN[0] * extent[k])) for k in range(3)))
+    share = (1 + sum(_MARGIN)) / CELLS
+    size = mi.Vector3f(*(dr.opaque(mi.Float, max(float(extent[k]) * share, 1e-6)) for k in range(3)))
 
     pair = dr.arange(mi.UInt32, cells * n * _SAMPLES) // _SAMPLES
     cell, light = pair // n, pair % n

@@ -32,7 +32,7 @@ DEPTH = 5
 COUNTS = tuple(Settings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
-"""Scenes with rare bright samples, of which a few renders' own variance tells too little; they are rows of their own."""
+"""Scenes with rare bright samples, of which a few renders say too little; they have rows of their own."""
 _MORE_COUNTS = tuple(name for name in hard_scenes.HARD_SCENES if name not in _SKEWED)
 _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 

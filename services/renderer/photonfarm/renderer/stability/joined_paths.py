@@ -233,7 +233,7 @@ def _hit_weight(scene: Any, lights: Lights, joined: Joined, st: Steps, before: A
     origin = joined.bounces[0].si.p
     si = mi.SurfaceInteraction3f(joined.on_light)
     si.wi = dr.select(si.is_valid(), si.wi, -joined.light.d)
-    p_direct, p_emission = hit_densities(scene, lights, joined.emitter, si, origin, joined.complete)
+    p_direct, p_emission = hit_densities(scene, lights, joined.emitter, si, origin, origin, joined.complete)
     dvc = dr.select(joined.on_light.is_valid(), before[1] / st.cos_left[0], before[1])
     w = weights.hit_emitter(p_direct, p_emission, before[0], 0 if len(joined.bounces) == 1 else dvc)
     return dr.select(joined.light.delta, 0, w)

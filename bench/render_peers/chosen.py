@@ -64,9 +64,7 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
         if candidate not in plugins:
             common = {"type": "bdpt", "record": True, "max_depth": max_depth, "rr_depth": 5}
             settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
-            plugins[candidate] = mi.load_dict(
-                {**common, **settings}
-            )
+            plugins[candidate] = mi.load_dict({**common, **settings})
         image = np.array(mi.render(scene, integrator=plugins[candidate], spp=spp, seed=seed))
         return np.ascontiguousarray(image[..., :3], np.float32)
 

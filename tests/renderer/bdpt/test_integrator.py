@@ -219,3 +219,18 @@ def test_empty_photon_slots_are_marked() -> None:
     assert (photons.power[~empty] > 0).all()
     again = bdpt.trace_photons(load("cove"), seed=3, paths=200, depth=6)
     np.testing.assert_array_equal(photons.position, again.position)
+
+
+@pytest.mark.parametrize(("connections", "light_ratio"), [(0, 0.0), (0, 1.0), (1, 0.25)])
+def test_recorded_launches_are_told_apart(
+    connections: int, light_ratio: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from photonfarm.renderer.bdpt import launches
+
+    monkeypatch.setattr(launches, "LAUNCH_PATHS", 5 * SIZE**2)  # 6 samples are a launch of 5 and one of 1
+    scene = load("cove")
+    settings = {"type": "bdpt", "max_depth": 5, "connections": connections, "light_ratio": light_ratio}
+    recorded, traced = (mi.load_dict({**settings, "record": record}) for record in (True, False))
+    for spp in (1, 5, 1, 6, 3, 5):
+        images = [np.array(it.render(scene, sensor=0, seed=spp, spp=spp)) for it in (recorded, traced)]
+        np.testing.assert_array_equal(*images)

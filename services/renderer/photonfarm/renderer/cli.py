@@ -60,11 +60,13 @@ def preview(spec: str, store: Path, count: int, out: Path) -> None:
 
 @click.command()
 @click.argument("spec")
-@click.option("--seconds", type=click.FloatRange(1), default=60.0, show_default=True, help="CPU time to measure for.")
+@click.option(
+    "--seconds", type=click.IntRange(1, 86400), default=60, show_default=True, help="CPU time to measure for."
+)
 @click.option("--write", is_flag=True, help="Put the settings into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
-def scene_plan(spec: str, seconds: float, write: bool, again: bool, as_json: bool) -> None:
+def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer import backend
     from photonfarm.shared.scene import find_spec, load_spec
@@ -100,6 +102,7 @@ def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int
         scenes = rows.chosen(only, quick=quick)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
+    out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be rendered first
     found = report.examine(
         scenes, quick=quick, seed=seed, failures=out / "failures", tell=partial(click.echo, err=True)
     )

@@ -15,10 +15,8 @@ from .eye_paths import Connectable, trace_eye_paths
 from .film import Images, Splat
 from .launches import Lanes, Launch, launches
 from .light_paths import PathOptions, trace_light_paths
+from .recording import Recorder
 from .scenes import UNBOUNDED, check_scene, depth_limit
-
-RECORDINGS = 16
-"""Kinds of launch kept ready: image sizes, samples per pixel, scenes; the one used last is dropped for a new one."""
 
 
 class BidirectionalPathTracer(mi.SamplingIntegrator):
@@ -43,7 +41,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.connections = int(props.get("connections", 1))
         self.light_ratio = float(props.get("light_ratio", 1.0))
         self._check_parameters()
-        self._trace = dr.freeze(trace, warn_after=1 << 30, limit=RECORDINGS) if props.get("record", False) else trace
+        self._recorder = Recorder(trace) if props.get("record", False) else None
 
     def _check_parameters(self) -> None:
         if self.rr_depth < 1:
@@ -123,8 +121,16 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 own = seeds[launch.first_image : launch.first_image + launch.images]
                 shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
                 lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts)
-                images.add(self._trace(scene, sensor, lights, options, lanes), launch.first_image * pixels)
+                part = self._trace(scene, sensor, lights, options, lanes)
+                images.add(part, launch.first_image * pixels)
             return images
+
+    def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+        if self._recorder is None:
+            return trace(scene, sensor, lights, options, lanes)
+        clipping = (sensor.near_clip(), sensor.far_clip()) if options.traces_light else ()
+        kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping)
+        return self._recorder(kind, scene, sensor, lights, options, lanes)
 
     def _options(self, launch: Launch, pixels: int) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0

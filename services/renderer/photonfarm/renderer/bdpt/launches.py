@@ -80,6 +80,11 @@ class Lanes:
         )  # fmt: skip
 
     @property
+    def kind(self) -> tuple[int, ...]:
+        """The numbers that kernels are made for."""
+        return self.images, self.width, self.height, self.samples, self.light_paths
+
+    @property
     def pixels(self) -> int:
         """Of one image."""
         return self.width * self.height

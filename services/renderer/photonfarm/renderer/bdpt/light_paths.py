@@ -43,6 +43,11 @@ class PathOptions:
     connects: bool  # whether any connection is made
     traces_light: bool  # whether any light path is joined to the lens
 
+    @property
+    def kind(self) -> tuple[int, ...]:
+        """The numbers that kernels are made for."""
+        return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light
+
 
 @dataclass(slots=True)
 class LightVertices:

@@ -96,7 +96,7 @@ def calibrate(method: Method, budgets_s: tuple[float, ...], clock: str) -> Calib
     per_sample = max((seconds - least) / (spp - 1) if spp > 1 else least, 1e-9)
     fixed = max(0.0, least - per_sample)
     chosen = tuple(spp if b == target else max(1, round((b - fixed) / per_sample)) for b in budgets_s)
-    for other in set(chosen) - {spp}:
+    for other in set(chosen):
         method.render(1, other)
     return Calibration(chosen, compile_s, fixed, per_sample)
 

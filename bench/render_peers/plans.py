@@ -32,7 +32,9 @@ PLANS: dict[str, ScenePlan] = {
     "glass_caustic": ScenePlan(
         "glass_caustic", 8, ("bdpt",), "light seen twice through the ball is found by chance alone, by every method"
     ),
-    "floor_caustic": ScenePlan("floor_caustic", 8, ("bdpt",), "a caustic alone: the ball is out of the picture"),
+    "floor_caustic": ScenePlan(
+        "floor_caustic", 8, ("bdpt", "ptracer"), "a caustic alone: the ball is out of the picture"
+    ),
     "mirror_room": ScenePlan("mirror_room", 8),
     "hundred_lights": ScenePlan("hundred_lights", 8),
 }

@@ -234,3 +234,24 @@ def test_recorded_launches_are_told_apart(
     for spp in (1, 5, 1, 6, 3, 5):
         images = [np.array(it.render(scene, sensor=0, seed=spp, spp=spp)) for it in (recorded, traced)]
         np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("name", ["textured_light", "many_lights", "rotated_envmap", "bump_floor"])
+def test_a_recorded_render_is_the_same_bit_by_bit(name: str) -> None:
+    scene, again = load(name), load(name)  # its own for each: what one render makes ready must not help the other
+    recorded, traced = (mi.load_dict({"type": "bdpt", "max_depth": 5, "record": record}) for record in (True, False))
+    for seed in range(3):
+        np.testing.assert_array_equal(
+            np.array(recorded.render(scene, sensor=0, seed=seed, spp=2)),
+            np.array(traced.render(again, sensor=0, seed=seed, spp=2)),
+        )
+
+
+def test_what_cannot_be_recorded_is_rendered_all_the_same() -> None:
+    described = HARD_SCENES["cove"](SIZE)
+    described["sensor"] = {**described["sensor"], "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}
+    scene = mi.load_dict(described, optimize=False)
+    recorded, traced = (mi.load_dict({"type": "bdpt", "max_depth": 5, "record": record}) for record in (True, False))
+    for seed in range(3):
+        images = [np.array(it.render(scene, sensor=0, seed=seed, spp=2)) for it in (recorded, traced)]
+        np.testing.assert_array_equal(*images)

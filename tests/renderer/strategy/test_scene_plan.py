@@ -53,7 +53,7 @@ def measurement(chosen: Candidate) -> Measurement:
         film=Film(width=16, height=16), spp=2, views=3, max_depth=3, modelled=("lights: 1 area",), left_out=(),
         rows=(row(0, 0.0, 1.0, 0.01, 0.01), row(0, 1.0, 0.5, 0.02, 0.02), row(1, 1.0, 0.8, 0.02, 0.04)),
         chosen=(chosen.connections, chosen.light_ratio), reasons=("measured",), filled=(1.0, 0.9, 0.8),
-        near=(1.0, 0.9, 0.8), power=(0.7, 0.295, 0.005), spent_s=5.0, compiling_s=1.0,
+        near=(1.0, 0.9, 0.8), power=(0.7, 0.295, 0.005), asked_s=60.0, spent_s=5.0, compiling_s=1.0,
     )  # fmt: skip
 
 

@@ -240,8 +240,7 @@ def _scene_sphere(scene: Any) -> tuple[Any, Any]:
     return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
 
 
-# ------------------------------------------- Next event estimation (y₀ from x)
-# -------------------------------------------
+# ------------------------------------- Next event estimation (y₀ from x) -------------------------------------
 
 
 @dataclass(slots=True)
@@ -337,7 +336,7 @@ def sample_emission(lights: Lights, rng: Any, path: Any, paths: Any) -> Emission
     index = _choose_start(lights, rng)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
     factor = lights.emission_factor(emitter)
-    u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng.next_1d())
+    u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng)
     out = Emission(
         ray=dr.zeros(mi.Ray3f, n),
         throughput=mi.Spectrum(0),

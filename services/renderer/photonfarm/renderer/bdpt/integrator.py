@@ -24,7 +24,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     - ``max_depth`` (int, default -1): longest path in edges, -1 unbounded; 1 shows lights only, 2 direct light. As in
       ``path``.
-    - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, on either side. As in ``path``.
+    - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; light paths that have
+      lost more than two thirds of their throughput meet it before.
     - ``connections`` (int ≥ 0, default 1): light vertices each eye vertex is connected to. Needs ``light_ratio`` > 0.
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
@@ -86,7 +87,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
-        seed = int(seed if isinstance(seed, int) else seed[0]) & 0xFFFFFFFF
+        seed = int(seed if isinstance(seed, int) else seed[0])
         images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count())
         with dr.suspend_grad():
             film.prepare([])
@@ -111,6 +112,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
         with dr.suspend_grad():
+            seeds = [seed & 0xFFFFFFFF for seed in seeds]
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
             lights = read_lights(scene) if scene.emitters() else None

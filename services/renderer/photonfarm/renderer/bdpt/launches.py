@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 LAUNCH_PATHS = 1 << 20
-"""Most eye paths traced at once, unless an image has more pixels: about 140 bytes for each with its light path."""
+"""Most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +27,9 @@ class Launch:
 
 def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator[Launch]:
     """Several images together where they are small, each by itself in several launches where they are not."""
-    together = max(1, min(images, LAUNCH_PATHS // (pixels * spp)))
-    samples = max(1, min(spp, LAUNCH_PATHS // pixels))
+    paths = int(pixels * max(1.0, light_ratio))  # for a sample of each pixel
+    together = max(1, min(images, LAUNCH_PATHS // (paths * spp)))
+    samples = max(1, min(spp, LAUNCH_PATHS // paths))
     for first_image in range(0, images, together):
         for first_sample in range(0, spp, samples):
             last_sample = min(first_sample + samples, spp)

@@ -93,21 +93,24 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> Any:
     return mi.UInt32(np.concatenate(table).tolist())  # a list: Dr.Jit compiles again for each alignment of numpy's
 
 
-def along_curve(lane: Any, n: Any, u: Any) -> Any:
+def along_curve(lane: Any, n: Any, rng: Sampler) -> Any:
     """A stratified point in [0, 1)² (Point2f) for each of ``n`` lanes, neighbours in space for neighbours in number.
 
     Lane k gets a uniform point of the k-th piece of Morton's curve, cut into n equal pieces (He and Owen, *Extensible
-    grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together.
+    grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together. The
+    place along the curve has 32 bits, and so 16 for each coordinate: the bits below those are independent.
     """
-    length = mi.UInt32((mi.Float64(lane) + mi.Float64(u)) * (4294967296.0 / mi.Float64(n)))
-    return mi.Point2f(_unit(dr.brev(_every_other_bit(length))), _unit(dr.brev(_every_other_bit(length >> 1))))
+    length = mi.UInt32((mi.Float64(lane) + mi.Float64(rng.next_1d())) * (4294967296.0 / mi.Float64(n)))
+    below = mi.Point2f(rng.next_independent(), rng.next_independent())
+    cell = mi.Point2f(mi.Float(_every_other_bit(length)), mi.Float(_every_other_bit(length >> 1)))
+    return dr.minimum((cell + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
 
 
 def _every_other_bit(x: Any) -> Any:
-    """The bits of even number, moved to the upper half."""
+    """The bits of even number, moved together: 16 bits."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits
-    return x << 16
+    return x
 
 
 def _mix(x: Any) -> Any:
@@ -121,7 +124,7 @@ def _mix(x: Any) -> Any:
 
 
 def _scramble(x: Any, seed: Any) -> Any:
-    """Owen's scramble of numbers whose bits are reversed: each bit flips by a hash of the bits below it."""
+    """A scramble of Owen's kind for numbers whose bits are reversed: bits flip by a hash of the bits below them."""
     x = x + seed
     x ^= x * 0x6C50B47C
     x ^= x * 0xB82F1E52

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
+log = logging.getLogger(__name__)
+
 RECORDINGS = 16
 """Kinds of launch kept ready: the oldest makes room for a new one."""
+
+ATTEMPTS = 2
 
 
 class Recorder:
@@ -21,17 +27,40 @@ class Recorder:
     def __init__(self, function: Callable[..., Any]) -> None:
         """Record calls of `function`."""
         self._function = function
-        self._recorded: dict[Hashable, tuple[Any, Any, Any]] = {}
+        self._recorded: dict[Hashable, _Recording] = {}
 
     def __call__(self, kind: Hashable, scene: Any, sensor: Any, *arguments: Any) -> Any:
         """The function's result. `kind` holds every number that the kernels are made for.
 
-        The scene and the sensor of a recording are kept, so that no others are taken for them.
+        What cannot be recorded is called as it is: for good if a second attempt fails too (lenses); Mitsuba makes some
+        tables when they are first asked for, which fails one attempt. The scene and the sensor of a recording are kept,
+        so that no others are taken for them.
         """
         kind = (id(scene), id(sensor), kind)
         if kind not in self._recorded:
             while len(self._recorded) >= RECORDINGS:
                 self._recorded.pop(next(iter(self._recorded)))
-            # Two variants at most: Dr.Jit records once more where it took data for a constant
-            self._recorded[kind] = dr.freeze(self._function, warn_after=1 << 30, limit=2), scene, sensor
-        return self._recorded[kind][0](scene, sensor, *arguments)
+            self._recorded[kind] = _Recording(_frozen(self._function), scene, sensor)
+        recording = self._recorded[kind]
+        if recording.failures < ATTEMPTS:
+            try:
+                return recording.call(scene, sensor, *arguments)
+            except RuntimeError as error:
+                log.debug("not recorded: %s", error)
+                recording.failures += 1
+                recording.call = _frozen(self._function)
+        return self._function(scene, sensor, *arguments)
+
+
+@dataclass(slots=True)
+class _Recording:
+    call: Callable[..., Any]
+    scene: Any
+    sensor: Any
+    failures: int = 0
+
+
+def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, recorded. Two variants at most: Dr.Jit records once more where it took data for a constant."""
+    frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
+    return frozen

@@ -20,7 +20,7 @@ _LIGHTS = {
     "Projector": "projector",
     "DirectionalEmitter": "directional",
 }
-_BRIGHTNESS = ("radiance.", "intensity.", "irradiance.", "data", "scale")
+_BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
 _CAMERAS = {"PerspectiveCamera": "pinhole", "ThinLensCamera": "thin lens"}
 """Cameras that light paths can be joined to."""
 
@@ -61,12 +61,18 @@ def read(scene: Any, camera: Any) -> Content:
 
 
 def _shines(emitter: Any) -> bool:
-    """Whether none of the parameters that scale a light is zero all over."""
+    """Whether any of its brightness is above zero, and its scale and its image are, if it has them."""
     import mitsuba as mi
 
     parameters = mi.traverse(emitter)
-    names = [name for name in parameters.keys() if name.startswith(_BRIGHTNESS) and not name.endswith("to_uv")]  # noqa: SIM118 - no mapping
-    return all(np.any(np.array(parameters[name], np.float64) > 0) for name in names)
+    names = [name for name in parameters.keys() if not name.endswith("to_uv")]  # noqa: SIM118 - no mapping
+    factors = [[name] for name in names if name in ("data", "scale")]
+    brightness = [name for name in names if name.startswith(_BRIGHTNESS)]
+    return all(
+        any(np.any(np.array(parameters[name], np.float64) > 0) for name in factor)
+        for factor in [*factors, brightness]
+        if factor
+    )
 
 
 def _is_specular(shape: Any) -> bool:

@@ -70,6 +70,7 @@ class Measurement(Frozen):
     filled: tuple[float, ...]  # of light_reach
     near: tuple[float, ...]
     power: tuple[float, ...]
+    asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time of everything
     compiling_s: float  # of it: loading, kernels, and what the images are weighted with
 
@@ -153,6 +154,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
         filled=reach.filled,
         near=reach.near,
         power=reach.power,
+        asked_s=seconds,
         spent_s=spent,
         compiling_s=spent - choice.spent_s + choice.scouting_s,
     )

@@ -20,10 +20,12 @@ significantly more, the candidate is charged with
 
     missed = mean over blocks of max over d of  N · max(0, (m_d − m)² − z²·(s² + s_d²)),    m_d > m,
 
-s the standard errors of the block means: nothing while a deficit is within z = 4 standard errors, and growing from 0
-beyond. It is what is least plausible (an event missed by N samples is as rare as 1/N, or rarer), so that it understates
-what is missed. One lucky sample does not convict others: a mean that rests on one sample has a standard error of its
-own size. The blocks are tried at several sizes, since light may be missing in a spot or all over; the largest counts.
+N the pixels behind the mean that fewer are behind (what little evidence there is against a candidate does not grow with
+the candidate's own images), s the standard errors of the block means: nothing while a deficit is within z = 4 standard
+errors, and growing from 0 beyond. It is what is least plausible (an event missed by N samples is as rare as 1/N, or
+rarer), so that it understates what is missed. One lucky sample does not convict others: a mean that rests on one sample
+has a standard error of its own size. The blocks are tried at several sizes, since light may be missing in a spot or all
+over; the largest counts.
 """
 
 from __future__ import annotations
@@ -124,7 +126,8 @@ def _missed_in_blocks(tally: Tally, others: Sequence[Tally], blocks: int) -> flo
     mean, variance, pixels = tally.block_mean(blocks)
     charge = np.zeros_like(mean)
     for other in others:
-        more, more_variance, _ = other.block_mean(blocks)
+        more, more_variance, more_pixels = other.block_mean(blocks)
         deficit = np.maximum(more - mean, 0)
-        charge = np.maximum(charge, deficit**2 - SIGNIFICANT**2 * (variance + more_variance))
-    return float(pixels * charge.mean())
+        unlikely = np.maximum(deficit**2 - SIGNIFICANT**2 * (variance + more_variance), 0)
+        charge = np.maximum(charge, min(pixels, more_pixels) * unlikely)
+    return float(charge.mean())

@@ -18,6 +18,10 @@ LEAST_SAMPLES = 0.7
 """Samples per pixel that the present cost must pay for: rounded up to 1, they cost at most 1.4 times as much."""
 
 
+SECONDS = 60.0
+"""CPU time of a pilot, unless another is asked for."""
+
+
 @dataclass(frozen=True, slots=True)
 class Saving:
     """How much sooner the settings of a plan reach the error of other settings."""
@@ -73,12 +77,12 @@ class Plan:
         }  # fmt: skip
 
 
-def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, talk: Talk) -> Plan:
-    """The plan of a spec, from its measurement in the cache if there is one and unless it is wanted again."""
+def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float | None, again: bool, talk: Talk) -> Plan:
+    """The plan of a spec: from the cache, if it is there, took no less than `seconds`, and is not wanted again."""
     found = None if again else cache.find(spec)
-    if found is not None and _knows(found, spec):
+    if found is not None and found.asked_s >= (seconds or 0) and _knows(found, spec):
         return plan_of(spec, found, cached=True)
-    measurement = measure(spec, beside, seconds, talk)
+    measurement = measure(spec, beside, seconds or SECONDS, talk)
     try:
         cache.keep(spec, measurement)
     except OSError as error:

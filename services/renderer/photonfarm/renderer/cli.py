@@ -61,12 +61,12 @@ def preview(spec: str, store: Path, count: int, out: Path) -> None:
 @click.command()
 @click.argument("spec")
 @click.option(
-    "--seconds", type=click.IntRange(1, 86400), default=60, show_default=True, help="CPU time to measure for."
+    "--seconds", type=click.IntRange(1, 86400), show_default="60, or what is kept", help="CPU time to measure."
 )
 @click.option("--write", is_flag=True, help="Put the settings into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
-def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
+def scene_plan(spec: str, seconds: int | None, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer import backend
     from photonfarm.shared.scene import find_spec, load_spec

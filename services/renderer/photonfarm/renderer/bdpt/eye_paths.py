@@ -20,6 +20,7 @@ from .loops import traced_once
 from .randomness import SHIFTS
 
 _MAX_THROUGHPUT_KEPT = 0.95
+_NEAR_VERTICES = 2
 
 
 @dataclass(slots=True)
@@ -214,14 +215,20 @@ class OwnVertex:
 
 
 def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex) -> Any:
-    """Sum over n_C connections to kept vertices of n_C light paths, as radiance (Spectrum)."""
+    """Mean over connections to kept vertices of other light paths, as radiance (Spectrum).
+
+    The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
+    """
+    later = (options.connections + 1) // 2
+    near = own.depth <= _NEAR_VERTICES
     total = mi.Spectrum(0)
     for k in range(options.connections):
         row = connectable.image * SHIFTS + own.depth % SHIFTS
-        shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, own.active)
+        active = own.active if k < later else own.active & near
+        shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
         path = connectable.image * connectable.paths + (connectable.lane + shift) % connectable.paths
-        total += _connect(scene, options, connectable, own, path)
-    return total / options.connections
+        total += _connect(scene, options, connectable, replace(own, active=active), path)
+    return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
 
 
 def _connect(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex, path: Any) -> Any:

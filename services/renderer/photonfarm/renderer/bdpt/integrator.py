@@ -26,7 +26,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
       ``path``.
     - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; light paths that have
       lost more than two thirds of their throughput meet it before.
-    - ``connections`` (int ≥ 0, default 1): light vertices each eye vertex is connected to. Needs ``light_ratio`` > 0.
+    - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
+      to half as many. Needs ``light_ratio`` > 0.
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays

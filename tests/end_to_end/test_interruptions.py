@@ -53,7 +53,7 @@ def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_be
         farm = start(60, steps=1_000_000)
         wait_until(lambda earlier=before: logged() > earlier)  # the trainer is at work
         farm.send_signal(number)
-        farm.wait(60)
+        farm.wait(150)  # a busy machine compiles kernels for a minute, and a worker ends its job first
         assert farm.returncode != 0
         wait_until(lambda: not processes_in(tmp_path), 60)
 

@@ -33,13 +33,20 @@ def wait_until(reached: Callable[[], object], seconds: float = 120) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc")
+def interruptible() -> None:
+    """A shell starts what it runs in the background deaf to SIGINT, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_behind(
     tmp_path: Path, small_room: Path
 ) -> None:
     def start(modifications: int, steps: int) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "photonfarm.shared.cli", "up", small_room.name, "--shard-rows", "4"]
         command += ["--modifications", str(modifications), "--train-steps", str(steps)]
-        return subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True)
+        return subprocess.Popen(
+            command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True, preexec_fn=interruptible
+        )
 
     def markers() -> int:
         return len(list(tmp_path.glob("store/scenes/*/committed/*.json")))

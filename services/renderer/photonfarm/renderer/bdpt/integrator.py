@@ -149,7 +149,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 
 def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
-    """Trace the light paths and the eye paths of a launch. Python runs once for each kind of launch: see `freeze`."""
+    """Trace the light paths and the eye paths of a launch. Where it is recorded, Python runs once for each kind."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
     if lights is not None and options.traces_light:

@@ -37,7 +37,7 @@ class PathOptions:
 
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
-    connections: int  # n_C: connections made at each eye vertex
+    connections: int  # n_C: see eye_paths.connect_all
     count: Any  # Float: technique count of connections in the weights (see integrator.connection_count)
     light_ratio: Any  # Float: n_T, light paths per eye path
     connects: bool  # whether any connection is made

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,7 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """
 import importlib.util, os, sys
-from photonfarm.shared.store import Store, durable
+from photonfarm.shared.store import Store
 from photonfarm.renderer.jobs import ShardRenderer
 spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
 analytic = importlib.util.module_from_spec(spec)
@@ -55,7 +56,8 @@ POINTS = {
     "before the marker": ("commit", "link", 10, "before"),
     "after the marker": ("commit", "link", 10, "after"),
     "while the base is written": ("base", "fsync", 3, "before"),
-    "after the base, before its marker": ("base", "link", 1, "before"),
+    "before the base gets its name": ("base", "rename", 1, "before"),
+    "after the base has got its name": ("base", "rename", 1, "after"),
 }
 
 
@@ -86,7 +88,7 @@ def test_a_writer_killed_at_any_point_leaves_all_or_nothing(
         renderer.render(scene.scene_id, job)
     assert stored_bytes(scene) == clean_bytes(1)
     Store(root).sweep(stray_age_s=0)
-    assert list((scene.folder / "tmp").iterdir()) == []
+    assert list(scene.storage.local("tmp").iterdir()) == []
 
 
 @pytest.mark.parametrize("point", [("fsync", 5, "before"), ("rename", 1, "before"), ("rename", 1, "after")])
@@ -101,22 +103,22 @@ def test_a_submitter_killed_at_any_point_leaves_a_whole_plan_or_none(
     assert scene.progress().planned_samples == 4 + 8  # 4 of the plan before, of which the request names 1
     assert len(scene.plans()) == 2
     Store(root).sweep(stray_age_s=0)
-    assert list((scene.folder / "tmp").iterdir()) == []
+    assert list(scene.storage.local("tmp").iterdir()) == []
 
 
 def test_temporary_files_of_the_living_and_of_other_machines_are_left_alone(
     planned: Callable[..., SceneStore],
 ) -> None:
-    from photonfarm.shared.store import durable
-
     scene = planned(1)
-    mine = durable.temporary(scene.folder / "tmp")
-    foreign = scene.folder / "tmp/another-machine-1-0-0.partial"
-    namesake = scene.folder / f"tmp/{os.uname().nodename}-2-0-4194999-0-0.partial"  # of host "…-2", or a container
+    mine = scene.storage.part()
+    foreign = mine.with_name("another-machine-1-0-0.partial")
+    namesake = mine.with_name(f"{os.uname().nodename}-2-0-4194999-0-0.partial")  # of host "…-2", or a container
     dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-4194999-"))  # no process has this number
     for path in (mine, foreign, namesake, dead):
         path.write_bytes(b"half a file")
-    assert Store(scene.folder.parent.parent).sweep(stray_age_s=0) == 1
+    assert scene.storage.sweep(stray_age_s=0) == 1
     assert not dead.exists()
-    assert Store(scene.folder.parent.parent).sweep(stray_age_s=0) == 0
-    assert durable.sweep(scene.folder / "tmp", now_s=foreign.stat().st_mtime + 2 * 86400) == 3
+    assert scene.storage.sweep(stray_age_s=0) == 0
+    for path in (mine, foreign, namesake):
+        os.utime(path, (0, time.time() - 2 * 86400))
+    assert scene.storage.sweep(stray_age_s=0) == 3

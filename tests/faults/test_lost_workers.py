@@ -76,7 +76,7 @@ def test_two_workers_under_a_hail_of_kills_complete_the_plan_bit_for_bit(
     assert kills >= 4
     Store(root).sweep(stray_age_s=0)
     assert_complete(scene, stored_bytes(scene), clean_bytes(40))
-    assert list((scene.folder / "tmp").iterdir()) == []
+    assert list(scene.storage.local("tmp").iterdir()) == []
 
 
 def test_a_redis_that_dies_and_comes_back_empty_delays_and_loses_nothing(

@@ -98,8 +98,8 @@ def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
     """The other scene's job, queued by someone else, cannot be stored: that scene's failure and not the worker's."""
     store = Store(tmp_path / "store")
     other = store.scene(store.plan(analytic.small_spec(points=17), Request(modifications=6), shard_rows=3).scene_id)
-    (other.folder / "tmp").rmdir()
-    (other.folder / "tmp").write_text("a file where the folder should be")
+    other.storage.local("tmp").rmdir()
+    other.storage.local("tmp").write_text("a file where the folder should be")
     queue.reconcile(store, connect(server.url), scene_id=other.scene_id, limit=1)
     run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
     assert scene.missing_jobs() == []
@@ -142,12 +142,12 @@ def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
     analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     scene.write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
-    (scene.folder / "tmp").rmdir()
-    (scene.folder / "tmp").write_text("a file where the folder should be")
+    scene.storage.local("tmp").rmdir()
+    scene.storage.local("tmp").write_text("a file where the folder should be")
     with pytest.raises(StoreError, match="cannot commit job"):
         run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
     assert queue_status(connect(server.url)).failed == {}
-    (scene.folder / "tmp").unlink()
+    scene.storage.local("tmp").unlink()
     run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
 

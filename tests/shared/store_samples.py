@@ -1,14 +1,24 @@
 """A small scene and made-up outputs for the tests of plan and store."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
 from photonfarm.shared.scene import SceneSpec, parse_spec
-from photonfarm.shared.store import Figures, JobOutputs, SceneStore
+from photonfarm.shared.store import Figures, SceneStore
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """All that a job renders, by row number."""
+
+    radiance: dict[int, F32]
+    buffers: dict[int, ViewBuffers]
+    photons: dict[int, Photons]
 
 
 def small_spec(**changes: Any) -> SceneSpec:
@@ -23,11 +33,11 @@ def small_spec(**changes: Any) -> SceneSpec:
     return parse_spec({**described, **changes}, where="test")
 
 
-def outputs(scene: SceneStore, job: int) -> JobOutputs:
+def outputs(scene: SceneStore, job: int) -> Outputs:
     """Outputs of the right rows and shapes, a function of the row numbers."""
     rows, spec = scene.job_rows(job), scene.spec
     size = (spec.film.height, spec.film.width)
-    return JobOutputs(
+    return Outputs(
         {s.row: values(s.row, (2, *size, 3)) for s in rows.samples},
         {
             row: ViewBuffers(values(row, size), values(row + 1, (*size, 3)), values(row + 2, (*size, 3)))
@@ -61,7 +71,19 @@ def base() -> tuple[Geometry, BasePointCloud]:
     return geometry, BasePointCloud(corners, corners, corners, corners, group, face)
 
 
+def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES) -> bool:
+    """Hand a job's outputs to the store, and commit them."""
+    with scene.job_writer(job) as out:
+        for row, photons_ in given.photons.items():
+            out.photons(row, photons_)
+        for row, buffers in given.buffers.items():
+            out.buffers(row, buffers)
+        for row, halves in given.radiance.items():
+            out.radiance(row, halves)
+        return out.commit(figures)
+
+
 def commit_all(scene: SceneStore) -> None:
     """Commit every job that is missing."""
     for job in scene.missing_jobs():
-        assert scene.commit(job, outputs(scene, job), FIGURES)
+        assert commit(scene, job, outputs(scene, job))

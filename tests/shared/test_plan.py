@@ -196,4 +196,4 @@ for modifications in range(1, 13):
     plans = scene.plans()
     assert [plan.number for plan in plans] == list(range(len(plans)))
     assert all(a.first_job + a.jobs == b.first_job for a, b in pairwise(plans))
-    assert not list((scene.folder / "tmp").iterdir())
+    assert not list(scene.storage.local("tmp").iterdir())

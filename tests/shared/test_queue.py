@@ -138,7 +138,7 @@ def queued(connection: redis.Redis) -> list[str]:
 
 
 def test_everything_missing_is_queued_once(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
-    scene.commit(3, samples.outputs(scene, 3), samples.FIGURES)
+    samples.commit(scene, 3, samples.outputs(scene, 3))
     assert reconcile(store, connection) == 9
     assert queued(connection) == [job_name(scene.scene_id, job) for job in range(10) if job != 3]
     assert reconcile(store, connection) == 0

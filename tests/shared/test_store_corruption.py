@@ -20,7 +20,7 @@ def scene(tmp_path: Path) -> SceneStore:
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=4), shard_rows=4).scene_id)
     given = samples.outputs(scene, 0)
     given.radiance[3][0, 0, 0, 0] = 1e9  # one row in radiance_wide
-    scene.commit(0, given, samples.FIGURES)
+    samples.commit(scene, 0, given)
     scene.write_base(*samples.base())
     return scene
 
@@ -110,7 +110,7 @@ def test_files_without_a_marker_are_not_samples_and_damaged_ones_are_replaced_by
     whole = path.read_bytes()
     for damaged in (whole[: len(whole) // 2], whole[:5] + b"?" + whole[6:]):
         path.write_bytes(damaged)
-        scene.commit(0, samples.outputs(scene, 0), samples.FIGURES)
+        samples.commit(scene, 0, samples.outputs(scene, 0))
         assert path.read_bytes() == whole
         read_everything(scene)
         marker.unlink()

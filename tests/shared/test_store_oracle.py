@@ -27,7 +27,7 @@ def scene(tmp_path: Path) -> SceneStore:
         given = samples.outputs(scene, job)
         if job == 1:
             given.radiance[9][0, 0, 0, 0] = 1e9
-        scene.commit(job, given, samples.FIGURES)
+        samples.commit(scene, job, given)
     scene.write_base(*samples.base())
     return scene
 

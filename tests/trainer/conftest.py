@@ -21,7 +21,7 @@ from photonfarm.shared.modification import Modification, sample_modification
 from photonfarm.shared.pointcloud import rebuild, sample_surface
 from photonfarm.shared.records import F32, STATIC, BasePointCloud, Geometry, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store.writer import Figures, JobOutputs, SceneStore, Store
+from photonfarm.shared.store import Figures, SceneStore, Store
 from photonfarm.shared.view import Camera, View, sample_view
 from photonfarm.trainer.settings import NetworkSettings, TrainSettings
 
@@ -219,15 +219,15 @@ class AnalyticSource:
 
 def commit_job(scene: SceneStore, job: int) -> bool:
     """Write one job of a store, its images analytic; as a render worker does."""
-    rows = scene.job_rows(job)
-    images, buffers = {}, {}
-    for sample in rows.samples:
-        clean, seen = render(scene.spec, rows.modifications[sample.modification_row], rows.views[sample.view_row])
-        images[sample.row] = noisy(clean, sample.row, 1.0)
-        if sample.view_row in rows.new_views:
-            buffers[sample.view_row] = seen
-    figures = Figures(core_s=0.5, wall_s=0.6, redrawn=0, worker="test", versions={"test": "1"})
-    return scene.commit(job, JobOutputs(images, buffers, {}), figures)
+    rows, viewed = scene.job_rows(job), set()
+    with scene.job_writer(job) as out:
+        for sample in rows.samples:
+            clean, seen = render(scene.spec, rows.modifications[sample.modification_row], rows.views[sample.view_row])
+            out.radiance(sample.row, noisy(clean, sample.row, 1.0))
+            if sample.view_row in rows.new_views - viewed:
+                out.buffers(sample.view_row, seen)
+                viewed.add(sample.view_row)
+        return out.commit(Figures(core_s=0.5, wall_s=0.6, redrawn=0, worker="test", versions={"test": "1"}))
 
 
 def noisy(clean: F32, seed: int, noise: float) -> F32:

@@ -21,8 +21,7 @@ from photonfarm.shared.estimate import stated
 from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import SCENES_VARIABLE, find_spec
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.durable import store_errors
+from photonfarm.shared.store import Store, store_errors
 from photonfarm.shared.submission import submit
 
 POLL_S = 0.5

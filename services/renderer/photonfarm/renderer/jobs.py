@@ -22,7 +22,7 @@ from photonfarm.shared.keys import Key, seed_of
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
 from photonfarm.shared.scene import SceneSpec, parse_spec
-from photonfarm.shared.store import Figures, JobOutputs, JobRows, SampleRow, SceneStore, Store
+from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 from photonfarm.shared.view import View
 
 ATTEMPTS = 3
@@ -110,15 +110,16 @@ class ShardRenderer:
         wall, core = time.monotonic(), time.process_time()
         if not stored.has_base():
             stored.write_base(*scene.base())
-        outputs, redrawn = _Rendering(scene, scene_id).run(stored.job_rows(job))
-        figures = Figures(
-            core_s=time.process_time() - core,
-            wall_s=time.monotonic() - wall,
-            redrawn=redrawn,
-            worker=self._worker,
-            versions=versions(),
-        )
-        return stored.commit(job, outputs, figures)
+        with stored.job_writer(job) as out:
+            redrawn = _Rendering(scene, scene_id, out).run(stored.job_rows(job))
+            figures = Figures(
+                core_s=time.process_time() - core,
+                wall_s=time.monotonic() - wall,
+                redrawn=redrawn,
+                worker=self._worker,
+                versions=versions(),
+            )
+            return out.commit(figures)
 
     def _scene(self, scene_id: str) -> tuple[SceneStore, SceneRenderer]:
         if scene_id in self._scenes:
@@ -167,27 +168,29 @@ def versions() -> Mapping[str, str]:
 class _Rendering:
     """One pass over a job's samples: each modification applied once, each view's buffers made once."""
 
-    def __init__(self, scene: SceneRenderer, scene_id: str) -> None:
+    def __init__(self, scene: SceneRenderer, scene_id: str, out: JobWriter) -> None:
         self._scene = scene
         self._scene_id = scene_id
+        self._out = out
         self._redrawn = 0
 
-    def run(self, rows: JobRows) -> tuple[JobOutputs, int]:
-        """The job's outputs, and how many renders were thrown away."""
-        outputs = JobOutputs({}, {}, {})
+    def run(self, rows: JobRows) -> int:
+        """Hand every row of the job to its writer; how many renders were thrown away."""
+        viewed: set[int] = set()
         for modification_row, samples in groupby(rows.samples, key=lambda sample: sample.modification_row):
             modification = rows.modifications[modification_row]
             self._scene.apply(modification)
             if modification_row in rows.new_modifications:
                 photons = self._photons(modification.key(self._scene_id))
                 if photons is not None:
-                    outputs.photons[modification_row] = photons
+                    self._out.photons(modification_row, photons)
             for sample in samples:
                 view = rows.views[sample.view_row]
-                if sample.view_row in rows.new_views and sample.view_row not in outputs.buffers:
-                    outputs.buffers[sample.view_row] = self._buffers(sample, view)
-                outputs.radiance[sample.row] = self._halves(sample, view)
-        return outputs, self._redrawn
+                if sample.view_row in rows.new_views - viewed:
+                    self._out.buffers(sample.view_row, self._buffers(sample, view))
+                    viewed.add(sample.view_row)
+                self._out.radiance(sample.row, self._halves(sample, view))
+        return self._redrawn
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """They know no seed, so that another try would not help."""

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 
 from photonfarm.shared.errors import SpecError, StoreError
-from photonfarm.shared.store.durable import store_errors, sync_folder
+from photonfarm.shared.store import store_errors
+from photonfarm.shared.store.local import sync
 
 FORMAT = 1
 
@@ -32,7 +33,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-        sync_folder(path.parent)
+        sync(path.parent)
 
 
 def load(path: Path) -> dict[str, Any]:

@@ -13,8 +13,7 @@ import torch
 
 from photonfarm.shared.errors import IncompleteError, StoreError
 from photonfarm.shared.records import F32
-from photonfarm.shared.store.status import SceneStatus, store_status
-from photonfarm.shared.store.writer import Store
+from photonfarm.shared.store import SceneStatus, Store, store_status
 from photonfarm.trainer import checkpoint, metrics_log
 from photonfarm.trainer.dataset import SampleSource
 from photonfarm.trainer.evaluation import (

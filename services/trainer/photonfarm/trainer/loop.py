@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError
-from photonfarm.shared.store.durable import store_errors
+from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import SampleSource
 from photonfarm.trainer.evaluation import batches, measure, network_predictor

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.store.durable import store_errors
+from photonfarm.shared.store import store_errors
 
 
 class MetricsLog:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.store.durable import store_errors
+from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.figures import evaluate, production, summary, validations
 from photonfarm.trainer.loop import CHECKPOINT, read_settings

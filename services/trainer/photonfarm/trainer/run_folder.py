@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from photonfarm.shared.errors import StoreError
-from photonfarm.shared.store.durable import store_errors
+from photonfarm.shared.store import store_errors
 
 LOCK = "lock"
 

@@ -16,13 +16,12 @@ from photonfarm.shared.store.reader import Sample, SceneReader
 class StoreSource:
     """A `SampleSource` over `SceneReader`; scene and store may appear later."""
 
-    def __init__(self, root: Path, scene_id: str) -> None:
+    def __init__(self, root: str | Path, scene_id: str) -> None:
         self._reader = SceneReader(root, scene_id)
-        self._folder = root / "scenes" / scene_id
 
     def ready(self) -> bool:
         """Whether spec and base are there; they come with the scene's first job."""
-        return (self._folder / "spec.json").is_file() and (self._folder / "base.json").is_file()
+        return self._reader.is_begun
 
     @property
     def spec(self) -> SceneSpec:

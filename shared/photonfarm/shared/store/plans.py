@@ -5,7 +5,6 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import UNUSED, PlannedRows, Request
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import schema
+from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.view import View
 
 NAME_DIGITS = 6
@@ -29,12 +29,17 @@ class StoredPlan:
     """One plan of a scene with its inputs in memory."""
 
     number: int
-    folder: Path
+    folder: str  # its name in the storage
     request: Request
     first_job: int
     jobs: int
     shard_rows: int
     rows: PlannedRows
+
+    @property
+    def end_job(self) -> int:
+        """Number of the job after its last."""
+        return self.first_job + self.jobs
 
     @property
     def first_row(self) -> int:
@@ -44,12 +49,16 @@ class StoredPlan:
     @property
     def end_row(self) -> int:
         """Number of the row after its last."""
-        return (self.first_job + self.jobs) * self.shard_rows
+        return self.end_job * self.shard_rows
 
     @property
     def samples(self) -> int:
         """How many samples it holds; the rest of its last job's rows is unused."""
         return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
+
+    def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
+        """The file of one job's rows of an array."""
+        return f"{self.folder}/{name}/{array.shard_name(job - self.first_job)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +87,12 @@ class JobRows:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def folder_name(number: int) -> str:
-    """The folder of a plan under `plans/`."""
-    return f"{number:0{NAME_DIGITS}d}"
+def folder(scene: str, number: int) -> str:
+    """The folder of a plan, in the scene's."""
+    return f"{scene}/plans/{number:0{NAME_DIGITS}d}"
 
 
-def numbers(plans: Path) -> list[int]:
-    """The plans that are there, in order; none if the folder is missing."""
-    if not plans.is_dir():
-        return []
-    return sorted(int(path.name) for path in plans.iterdir() if path.name.isdecimal())
-
-
-def build(
-    folder: Path, spec: SceneSpec, request: Request, rows: PlannedRows, *, first_job: int, shard_rows: int
-) -> None:
+def build(part: Path, spec: SceneSpec, request: Request, rows: PlannedRows, *, first_job: int, shard_rows: int) -> None:
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
     import zarr
     from zarr.storage import LocalStore
@@ -105,43 +105,37 @@ def build(
         "jobs": count // shard_rows,
         "shard_rows": shard_rows,
     }
-    group = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3, attributes=attributes)
+    group = zarr.open_group(LocalStore(part), mode="w-", zarr_format=3, attributes=attributes)
     for name, (dimensions, about) in schema.PLAN_INPUTS.items():
         schema.create_input(group, name, getattr(rows, name), dimensions, about)
     schema.create_outputs(group, spec, count, shard_rows)
 
 
-def load(plans: Path, number: int) -> StoredPlan:
+def load_all(storage: Storage, scene: str, loaded: list[StoredPlan]) -> list[StoredPlan]:
+    """The plans of a scene in order, those already loaded taken over."""
+    with store_errors("list the plans", f"{storage.where}/{scene}"):
+        numbers = sorted(int(name) for name in storage.names(f"{scene}/plans") if name.isdecimal())
+    return loaded + [_load(storage, scene, number) for number in numbers[len(loaded) :]]
+
+
+def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan with its inputs; raises CorruptError if it is not as it was written."""
     import zarr
-    from zarr.storage import LocalStore
 
-    folder = plans / folder_name(number)
+    name = folder(scene, number)
     try:
-        group = zarr.open_group(LocalStore(folder, read_only=True), mode="r", zarr_format=3, use_consolidated=False)
+        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
         rows = PlannedRows(**{field.name: _whole(group, field.name) for field in fields(PlannedRows)})
         about: dict[str, Any] = dict(group.attrs)
         request = Request.model_validate(about["request"])
         first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
     except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
-        raise CorruptError(f"{folder}: is not a readable plan: {error}") from error
-    return StoredPlan(number, folder, request, first_job, jobs, shard_rows, rows)
+        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}") from error
+    return StoredPlan(number, name, request, first_job, jobs, shard_rows, rows)
 
 
 def _whole(group: Any, name: str) -> Any:
     return np.asarray(group[name][...])
-
-
-def shard_rows_of(plans: Path) -> int | None:
-    """The samples per job that the scene's first plan fixed; None if there is no plan."""
-    found = numbers(plans)
-    if not found:
-        return None
-    document = plans / folder_name(found[0]) / "zarr.json"
-    try:
-        return int(json.loads(document.read_text())["attributes"]["shard_rows"])
-    except (OSError, ValueError, KeyError) as error:
-        raise CorruptError(f"{document}: is not the document of a plan: {error}") from error
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

@@ -8,6 +8,8 @@ are read straight from the shards, every byte checked against its checksum.
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -20,8 +22,12 @@ from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import plans, schema, shards, writer
+from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.plans import SampleRow, StoredPlan
+from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
+from photonfarm.shared.store.shards import Shard
+from photonfarm.shared.store.storage import open_storage
+from photonfarm.shared.store.store import FORMAT_FILE, check_format
 from photonfarm.shared.view import View
 
 
@@ -37,28 +43,38 @@ class Sample:
     pass_: int
 
 
+OPEN_SHARDS = 256
+"""Files kept open by a reader; a process may have 1024 as a rule."""
+
+
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
     def __init__(self, root: str | Path, scene_id: str) -> None:
         """Name what to follow; store, scene and plans may appear later."""
-        self._root = Path(root)
-        self._folder = self._root / "scenes" / scene_id
+        self._storage = open_storage(root)
         self._scene_id = scene_id
+        self._name = f"{SCENES}/{scene_id}"
         self._spec: SceneSpec | None = None
         self._arrays: dict[str, schema.ArraySchema] = {}
         self._plans: list[StoredPlan] = []
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
+        self._shards = _OpenShards()
 
     @property
     def spec(self) -> SceneSpec:
         """The scene's spec; raises StoreError while the scene is not there."""
         if self._spec is None:
-            writer.Store(self._root)  # checks the format
-            self._spec = writer.read_spec(self._folder)
+            check_format(self._storage)
+            self._spec = read_spec(self._storage, self._scene_id)
             self._arrays = schema.output_arrays(self._spec)
         return self._spec
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether spec and base are there; the base comes with the scene's first job."""
+        return all(self._storage.exists(f"{self._name}/{name}") for name in ("spec.json", "base/zarr.json"))
 
     @property
     def rows(self) -> NDArray[np.int64]:
@@ -75,16 +91,18 @@ class SceneReader:
 
         Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
         """
-        if self._spec is None and not (self._folder / "spec.json").is_file():
-            if (self._root / writer.FORMAT_FILE).is_file():
-                writer.Store(self._root)
+        if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
+            if self._storage.exists(FORMAT_FILE):
+                check_format(self._storage)
             return np.zeros(0, np.int64)
         _ = self.spec
-        committed = writer.committed_jobs(self._folder)  # before the plans: each one's plan is there by now
-        self._plans = writer.load_plans(self._folder, self._plans)
+        committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
+        self._plans = plans.load_all(self._storage, self._name, self._plans)
         if committed == self._committed:
             return np.zeros(0, np.int64)
         complete = plans.complete_rows(self._plans, committed)
+        if self._committed - committed:  # taken back by a repair
+            self._shards.clear()
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
@@ -126,7 +144,7 @@ class SceneReader:
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud; raises StoreError while they are not there."""
-        return read_base(self._folder)
+        return read_base(self._storage, self._name)
 
     # ----------------------------------------------------------------------------------------------------------- arrays
 
@@ -139,53 +157,72 @@ class SceneReader:
         return sample
 
     def _radiance(self, row: int) -> F32:
-        name, values = "radiance", self._row_of("radiance", row, may_be_missing=True)
-        if values is None:
-            name, values = "radiance_wide", self._row_of("radiance_wide", row, may_be_missing=False)
-        radiance = values.astype(np.float32)
-        if not np.isfinite(radiance).all():
-            raise CorruptError(f"{self._shard(name, row)[0]}: {name} of row {row} is not finite")
-        return radiance * np.float32(2.0 ** -self._arrays[name].attributes["radiance_exponent"])
+        shard, array = self._shard("radiance", row), self._arrays["radiance"]
+        if shard is None or self._within(row) not in shard:
+            shard, array = self._shard("radiance_wide", row), self._arrays["radiance_wide"]
+        return self._floats(shard, array, row) * np.float32(2.0 ** -array.attributes["radiance_exponent"])
 
     def _buffers(self, view_row: int) -> ViewBuffers:
         return ViewBuffers(**{f.name: self._stored(f.name, view_row) for f in fields(ViewBuffers)})
 
     def _stored(self, name: str, row: int) -> NDArray[Any]:
         """A row of an array, in float32 if it holds floats."""
-        values = self._row_of(name, row, may_be_missing=False)
-        if values.dtype.kind != "f":
-            return values
-        wide = values.astype(np.float32)
-        if not np.isfinite(wide).all():
-            raise CorruptError(f"{self._shard(name, row)[0]}: {name} of row {row} is not finite")
+        array = self._arrays[name]
+        shard = self._shard(name, row)
+        return self._floats(shard, array, row) if array.dtype.kind == "f" else self._row(shard, array, row)
+
+    def _floats(self, shard: Shard | None, array: schema.ArraySchema, row: int) -> F32:
+        wide = self._row(shard, array, row).astype(np.float32)
+        if shard is not None and not np.isfinite(wide).all():
+            raise CorruptError(f"{shard.path}: {array.name} of row {row} is not finite")
         return wide
 
-    def _row_of(self, name: str, row: int, *, may_be_missing: bool) -> Any:
-        path, plan = self._shard(name, row)
-        if may_be_missing and not path.exists():
-            return None
-        values = shards.read_row(path, self._arrays[name], plan.shard_rows, row % plan.shard_rows)
-        if values is None and not may_be_missing:
-            raise CorruptError(f"{path}: row {row} is committed, but missing")
+    def _row(self, shard: Shard | None, array: schema.ArraySchema, row: int) -> NDArray[Any]:
+        values = None if shard is None else shard.read(self._within(row))
+        if values is None:
+            raise CorruptError(
+                f"{self._storage.where}/{self._file(array.name, row)}: row {row} is committed, but missing"
+            )
         return values
 
-    def _shard(self, name: str, row: int) -> tuple[Path, StoredPlan]:
+    def _within(self, row: int) -> int:
+        return row % self._plans[0].shard_rows
+
+    def _file(self, name: str, row: int) -> str:
         plan = plans.plan_of(self._plans, row)
-        job = row // plan.shard_rows - plan.first_job
-        return plan.folder / name / self._arrays[name].shard_name(job), plan
+        return plan.shard(name, self._arrays[name], row // plan.shard_rows)
+
+    def _shard(self, name: str, row: int) -> Shard | None:
+        """The shard of a row; None if there is none, which may be of `radiance` and `radiance_wide` alone."""
+        file, array = self._file(name, row), self._arrays[name]
+        shard = self._shards.get(file)
+        if shard is None:
+            if array.kind == "sample" and not self._storage.exists(file):
+                return None
+            shard = Shard(self._storage.local(file), array, self._plans[0].shard_rows)
+            self._shards.put(file, shard)
+        return shard
 
 
-def read_base(folder: Path) -> tuple[Geometry, BasePointCloud]:
-    """Geometry and base point cloud in a scene's folder."""
-    import zarr
-    from zarr.storage import LocalStore
+class _OpenShards:
+    """The shards used last; one that is dropped is closed once nobody reads it any more."""
 
-    if not (folder / "base.json").is_file():
-        raise StoreError(f"{folder}: its base is not there yet; the first job of the scene writes it")
-    try:
-        root: Any = zarr.open_group(LocalStore(folder / "base", read_only=True), mode="r", use_consolidated=False)
-        geometry = Geometry(**{f.name: np.asarray(root["geometry"][f.name][...]) for f in fields(Geometry)})
-        cloud = BasePointCloud(**{f.name: np.asarray(root["cloud"][f.name][...]) for f in fields(BasePointCloud)})
-    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
-        raise CorruptError(f"{folder / 'base'}: is not what was committed: {error}") from error
-    return geometry, cloud
+    def __init__(self) -> None:
+        self._shards: OrderedDict[str, Shard] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, file: str) -> Shard | None:
+        with self._lock:
+            if file in self._shards:
+                self._shards.move_to_end(file)
+            return self._shards.get(file)
+
+    def put(self, file: str, shard: Shard) -> None:
+        with self._lock:
+            self._shards[file] = shard
+            while len(self._shards) > OPEN_SHARDS:
+                self._shards.popitem(last=False)
+
+    def clear(self) -> None:
+        with self._lock:
+            self._shards.clear()

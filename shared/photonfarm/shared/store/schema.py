@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import zarr
 
 FORMAT = "photonfarm store"
-VERSION = 1
+VERSION = 2
 
 Kind = Literal["sample", "view", "modification"]
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonfarm.shared.store.writer import SceneStore, Store
+from photonfarm.shared.store.scene_store import SceneStore
+from photonfarm.shared.store.store import Store
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,233 @@
+"""One job's outputs on their way into the store: row by row while it is rendered, and then all at once.
+
+Rows are encoded and written by a thread of their own, to parts that nobody sees; the commit names them, makes them
+durable, and announces them by the job's marker.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from collections.abc import Mapping, Set
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.errors import CorruptError, IncompleteError
+from photonfarm.shared.records import F32, Photons, ViewBuffers, arrays_of
+from photonfarm.shared.store import markers, schema
+from photonfarm.shared.store.plans import JobRows, StoredPlan
+from photonfarm.shared.store.shards import Shard, ShardWriter
+from photonfarm.shared.store.storage import store_errors
+
+if TYPE_CHECKING:
+    from photonfarm.shared.store.scene_store import SceneStore
+
+WAITING_ROWS = 8
+"""Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What a job cost and how it went; kept in its marker."""
+
+    core_s: float  # processor time, all threads
+    wall_s: float
+    redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
+    worker: str
+    versions: Mapping[str, str]
+
+
+class JobWriter:
+    """Takes a job's rows in any order, and commits them once all are there.
+
+    A context manager: leaving it without `commit` leaves nothing behind. Arrays that are given must not be changed
+    afterwards. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
+    StoreError once the disk has refused something.
+    """
+
+    def __init__(self, scene: SceneStore, rows: JobRows, plan: StoredPlan) -> None:
+        """Begin; `SceneStore.job_writer` calls this."""
+        self._scene = scene
+        self._rows = rows
+        self._plan = plan
+        self._storage = scene.storage
+        self._arrays = schema.output_arrays(scene.spec)
+        self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
+        self._shards: dict[str, ShardWriter] = {}
+        self._waiting: queue.Queue[tuple[str, int, NDArray[Any]] | None] = queue.Queue(WAITING_ROWS)
+        self._error: OSError | None = None
+        self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the thread and remove what has not been committed."""
+        self._join()
+        for shard in self._shards.values():
+            shard.close()
+            shard.part.unlink(missing_ok=True)
+
+    # ------------------------------------------------------------------------------------------------------------- rows
+
+    def radiance(self, row: int, halves: F32) -> None:
+        """The half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
+        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
+        self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
+
+    def buffers(self, row: int, buffers: ViewBuffers) -> None:
+        """The buffers of a new view row."""
+        self._claim("view", row, "buffers", self._rows.new_views)
+        for name, values in arrays_of(buffers).items():
+            self._put(row, name, values)
+
+    def photons(self, row: int, photons: Photons) -> None:
+        """The photons of a new modification row."""
+        self._claim("modification", row, "photons", self._photon_rows())
+        for name, values in arrays_of(photons).items():
+            self._put(row, f"photon_{name}", values)
+
+    def _photon_rows(self) -> frozenset[int]:
+        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
+
+    def _claim(self, kind: schema.Kind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
+        if row not in expected or row in self._given[kind]:
+            raise IncompleteError(f"{what} of job {self._rows.job}: row {row} is not the job's, or is there already")
+        self._given[kind].add(row)
+
+    def _put(self, row: int, name: str, values: NDArray[Any]) -> None:
+        array = self._arrays[name]
+        if values.shape != array.shape:
+            raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
+        self._waiting.put((name, row % self._plan.shard_rows, _cast(values, array, row)))
+        self._raise_error()
+
+    def _write(self) -> None:
+        """The thread: after an error it only empties the queue, so that nobody waits for it."""
+        while (taken := self._waiting.get()) is not None:
+            if self._error is not None:
+                continue
+            name, row, values = taken
+            try:
+                if name not in self._shards:
+                    self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
+                self._shards[name].append(row, values)
+            except OSError as error:
+                self._error = error
+
+    def _join(self) -> None:
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            with self._errors():
+                raise self._error
+
+    def _errors(self) -> contextlib.AbstractContextManager[None]:
+        return store_errors(f"commit job {self._rows.job}", self._storage.where)
+
+    # ----------------------------------------------------------------------------------------------------------- commit
+
+    def commit(self, figures: Figures) -> bool:
+        """Make the rows part of the store, all or nothing; False if another worker's commit came first.
+
+        Files that another writer left are kept where every row of the job can be read from them and ours, and are
+        replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given.
+        """
+        self._check_complete()
+        self._join()
+        self._raise_error()
+        with self._errors():
+            files = {name: shard.finish() for name, shard in self._shards.items()}
+            if self._scene.is_committed(self._rows.job):
+                return False
+            kept = [name for name in files if not self._adopt(name)]
+            if kept and not self._is_readable():
+                # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
+                if self._scene.is_committed(self._rows.job):
+                    return False
+                for name in kept:
+                    self._adopt(name, replace=True)
+                self._check_readable()
+                kept = []
+            others = [name for name in self._arrays if name not in files and self._storage.exists(self._file(name))]
+            files |= {name: self._shard(name).summary() for name in [*kept, *others]}
+            described = {self._file(name): about for name, about in files.items()}
+            self._storage.settle(described)
+            return markers.place(self._storage, self._scene.name, self._rows.job, described, asdict(figures))
+
+    def _adopt(self, name: str, *, replace: bool = False) -> bool:
+        return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
+
+    def _check_complete(self) -> None:
+        expected = {
+            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
+            "view": ("buffers", self._rows.new_views),
+            "modification": ("photons", self._photon_rows()),
+        }
+        for kind, (what, rows) in expected.items():
+            if missing := rows - self._given[kind]:
+                raise IncompleteError(f"{what} of job {self._rows.job}: row {min(missing)} is missing")
+
+    def _file(self, name: str) -> str:
+        return self._plan.shard(name, self._arrays[name], self._rows.job)
+
+    def _shard(self, name: str) -> Shard:
+        return Shard(self._storage.local(self._file(name)), self._arrays[name], self._plan.shard_rows)
+
+    def _is_readable(self) -> bool:
+        try:
+            self._check_readable()
+        except CorruptError:
+            return False
+        return True
+
+    def _check_readable(self) -> None:
+        """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
+        wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
+        for name, array in self._arrays.items():
+            if array.kind != "sample":
+                self._check_rows(name, wanted[array.kind])
+        samples = {sample.row for sample in self._rows.samples}
+        if self._storage.exists(self._file("radiance")):
+            samples = self._check_rows("radiance", samples, may_be_missing=True)
+        self._check_rows("radiance_wide", samples)
+
+    def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
+        """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
+        if not wanted:
+            return set()
+        shard = self._shard(name)
+        missing = {row for row in wanted if shard.read(row % self._plan.shard_rows) is None}
+        if missing and not may_be_missing:
+            raise CorruptError(f"{shard.path}: row {min(missing)} is missing")
+        return missing
+
+
+def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
+    """Which array takes a sample, and what is stored there: float16 and scaled, or as it is where that cannot hold it.
+
+    65504 is the largest float16 and 65520 the first number that rounds to infinity.
+    """
+    with np.errstate(over="ignore", under="ignore"):
+        scaled = (radiance * np.float32(2.0**exponent)).astype(np.float16)
+    return ("radiance", scaled) if np.isfinite(scaled).all() else ("radiance_wide", radiance)
+
+
+def _cast(values: NDArray[Any], array: schema.ArraySchema, row: int) -> NDArray[Any]:
+    with np.errstate(over="ignore", under="ignore"):
+        stored = values.astype(array.dtype, copy=False)
+    if stored.dtype.kind == "f" and not np.isfinite(stored).all():
+        raise IncompleteError(f"{array.name} of row {row} holds a value that is not finite in {array.dtype.name}")
+    return stored

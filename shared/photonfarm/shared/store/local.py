@@ -1,0 +1,182 @@
+"""A store in a folder: safe for any number of processes and machines on one POSIX file system, without locks.
+
+A file is written under a temporary name in `tmp`, synced, and linked to its final name, so that a final name is always
+a whole file, and the first one stays. Folders are synced before anything announces their files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import shutil
+import socket
+import time
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S
+
+if TYPE_CHECKING:
+    from zarr.storage import LocalStore
+
+TMP = "tmp"
+
+_counter = itertools.count()
+
+
+class LocalStorage:
+    """`storage.Storage` in a folder, which need not exist yet."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @property
+    def where(self) -> str:
+        """The folder."""
+        return str(self.root)
+
+    # ---------------------------------------------------------------------------------------------------------- reading
+
+    def local(self, name: str) -> Path:
+        """The file itself."""
+        return self.root / name
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a name; raises FileNotFoundError."""
+        return (self.root / name).read_bytes()
+
+    def exists(self, name: str) -> bool:
+        """Whether a name has bytes."""
+        return (self.root / name).is_file()
+
+    def size(self, name: str) -> int:
+        """How many bytes a name has; raises FileNotFoundError."""
+        return (self.root / name).stat().st_size
+
+    def names(self, folder: str) -> list[str]:
+        """The names right below a folder; none if it does not exist."""
+        try:
+            return [path.name for path in (self.root / folder).iterdir()]
+        except FileNotFoundError:
+            return []
+
+    def zarr(self, folder: str) -> LocalStore:
+        """A folder as zarr-python reads it."""
+        from zarr.storage import LocalStore
+
+        return LocalStore(self.root / folder, read_only=True)
+
+    # ---------------------------------------------------------------------------------------------------------- writing
+
+    def part(self) -> Path:
+        """A new path in `tmp` that says whose it is: host, process space, process, number, time."""
+        tmp = self.root / TMP
+        tmp.mkdir(parents=True, exist_ok=True)
+        return tmp / f"{_owner()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
+
+    def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
+        """Sync a part and link it to its name; False if that was taken."""
+        final = self.root / name
+        _make_folder(final.parent)
+        sync(part, data_only=True)
+        if replace:
+            part.replace(final)
+            return True
+        try:
+            os.link(part, final)
+        except FileExistsError:
+            return False
+        part.unlink()
+        return True
+
+    def adopt_folder(self, part: Path, folder: str) -> bool:
+        """Sync a folder with all that is in it, and rename it; False if the name was taken."""
+        final = self.root / folder
+        _sync_tree(part)
+        _make_folder(final.parent)
+        try:
+            part.rename(final)  # fails on a folder that is there, since none of ours is ever empty
+        except OSError:
+            if not final.is_dir():
+                raise
+            return False
+        sync(final.parent)
+        return True
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Sync the folders that the names are in."""
+        for folder in sorted({(self.root / name).parent for name in names}):
+            sync(folder)
+
+    # --------------------------------------------------------------------------------------------------------- sweeping
+
+    def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
+        """Remove parts that dead writers left; how many."""
+        swept, now_s = 0, time.time()
+        for name in self.names(TMP):
+            path = self.root / TMP / name
+            with contextlib.suppress(FileNotFoundError):  # another sweeper was faster
+                age_s = now_s - path.stat().st_mtime
+                if age_s > FOREIGN_AGE_S or (age_s > stray_age_s and _is_of_the_dead(name)):
+                    _remove(path)
+                    swept += 1
+        return swept
+
+
+@cache
+def _owner() -> str:
+    """Where process numbers mean what they mean here: containers may share a host's name, but not its processes."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text()[:8]
+        space = f"{boot}{Path('/proc/self/ns/pid').stat().st_ino:x}"
+    except OSError:  # not Linux, hence no containers: the host's name must do
+        space = "0"
+    return f"{socket.gethostname()}-{space}"
+
+
+def _is_of_the_dead(name: str) -> bool:
+    owner, *numbers = name.rsplit("-", 3)  # from the right: a host's name may hold any number of -
+    if owner != _owner():
+        return False  # of another machine or container
+    try:
+        os.kill(int(numbers[0]), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, ValueError):
+        return False
+    return False
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def sync(path: Path, *, data_only: bool = False) -> None:
+    """Make a file's bytes durable, or the names in a folder."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        (os.fdatasync if data_only else os.fsync)(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder, durably, if it is not there, with those above it."""
+    if not folder.is_dir():
+        _make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync(folder.parent)
+
+
+def _sync_tree(folder: Path) -> None:
+    """Make a folder durable with everything below it."""
+    for path, _, files in os.walk(folder):
+        for name in files:
+            sync(Path(path, name))
+        sync(Path(path))

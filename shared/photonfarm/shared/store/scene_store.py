@@ -1,0 +1,207 @@
+"""One scene of a store as those see it who plan and render: its spec, plans, jobs, base and markers.
+
+Plans and markers are the truth. Nothing here needs a lock: a name appears once, and the first one stays.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from photonfarm.shared.errors import CorruptError, SpecError, StoreError
+from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Known, Request, expand
+from photonfarm.shared.records import BasePointCloud, Geometry, arrays_of
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import markers, plans, schema
+from photonfarm.shared.store.commit import JobWriter
+from photonfarm.shared.store.plans import JobRows, StoredPlan
+from photonfarm.shared.store.storage import Storage, store_errors
+
+SCENES = "scenes"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """What became of a request."""
+
+    scene_id: str
+    plan: int | None  # number of the new plan; None if nothing was new, or nothing was written
+    new: int  # samples planned now
+    known: int  # samples of the request that older plans hold
+    jobs: int  # jobs of the new plan
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a scene is, in samples."""
+
+    planned_samples: int
+    committed_samples: int  # complete ones
+
+
+class SceneStore:
+    """One scene of a store."""
+
+    def __init__(self, storage: Storage, scene_id: str) -> None:
+        """Open; raises StoreError if there is no such scene."""
+        self.storage = storage
+        self.scene_id = scene_id
+        self.name = f"{SCENES}/{scene_id}"  # of its folder
+        self.spec = read_spec(storage, scene_id)
+        self._plans: list[StoredPlan] = []
+
+    @property
+    def folder(self) -> Path:
+        """The scene's folder, of a store on this machine's file system."""
+        return self.storage.local(self.name)
+
+    # ------------------------------------------------------------------------------------------------------------ plans
+
+    def plans(self) -> list[StoredPlan]:
+        """The plans that are there by now, in order."""
+        self._plans = plans.load_all(self.storage, self.name, self._plans)
+        return self._plans
+
+    def plan(self, request: Request, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
+        """Plan what is new of a request; racing submitters try again, each against the other's plan."""
+        while True:
+            found = self.plans()
+            rows_per_job = self._shard_rows(found, shard_rows)
+            first_job = found[-1].end_job if found else 0
+            known = Known()
+            for plan in found:
+                known.add(plan.rows, plan.first_row)
+            expansion = expand(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
+            if expansion.rows is None or dry_run:
+                return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0)
+            with store_errors("write a plan", self.storage.where):
+                built = self.storage.part()
+                try:
+                    plans.build(built, self.spec, request, expansion.rows, first_job=first_job, shard_rows=rows_per_job)
+                    if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
+                        jobs = len(expansion.rows.sample_pass) // rows_per_job
+                        return PlanResult(self.scene_id, len(found), expansion.new, expansion.known, jobs)
+                finally:
+                    shutil.rmtree(built, ignore_errors=True)
+
+    def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
+        if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
+            raise SpecError(f"shard_rows = {wanted}: 1 to {MAX_SHARD_ROWS} samples per job are allowed")
+        if not found:
+            return wanted or SHARD_ROWS
+        if wanted not in (None, found[0].shard_rows):
+            raise SpecError(
+                f"shard_rows = {wanted}: scene {self.scene_id} has {found[0].shard_rows} samples per job, fixed by its "
+                "first plan; leave the setting out"
+            )
+        return found[0].shard_rows
+
+    # ------------------------------------------------------------------------------------------------------------- jobs
+
+    def job_rows(self, job: int) -> JobRows:
+        """What a job must produce, with its inputs; raises IndexError for a job of no plan."""
+        if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
+            self.plans()
+        return plans.job_rows(self._plans, job)
+
+    def job_writer(self, job: int) -> JobWriter:
+        """What takes a job's outputs and commits them; raises IndexError for a job of no plan."""
+        rows = self.job_rows(job)
+        return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
+
+    def jobs(self) -> int:
+        """How many jobs are planned; they are numbered from 0."""
+        found = self.plans()
+        return found[-1].end_job if found else 0
+
+    def committed_jobs(self) -> set[int]:
+        """The jobs that have their marker."""
+        return markers.jobs(self.storage, self.name)
+
+    def missing_jobs(self) -> list[int]:
+        """The jobs that are planned and not committed, in order."""
+        committed = self.committed_jobs()
+        return [job for job in range(self.jobs()) if job not in committed]
+
+    def is_committed(self, job: int) -> bool:
+        """Whether a job has its marker."""
+        return self.storage.exists(markers.name_of(self.name, job))
+
+    def marker(self, job: int) -> dict[str, Any]:
+        """The marker of a committed job: its files and its figures."""
+        return markers.read(self.storage, self.name, job)
+
+    def progress(self) -> Progress:
+        """How far the scene is; costs one listing of the markers."""
+        committed = self.committed_jobs()
+        found = self.plans()
+        complete = plans.complete_rows(found, committed)
+        return Progress(sum(plan.samples for plan in found), int(np.count_nonzero(complete)))
+
+    # ------------------------------------------------------------------------------------------------------------- base
+
+    def has_base(self) -> bool:
+        """Whether geometry and base cloud are complete."""
+        return self.storage.exists(f"{self.name}/base/zarr.json")
+
+    def write_base(self, geometry: Geometry, cloud: BasePointCloud) -> None:
+        """Store geometry and base point cloud; the first ones written stay."""
+        if self.has_base():
+            return
+        with store_errors("write the base", self.storage.where):
+            built = self.storage.part()
+            try:
+                _build_base(built, {"geometry": geometry, "cloud": cloud})
+                self.storage.adopt_folder(built, f"{self.name}/base")
+            finally:
+                shutil.rmtree(built, ignore_errors=True)
+
+
+def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
+    """The spec of a scene; raises StoreError if there is no such scene."""
+    name = f"{SCENES}/{scene_id}/spec.json"
+    try:
+        spec = SceneSpec.model_validate_json(storage.read(name))
+    except FileNotFoundError as error:
+        raise StoreError(f"{storage.where}: holds no scene {scene_id}") from error
+    except OSError as error:
+        raise StoreError(f"{storage.where}/{name}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {error}") from error
+    if spec.scene_id != scene_id:
+        raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
+    return spec
+
+
+def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:
+    import zarr
+    from zarr.storage import LocalStore
+
+    root = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3)
+    for name, record in records.items():
+        group = root.create_group(name)
+        for field, values in arrays_of(record).items():
+            axes = (field, "component") if values.ndim == 2 else (field,)
+            schema.create_input(group, field, values, axes, "see photonfarm.shared.records; scene units, at rest")
+
+
+def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
+    """Geometry and base point cloud in a scene's folder; raises StoreError while they are not there."""
+    import zarr
+
+    folder = f"{scene}/base"
+    if not storage.exists(f"{folder}/zarr.json"):
+        raise StoreError(f"{storage.where}/{scene}: its base is not there yet; the first job of the scene writes it")
+    try:
+        root: Any = zarr.open_group(storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
+        geometry = Geometry(**{f.name: np.asarray(root["geometry"][f.name][...]) for f in fields(Geometry)})
+        cloud = BasePointCloud(**{f.name: np.asarray(root["cloud"][f.name][...]) for f in fields(BasePointCloud)})
+    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
+        raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {error}") from error
+    return geometry, cloud

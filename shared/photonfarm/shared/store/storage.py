@@ -1,0 +1,100 @@
+"""Where the files of a store lie: names with bytes, each written once, whole, and by whoever comes first.
+
+A name is a path below the store, with / between its parts. What is to be stored is written to a `part` on this machine
+and adopted under its name; after `settle` it stays, whatever happens to the machine. `local` has the folder on a POSIX
+file system; `objects` the bucket.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from photonfarm.shared.errors import StoreError
+
+if TYPE_CHECKING:
+    import zarr.abc.store
+
+STRAY_AGE_S = 60.0
+"""Parts of a dead process of this machine are swept at this age…"""
+
+FOREIGN_AGE_S = 86400.0
+"""…and those of other machines, whose processes cannot be asked after, at this one."""
+
+
+class Storage(Protocol):
+    """Files by name. Any method may raise OSError; none leaves half a file under a name."""
+
+    @property
+    def where(self) -> str:
+        """The store's folder or URL, for messages."""
+
+    def local(self, name: str) -> Path:
+        """A file of this machine with the bytes of a name; it need not exist for a name that does not."""
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a name; raises FileNotFoundError."""
+
+    def exists(self, name: str) -> bool:
+        """Whether a name has bytes."""
+
+    def size(self, name: str) -> int:
+        """How many bytes a name has; raises FileNotFoundError."""
+
+    def names(self, folder: str) -> list[str]:
+        """The last parts of the names and folders right below a folder, in no order; none if it does not exist."""
+
+    def zarr(self, folder: str) -> zarr.abc.store.Store:
+        """A folder as zarr-python reads it."""
+
+    def part(self) -> Path:
+        """A new path on this machine, to write a file or folder to before it is adopted, or removed."""
+
+    def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
+        """Give a part its name; False if the name was taken, which keeps what is there, and the part.
+
+        With `replace` it takes the place of what is there, at once.
+        """
+
+    def adopt_folder(self, part: Path, folder: str) -> bool:
+        """Give a folder that is a Zarr group its name, at once; False if the name was taken, which keeps the part."""
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Return once these names are as durable as their bytes."""
+
+    def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
+        """Remove parts that dead writers left; how many."""
+
+
+def open_storage(root: str | Path) -> Storage:
+    """The storage of a folder's path or of a bucket's URL, which need not exist yet."""
+    from photonfarm.shared.store.local import LocalStorage
+
+    return LocalStorage(Path(root))
+
+
+def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
+    """Store a JSON document durably under a new name; False if the name was taken, which keeps what is there."""
+    part = storage.part()
+    try:
+        part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        placed = storage.adopt(part, name)
+    finally:
+        part.unlink(missing_ok=True)
+    storage.settle([name])
+    return placed
+
+
+@contextlib.contextmanager
+def store_errors(doing: str, where: str | Path) -> Iterator[None]:
+    """Turn what the operating system refuses into a StoreError that says what failed, where and why."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise StoreError(f"{where}: cannot {doing}: {reason} ({error.filename or where})") from error

@@ -1,0 +1,95 @@
+"""A store: its format and its scenes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.plan import SHARD_ROWS, Known, Request, expand
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import schema
+from photonfarm.shared.store.local import TMP
+from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore
+from photonfarm.shared.store.storage import STRAY_AGE_S, Storage, open_storage, put_json, store_errors
+
+FORMAT_FILE = "photonfarm.json"
+
+
+class Store:
+    """A sample store in a folder or bucket; holds any number of scenes."""
+
+    def __init__(self, root: str | Path, *, create: bool = False) -> None:
+        """Open a store, or make one where there is none; raises StoreError if that cannot be."""
+        self.root = root
+        self.storage = open_storage(root)
+        self._opened: dict[str, SceneStore] = {}
+        if create:
+            self._create()
+        check_format(self.storage)
+
+    def _create(self) -> None:
+        with store_errors("make a store here", self.storage.where):
+            if self.storage.exists(FORMAT_FILE):
+                return
+            foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
+            if foreign and not self.storage.exists(FORMAT_FILE):  # nobody made one in the meantime
+                raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
+            put_json(self.storage, {"format": schema.FORMAT, "version": schema.VERSION}, FORMAT_FILE)
+
+    def scene_ids(self) -> list[str]:
+        """The scenes that are there, in order of their ids."""
+        with store_errors("list the scenes", self.storage.where):
+            names = sorted(self.storage.names(SCENES))
+            return [name for name in names if self.storage.exists(f"{SCENES}/{name}/spec.json")]
+
+    def scene(self, scene_id: str) -> SceneStore:
+        """One scene of the store, the same object each time; raises StoreError if it is not there."""
+        if scene_id not in self._opened:
+            self._opened[scene_id] = SceneStore(self.storage, scene_id)
+        return self._opened[scene_id]
+
+    def scenes(self, only: str | None = None) -> list[SceneStore]:
+        """Every scene of the store, or the one that is named; raises StoreError if that is not there."""
+        return [self.scene(scene_id) for scene_id in (self.scene_ids() if only is None else [only])]
+
+    def add(self, spec: SceneSpec) -> SceneStore:
+        """The scene of a spec, made if it is new; the first spec written for a scene id stays."""
+        name = f"{SCENES}/{spec.scene_id}/spec.json"
+        with store_errors("add a scene", self.storage.where):
+            if not self.storage.exists(name):
+                put_json(self.storage, spec.model_dump(mode="json"), name)
+        return self.scene(spec.scene_id)
+
+    def plan(
+        self, spec: SceneSpec, request: Request, *, shard_rows: int | None = None, dry_run: bool = False
+    ) -> PlanResult:
+        """Plan what is new of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
+        if dry_run and spec.scene_id not in self.scene_ids():
+            expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
+            return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0)
+        return self.add(spec).plan(request, shard_rows=shard_rows, dry_run=dry_run)
+
+    def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
+        """Remove temporary files that dead writers left; how many."""
+        with store_errors("sweep temporary files", self.storage.where):
+            return self.storage.sweep(stray_age_s=stray_age_s)
+
+
+def check_format(storage: Storage) -> None:
+    """Return for a store of this program's format and version; raises StoreError, with a sentence, for any other."""
+    file = f"{storage.where}/{FORMAT_FILE}"
+    try:
+        document = json.loads(storage.read(FORMAT_FILE))
+        name, version = document["format"], document["version"]
+    except FileNotFoundError as error:
+        raise StoreError(f"{storage.where}: is not a store: {FORMAT_FILE} is missing") from error
+    except OSError as error:
+        raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptError(f"{file}: is not the document of a store: {error}") from error
+    if name != schema.FORMAT or version != schema.VERSION:
+        raise StoreError(
+            f"{storage.where}: has format {name!r} version {version!r}; this program reads and writes "
+            f"{schema.FORMAT!r} version {schema.VERSION}"
+        )

@@ -60,7 +60,7 @@ class JobWriter:
         self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
         self._shards: dict[str, ShardWriter] = {}
         self._waiting: queue.Queue[tuple[str, int, NDArray[Any]] | None] = queue.Queue(WAITING_ROWS)
-        self._error: OSError | None = None
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
         self._thread.start()
 
@@ -121,7 +121,7 @@ class JobWriter:
                 if name not in self._shards:
                     self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
                 self._shards[name].append(row, values)
-            except OSError as error:
+            except Exception as error:  # noqa: BLE001 - raised again where rows are given
                 self._error = error
 
     def _join(self) -> None:

@@ -85,8 +85,8 @@ def page(scene: str, size: int, spp: int, repetitions: int, rows: list[Row]) -> 
     return f"""# Cost of a sample
 
 `{scene}` at {size}², {spp} spp, max_depth {MAX_DEPTH}, one thread; medians of {repetitions} images of each method,
-rendered in turn. `bdpt` (connections, light paths per eye path), with recorded launches as the workers have them. What a sample buys for
-its cost is in [bdpt_against_peers.md](bdpt_against_peers.md).
+rendered in turn. `bdpt` (connections, light paths per eye path), with recorded launches as the workers have them. What
+a sample buys for its cost is in [bdpt_against_peers.md](bdpt_against_peers.md).
 
 {results.table(header, lines)}
 

@@ -47,17 +47,31 @@ class Measured:
     shots: list[list[Shot]]  # [budget][round]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """One scene to measure: what every step needs to know."""
+
+    plan: ScenePlan
+    settings: Settings
+    scene: Any  # Mitsuba's, loaded
+
+    def method(self, name: str, chosen: dict[str, Any] | None = None) -> MitsubaMethod:
+        """One of Mitsuba's methods on this scene; `chosen` holds the parameters of the method 'chosen'."""
+        return MitsubaMethod(self.scene, integrator(name, self.plan.max_depth, chosen or {}))
+
+
 def measure(name: str, plan: ScenePlan, settings: Settings, scene: Any) -> dict[str, Any]:
     """The result of one line, as JSON takes it."""
-    methods, absent, differences = _peers(plan, settings, scene)
+    line = Line(plan, settings, scene)
+    methods, absent, differences = _peers(line)
     try:
         calibrations = {name: _calibrated(name, methods[name], settings) for name in methods}
-        settled = _settle(plan, settings, scene, calibrations)
+        settled = _settle(line, calibrations)
         if settled is not None:
-            methods["chosen"] = MitsubaMethod(scene, integrator("chosen", plan.max_depth, settled.parameters()))
+            methods["chosen"] = line.method("chosen", settled.parameters())
             calibrations["chosen"] = _calibrated("chosen", methods["chosen"], settings)
         measured = _in_turns(methods, calibrations, settings)
-        references, described = _references(plan, settings, scene, methods, calibrations)
+        references, described = _references(line, methods, calibrations)
     finally:
         for method in methods.values():
             method.close()
@@ -83,38 +97,32 @@ def _calibrated(name: str, method: Method, settings: Settings) -> Calibration:
     return found
 
 
-def _settle(
-    plan: ScenePlan,
-    settings: Settings,
-    scene: Any,
-    calibrations: Mapping[str, Calibration],
-) -> chosen.Chosen | None:
+def _settle(line: Line, calibrations: Mapping[str, Calibration]) -> chosen.Chosen | None:
     """The settings of the method 'chosen'. After the others are compiled: the pilot compiles all of its candidates."""
+    settings = line.settings
     if "chosen" not in settings.methods:
         return None
     if settings.chosen:
         return chosen.given(settings.chosen)
-    known = calibrations.get("bdpt") or calibrate(
-        MitsubaMethod(scene, integrator("bdpt", plan.max_depth, {})), settings.budgets_s, settings.clock
-    )
-    found = chosen.by_pilot(scene, plan.max_depth, settings.pilot_seconds, chosen.pilot_spp(known))
+    known = calibrations.get("bdpt") or calibrate(line.method("bdpt"), settings.budgets_s, settings.clock)
+    found = chosen.by_pilot(line.scene, line.plan.max_depth, settings.pilot_seconds, chosen.pilot_spp(known))
     say(f"  pilot: connections {found.connections}, light_ratio {found.light_ratio:g} in {found.pilot_wall_s:.0f} s")
     return found
 
 
-def _peers(plan: ScenePlan, settings: Settings, scene: Any) -> tuple[dict[str, Method], dict[str, str], set[str]]:
+def _peers(line: Line) -> tuple[dict[str, Method], dict[str, str], set[str]]:
     """(methods but 'chosen' by name, why others are absent, in what LuxCore's scene is only almost the same)."""
     methods: dict[str, Method] = {}
     absent: dict[str, str] = {}
     differences: set[str] = set()
-    for name in settings.methods:
+    for name in line.settings.methods:
         if name == "chosen":
             continue
         if name != "pyluxcore":
-            methods[name] = MitsubaMethod(scene, integrator(name, plan.max_depth, {}))
+            methods[name] = line.method(name)
             continue
         try:
-            translated = luxcore_scene.translate(scene)
+            translated = luxcore_scene.translate(line.scene)
         except luxcore_scene.NotExpressibleError as reason:
             absent[name] = f"not expressible: {reason}"
             continue
@@ -123,7 +131,7 @@ def _peers(plan: ScenePlan, settings: Settings, scene: Any) -> tuple[dict[str, M
             continue
         differences = translated.differences
         methods[name] = luxcore.LuxCoreMethod(
-            translated, size=settings.size, max_depth=plan.max_depth, threads=settings.threads
+            translated, size=line.settings.size, max_depth=line.plan.max_depth, threads=line.settings.threads
         )
     return methods, absent, differences
 
@@ -143,20 +151,17 @@ def _in_turns(
 
 
 def _references(
-    plan: ScenePlan,
-    settings: Settings,
-    scene: Any,
-    methods: Mapping[str, Method],
-    calibrations: Mapping[str, Calibration],
+    line: Line, methods: Mapping[str, Method], calibrations: Mapping[str, Calibration]
 ) -> tuple[dict[str, Reference], str]:
     """(reference of each method, what the common one is made of).
 
     LuxCore has its own, as its scene differs a little.
     """
+    settings = line.settings
     share = settings.reference / REFERENCE_IMAGES
     sets, described = [], []
-    for name in plan.reference:
-        method = MitsubaMethod(scene, integrator(name, plan.max_depth, {}))
+    for name in line.plan.reference:
+        method = line.method(name)
         known = calibrations.get(name) or calibrate(method, (settings.seconds,), settings.clock)
         spp = max(1, round(known.spp[-1] * share))
         sets.append(_images(method, spp))

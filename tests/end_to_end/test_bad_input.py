@@ -1,9 +1,33 @@
 """Every fault that a user can cause gives one sentence on stderr and its exit code, and nothing stored is lost."""
 
+import importlib.util
 import os
+import subprocess
+import sys
 from pathlib import Path
+from types import ModuleType
 
+import numpy as np
 import pytest
+
+from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.hold_out import check_hold_out
+from photonfarm.shared.scene import load_spec
+from photonfarm.shared.store import Store
+from photonfarm.shared.submission import request_of, submit
+from photonfarm.trainer.dataset import is_row_held_out
+from photonfarm.trainer.store_source import StoreSource
+
+
+@pytest.fixture(scope="module")
+def analytic() -> ModuleType:
+    """The module `faults/analytic_scene`."""
+    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
+    spec = importlib.util.spec_from_file_location("analytic_scene_of_bad_input", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_an_unknown_spec_is_exit_code_3(photonfarm) -> None:
@@ -67,6 +91,76 @@ def test_no_llvm_is_exit_code_6_and_says_what_to_install(photonfarm, tmp_path: P
 def test_wrong_usage_is_exit_code_2(photonfarm) -> None:
     assert photonfarm("submit", "cornell", "--views", "0").returncode == 2
     assert photonfarm("fly").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("room", "--modifications", "2"), "of the 2 configurations planned none is held out, and one is needed"),
+        (("room", "--modifications", "2", "--hold-out", "0.999"), "of the 2 configurations planned all are held out"),
+        (("cornell", "--modifications", "3", "--views", "2", "--hold-out", "0.99"), "of the 6 views planned all are"),
+    ],
+)
+def test_up_refuses_a_hold_out_that_leaves_one_side_empty_before_it_writes_anything(
+    photonfarm, tmp_path: Path, options: tuple[str, ...], sentence: str
+) -> None:
+    result = photonfarm("up", *options, timeout=60)
+    assert result.returncode == 3
+    assert sentence in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anything(
+    photonfarm, tmp_path: Path
+) -> None:
+    (tmp_path / "photonfarm.toml").write_text("[train]\nthreads = 0\n")
+    result = photonfarm("up", "room", timeout=60)
+    assert result.returncode == 2
+    assert "Invalid value for '--threads': 0 is not in the range x>=1" in result.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
+
+
+def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(photonfarm, tmp_path: Path) -> None:
+    """With 64 configurations planned before, some of them held out, one more may be of either side."""
+    assert photonfarm("submit", "room", "--modifications", "64", "--no-queue").returncode == 0
+    wanted = request_of(modifications=1, views=1, passes=1, seed=1)
+    check_hold_out(load_spec("room"), tmp_path / "store", 0.125, wanted)
+    with pytest.raises(SpecError, match="none is held out"):
+        check_hold_out(load_spec("room"), tmp_path / "none", 0.125, wanted)
+
+
+@pytest.mark.parametrize("spec", ["room", "cornell"])
+def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp_path: Path, spec: str) -> None:
+    """Configurations of `room`, views of the static `cornell`; three of them, so that one side is empty often."""
+    request = {"modifications": 3, "views": 1, "passes": 2, "seed": 0}
+    root = tmp_path / "store"
+    scene = Store(root, create=True).scene(submit(spec, root, None, **request).scene_id)
+    renderer = ShardRenderer(Store(root), worker="test", load=analytic.AnalyticScene.load)
+    for job in scene.missing_jobs():
+        renderer.render(scene.scene_id, job)
+    source = StoreSource(root, scene.scene_id)
+    rows = source.refresh()
+    assert len(rows) == 6
+    found = set()
+    for share in np.linspace(0.02, 0.998, 49):
+        sides = {is_row_held_out(source, int(row), share) for row in rows}
+        for store in (root, tmp_path / "none"):
+            if len(sides) == 2:
+                check_hold_out(load_spec(spec), store, share, request_of(**request))
+            else:
+                rule = "all are held out" if sides == {True} else "none is held out"
+                with pytest.raises(SpecError, match=rule):
+                    check_hold_out(load_spec(spec), store, share, request_of(**request))
+        found.add(frozenset(sides))
+    assert len(found) == 3, "each way of splitting was met"
+
+
+def test_up_without_a_trainer_says_so_before_it_writes_anything(tmp_path: Path) -> None:
+    code = "from photonfarm.shared import cli, verbs; verbs._installed().pop('train'); cli.main(['up', 'room'])"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "`photonfarm train` is not installed here" in result.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -1,7 +1,8 @@
-"""`photonfarm up` ended in the middle in several ways: nothing stays behind, and started again it goes on."""
+"""Farm and worker ended in the middle in several ways: nothing stays behind, and started again the farm goes on."""
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.submission import submit
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc"),
+]
 
 
 def processes_in(folder: Path) -> dict[int, str]:
@@ -31,8 +41,6 @@ def wait_until(reached: Callable[[], object], seconds: float = 120) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc")
 def interruptible() -> None:
     """A shell starts what it runs in the background deaf to SIGINT, and its children inherit that."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -74,3 +82,83 @@ def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_be
     assert markers() == 100
     assert json.loads((tmp_path / "out/report.json").read_text())["train_steps"] == max(so_far) + 200
     assert not processes_in(tmp_path)
+
+
+DOCKER_S = 10  # from its SIGTERM to its SIGKILL
+
+
+@pytest.fixture
+def endless_room(small_room: Path) -> Path:
+    """`small_room` with as many samples per pixel as there may be: native code that is busy for minutes."""
+    small_room.write_text(re.sub(r"(?m)^half_spp = .*$", "half_spp = 65536", small_room.read_text()))
+    return small_room
+
+
+def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[bytes]:
+    """A verb in a folder, with what it says in the file `said`."""
+    with (folder / "said").open("wb") as said:
+        return subprocess.Popen(
+            [sys.executable, "-m", "photonfarm.shared.cli", *verb],
+            cwd=folder, stderr=said, start_new_session=True, preexec_fn=interruptible, env=os.environ | environment,
+        )  # fmt: skip
+
+
+def wait_for_native_code(folder: Path) -> None:
+    """The base is written right before the first sample is rendered."""
+    wait_until(lambda: list(folder.glob("store/scenes/*/base.json")))
+    time.sleep(3)
+
+
+def assert_nothing_is_torn(folder: Path) -> None:
+    (scene,) = Store(folder / "store").scenes()
+    assert isinstance(scene, SceneStore)
+    assert scene.has_base()
+    assert scene.committed_jobs() == set()
+    assert not [file for file in scene.folder.glob("plans/*/*/c.*") if file.parent.name in ("radiance", "depth")]
+
+
+@pytest.mark.parametrize(
+    ("signals", "code", "within_s"),
+    [
+        ([signal.SIGINT], 130, DOCKER_S),
+        ([signal.SIGTERM], 143, DOCKER_S),
+        ([signal.SIGINT, signal.SIGINT], 130, 4),
+    ],
+)
+def test_up_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
+    tmp_path: Path, endless_room: Path, signals: list[signal.Signals], code: int, within_s: float
+) -> None:
+    options = ("--modifications", "8", "--views", "1", "--shard-rows", "4", "--hold-out", "0.5")
+    farm = started(tmp_path, "up", endless_room.name, *options)
+    wait_for_native_code(tmp_path)
+    told = time.monotonic()
+    for number in signals:
+        farm.send_signal(number)
+        time.sleep(0.5)
+    assert farm.wait(60) == code
+    assert time.monotonic() - told < within_s
+    assert not processes_in(tmp_path)
+    said = (tmp_path / "said").read_text()
+    assert said.count("stopping; a job in hand that is not nearly done will be rendered again") == 1
+    for log in (tmp_path / "said", *(tmp_path / "run").glob("*.log")):
+        assert "Traceback" not in log.read_text()
+    assert_nothing_is_torn(tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_work_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
+    tmp_path: Path, endless_room: Path, number: signal.Signals
+) -> None:
+    with EmbeddedRedis(tmp_path / "redis") as redis:
+        submit(str(endless_room), tmp_path / "store", redis.url, modifications=4, views=1, passes=1, seed=0)
+        worker = started(tmp_path, "work", PHOTONFARM_REDIS_URL=redis.url)
+        wait_for_native_code(tmp_path)
+        told = time.monotonic()
+        worker.send_signal(number)
+        assert worker.wait(60) == 0
+        assert time.monotonic() - told < DOCKER_S
+        assert processes_in(tmp_path).keys() == {redis.pid}
+    said = (tmp_path / "said").read_text()
+    assert said.count("stopping; a job in hand that takes longer than 5 s will be rendered again") == 1
+    assert "Traceback" not in said
+    assert_nothing_is_torn(tmp_path)

@@ -13,7 +13,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.shared.queue import connect, queue_status, reconcile
+from photonfarm.renderer.worker import GRACE_S
+from photonfarm.shared.queue import STARTS, connect, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
@@ -145,6 +146,40 @@ def test_sigterm_lets_the_job_at_hand_be_finished(
     assert done + 1 <= len(scene.committed_jobs()) <= done + 2
     status = queue_status(connection)
     assert (status.running, status.workers) == (0, 0)
+
+
+def test_a_job_that_outlasts_the_grace_is_killed_and_free_at_once(
+    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
+) -> None:
+    """Nor does the start that was cut short count towards those after which a job is given up."""
+    scene = planned(2)
+    running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), heartbeat_ttl_s=60.0)
+    connection = connect(redis_server.url)
+    analytic.wait_for(lambda: connection.keys(f"{STARTS}*"))
+    child, told = analytic.child_of(running), time.monotonic()
+    running.send_signal(signal.SIGTERM)
+    assert running.wait(9) == 0
+    assert time.monotonic() - told > GRACE_S - 0.5
+    assert not Path(f"/proc/{child}").exists()
+    assert scene.committed_jobs() == set()
+    status = queue_status(connection)
+    assert (status.running, status.workers, status.failed) == (0, 0, {})
+    assert not connection.keys(f"{STARTS}*")
+    said = running.stderr.read().decode()
+    assert said.count("stopping; a job in hand that takes longer than 5 s will be rendered again") == 1
+    assert "Traceback" not in said
+
+
+def test_a_child_in_a_long_job_ends_soon_after_its_supervisor(
+    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
+) -> None:
+    scene = planned(2)
+    running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60))
+    analytic.wait_for(lambda: queue_status(connect(redis_server.url)).running == 1)
+    child = analytic.child_of(running)
+    running.kill()
+    analytic.wait_for(lambda: not Path(f"/proc/{child}").exists(), 9)
+    assert "Traceback" not in running.stderr.read().decode()
 
 
 def test_a_second_signal_ends_the_worker_at_once(

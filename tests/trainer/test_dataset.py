@@ -5,13 +5,13 @@ import pytest
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.view import Camera
-from photonfarm.trainer.dataset import Compact, is_held_out
+from photonfarm.trainer.dataset import Compact, is_row_held_out
 from photonfarm.trainer.feed import Feed
 
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
     source = make_source(800, views=4)
-    held = [is_held_out(source, row, 1 / 8) for row in range(800)]
+    held = [is_row_held_out(source, row, 1 / 8) for row in range(800)]
     sides = {side: {source.modification_key(r) for r in range(800) if held[r] is side} for side in (True, False)}
     assert not sides[True] & sides[False]
     assert abs(len(sides[True]) - 25) <= 3 * np.sqrt(200 / 8 * 7 / 8), "binomial, 3 σ"
@@ -19,13 +19,13 @@ def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
 
 def test_what_is_held_out_for_a_small_share_is_held_out_for_a_larger_one(make_source) -> None:
     source = make_source(200)
-    small, large = ({r for r in range(200) if is_held_out(source, r, share)} for share in (1 / 16, 1 / 4))
+    small, large = ({r for r in range(200) if is_row_held_out(source, r, share)} for share in (1 / 16, 1 / 4))
     assert small < large
 
 
 def test_a_static_scene_is_split_by_views(make_source) -> None:
     source = make_source(200, moving=False)
-    held = sum(is_held_out(source, row, 1 / 4) for row in range(200))
+    held = sum(is_row_held_out(source, row, 1 / 4) for row in range(200))
     assert abs(held - 50) <= 3 * np.sqrt(200 * 3 / 16), "binomial, 3 σ"
 
 

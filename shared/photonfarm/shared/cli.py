@@ -158,7 +158,10 @@ def status(store: Path, redis_url: str, as_json: bool) -> None:
 )
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
 def up(spec: str, store: Path, **options: Any) -> None:
-    """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done."""
+    """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
+
+    Ctrl-C stops it within seconds; the same command goes on from there.
+    """
     from photonfarm.shared.up import run_farm
 
     try:

@@ -226,7 +226,7 @@ def load_spec(path: str | Path) -> SceneSpec:
     """
     file = find_spec(str(path))
     try:
-        described = tomllib.loads(file.read_text())
+        described = tomllib.loads(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
     except tomllib.TOMLDecodeError as error:

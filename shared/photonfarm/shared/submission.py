@@ -26,7 +26,7 @@ class Submission:
 
 def preview(spec: str, store: Path, *, shard_rows: int | None = None, **request: int) -> Submission:
     """What `submit` would plan; nothing is written."""
-    loaded, wanted = load_spec(spec), _request(**request)
+    loaded, wanted = load_spec(spec), request_of(**request)
     if not store.exists():
         return Submission(loaded.scene_id, None, wanted.samples, 0, None, dry_run=True)
     planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
@@ -41,7 +41,7 @@ def submit(
     Jobs that have failed are tried again.
     Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
     """
-    loaded, wanted = load_spec(spec), _request(**request)
+    loaded, wanted = load_spec(spec), request_of(**request)
     opened = Store(store, create=True)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
     try:
@@ -54,5 +54,6 @@ def submit(
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
 
 
-def _request(*, modifications: int, views: int, passes: int, seed: int) -> Request:
+def request_of(*, modifications: int, views: int, passes: int, seed: int) -> Request:
+    """A request by the names of the options; raises SpecError."""
     return Request.of(modifications=modifications, views_per_modification=views, passes=passes, seed=seed)

@@ -9,60 +9,67 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.estimate import stated
+from photonfarm.shared.hold_out import check_hold_out
 from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import SCENES_VARIABLE, find_spec
+from photonfarm.shared.scene import SCENES_VARIABLE, find_spec, load_spec
 from photonfarm.shared.store import Store, store_errors
-from photonfarm.shared.submission import submit
+from photonfarm.shared.submission import request_of, submit
 
 POLL_S = 0.5
 PLAIN_LINE_S = 15.0  # between lines where there is no terminal to draw bars on
-STOP_S = 120.0  # for a process to finish its job or to write its checkpoint
+STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives us 10 s
+AT_ONCE_S = 1.0  # for them to end when asked again, which is in the middle of a job
 
 Process = subprocess.Popen[bytes]
 
 
 def run_farm(
-    spec: str, store: Path, *, workers: int, run: Path, train_steps: int, hold_out: float, out: Path, **request: int
+    spec: str,
+    store: Path,
+    *,
+    workers: int,
+    run: Path,
+    train_steps: int,
+    hold_out: float,
+    out: Path,
+    shard_rows: int | None = None,
+    **request: int,
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
-    Started again after any interruption it goes on where it was, as the store and the trainer's checkpoints last.
+    What the trainer would refuse is refused before anything is written: SpecError for a hold-out that leaves one side
+    empty, click's UsageError for settings. Started again after any interruption it goes on where it was, as the store
+    and the trainer's checkpoints last.
     """
+    training = ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
+    if train_steps:
+        _check_arguments(training)
+        check_hold_out(load_spec(spec), store, hold_out, request_of(**request))
     console = Console(stderr=True, highlight=False)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(spec, store, redis.url, **request)
+        planned = submit(spec, store, redis.url, shard_rows=shard_rows, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         environment = _environment(spec, store, redis.url)
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
-            verbs["trainer"] = [
-                "train",
-                spec,
-                "--run",
-                str(run),
-                "--steps",
-                str(train_steps),
-                "--hold-out",
-                str(hold_out),
-            ]
-        running = {
-            name: stack.enter_context(_process(verb, environment, run / f"{name}.log")) for name, verb in verbs.items()
-        }
+            verbs["trainer"] = training
+        running = stack.enter_context(_processes(verbs, environment, run, console))
         preview = ["preview", spec, "--out", str(out / "preview.html")]
         try:
             _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), redis, console)
@@ -72,6 +79,17 @@ def run_farm(
             _call(preview, environment)  # what has been rendered can still be looked at
             raise
         _call(preview, environment)
+
+
+def _check_arguments(arguments: list[str]) -> None:
+    """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
+    root = click.get_current_context().find_root()
+    verb = cast(click.Group, root.command).get_command(root, arguments[0])
+    if verb is None:
+        raise click.UsageError(
+            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
+        )
+    verb.make_context(arguments[0], arguments[1:], parent=root).close()
 
 
 @contextmanager
@@ -102,23 +120,49 @@ def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
 
 
 @contextmanager
-def _process(arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
-    """One verb as a process of its own; on the way out it is asked to stop, and waited for."""
-    with log.open("ab") as output:
-        process = subprocess.Popen(
-            tied(_verb(arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-            start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, below
-        )  # fmt: skip
+def _processes(
+    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, console: Console
+) -> Iterator[dict[str, Process]]:
+    """Each verb as a process of its own; on the way out all are asked to stop at once, and waited for together."""
+    running: dict[str, Process] = {}
     try:
-        yield process
+        for name, verb in verbs.items():
+            running[name] = _start(verb, environment, logs / f"{name}.log")
+        yield running
     finally:
-        if process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(STOP_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        alive = [process for process in running.values() if process.poll() is None]
+        if alive:
+            console.print("stopping; a job in hand that is not nearly done will be rendered again")
+            _stop(alive)
+
+
+def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
+    with log.open("ab") as output:
+        return subprocess.Popen(
+            tied(_verb(arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
+        )  # fmt: skip
+
+
+def _stop(processes: list[Process]) -> None:
+    """End them gracefully, or less so after STOP_S or at a second Ctrl-C or SIGTERM; none is left."""
+    try:
+        _ask(processes, STOP_S)
+    finally:
+        _ask(processes, AT_ONCE_S)
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _ask(processes: list[Process], seconds: float) -> None:
+    """Send SIGTERM to all that are alive, and wait until they have ended or the time is over."""
+    for process in processes:
+        process.terminate()
+    end = time.monotonic() + seconds
+    with suppress(subprocess.TimeoutExpired):
+        for process in processes:
+            process.wait(max(end - time.monotonic(), 0.0))
 
 
 class _Farm:

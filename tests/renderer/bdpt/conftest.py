@@ -1,9 +1,9 @@
-"""What the integrator's tests share: the variant, one thread, and comparisons that keep the images of a failure."""
+"""What the integrator's tests share: the variant, and comparisons that keep the images of a failure."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +11,12 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer import backend
+from photonfarm.shared.statistics import block_z_test
 
 mi = backend.load(threads=1)
-import drjit as dr  # noqa: E402 - after the variant is set
-
-from photonfarm.shared.statistics import block_z_test  # noqa: E402
 
 Z_LIMIT = 4.5  # a normal z beyond this has probability 7e-6; with 16 blocks a test fails by chance once in 10 000 runs
 FAILURES = Path(os.environ.get("PHOTONFARM_TEST_FAILURES", "test-failures"))
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _one_thread() -> Iterator[None]:
-    """Light splats are added in a fixed order only by one thread."""
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(before)
 
 
 @pytest.fixture

@@ -10,8 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.renderer.cli import report_stability
-from photonfarm.renderer.stability import rows
+from photonfarm.renderer.stability import report, rows
 from photonfarm.renderer.stability.case import Settings
+from photonfarm.renderer.stability.pictures import FULL_Z, SIDE, of_z, sheet
+from photonfarm.renderer.stability.runner import plus_minus, run
 from photonfarm.renderer.stability.truths import known
 
 
@@ -24,12 +26,13 @@ def test_the_report_is_written_as_markdown_json_and_picture(tmp_path: Path) -> N
     assert result.exit_code == 0, result.output
     out = tmp_path / "out"
     text = (out / "stability.md").read_text(encoding="utf-8")
-    assert "**2 of 2 rows pass**" in text
+    assert "**2 of 2 rows pass**, 2 of 2 scenes. There are 36 rows; the others were not tried." in text
     assert "photonfarm report stability --quick --only 5 --only 30" in text
     assert "only the box filter is allowed" in text
     assert "smooth vertex normals" in text
     document = json.loads((out / "stability.json").read_text(encoding="utf-8"))
     assert (document["rows_passed"], document["rows_run"], document["rows"]) == (2, 2, 36)
+    assert (document["scenes_passed"], document["scenes_run"]) == (2, 2)
     assert {"z_max", "mean_ratio", "max_over_mean", "nan", "inf", "verdict"} <= set(document["results"][0])
     assert (out / "stability.png").stat().st_size > 0
 
@@ -50,11 +53,48 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     assert "## Failures" in (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
 
 
-def test_an_unknown_row_is_wrong_usage_and_names_the_known_ones(tmp_path: Path) -> None:
-    result = call(tmp_path, "--quick", "--only", "37")
+def test_rows_and_scenes_are_counted_apart_and_refusals_without_a_row_by_themselves() -> None:
+    (refused,) = run(rows.REFUSALS[0], quick=True)
+    one = replace(refused.result, row=1, name="one")
+    results = [
+        one,
+        replace(one, name="two", faults=("wrong",)),
+        replace(one, row=2),
+        replace(one, row=None, name="fog"),
+    ]
+    text = report.markdown(report.Report(results), "made so")
+    assert "**1 of 2 rows pass**, 2 of 3 scenes and 1 of 1 further refusals." in text
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("37", "there is no row 37; allowed are 1 to 36"),
+        ("0", "there is no row 0; allowed are 1 to 36"),
+        ("13-glass-caustc", "there is no hard scene '13-glass-caustc'; do you mean '13-glass-caustic'?"),
+    ],
+)
+def test_an_unknown_row_is_wrong_usage_and_answered_in_a_sentence(row: str, said: str, tmp_path: Path) -> None:
+    result = call(tmp_path, "--quick", "--only", row)
     assert result.exit_code == 2
-    assert "'37'" in result.stderr
-    assert "13-glass-caustic" in result.stderr
+    assert result.stderr.splitlines()[-1] == f"Error: Invalid value for --only: {said}"
+
+
+def test_errors_of_ratios_are_written_with_two_digits() -> None:
+    assert plus_minus(1.0088, 0.0135) == "1.009 ± 0.013"
+    assert plus_minus(1.000259974816193, 2.600382094274619e-05) == "1.000260 ± 0.000026"
+    assert plus_minus(0.9999996651233783, 3.044665915863112e-10) == "0.9999997 ± 3.0e-10"
+    assert plus_minus(1.0, 0.0) == "1.0000000 ± 0"
+
+
+def test_colours_of_z_are_those_of_the_legend() -> None:
+    z = np.array([[-FULL_Z, 0.0, FULL_Z], [-9.0, np.nan, 9.0]])
+    blue, white, red, black = (0, 0, 255), (255, 255, 255), (255, 0, 0), (0, 0, 0)
+    np.testing.assert_array_equal(of_z(z), [[blue, white, red], [blue, black, red]])
+    sheet_of_one = np.asarray(sheet([("one", np.zeros((SIDE, 3 * SIDE, 3), np.uint8))]))
+    legend = sheet_of_one[: sheet_of_one.shape[0] - SIDE]
+    for colour in (blue, red):
+        assert (legend == colour).all(axis=-1).any()
 
 
 def test_rows_are_chosen_by_number_name_label_and_settings() -> None:

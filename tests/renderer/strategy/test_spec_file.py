@@ -5,6 +5,7 @@ import pytest
 
 from photonfarm.renderer.strategy import spec_file
 from photonfarm.shared.errors import SpecError
+from photonfarm.shared.scene import find_spec, load_spec
 
 SETTINGS = {"transport": {"connections": 0, "light_ratio": 4.0, "half_spp": 9}, "photons": {"paths": 0, "depth": 2}}
 
@@ -59,6 +60,29 @@ def test_tables_that_are_not_there_are_added_with_the_file_s_line_ends(text: str
 def test_a_table_that_cannot_be_edited_in_place_is_refused(text: str) -> None:
     with pytest.raises(SpecError, match=r"spec: write \[transport\] and \[photons\] as tables with a line per key"):
         spec_file.put(text, SETTINGS, where="spec")
+
+
+def test_a_byte_order_mark_stays_and_such_a_file_can_be_loaded(tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + find_spec("cornell").read_bytes())
+    spec_file.write(file, SETTINGS)
+    assert file.read_bytes().startswith(b"\xef\xbb\xbf#")
+    assert load_spec(file).transport.half_spp == 9
+
+
+def test_numbers_that_are_not_finite_stay_as_they_are_and_are_refused_where_they_mean_something(tmp_path: Path) -> None:
+    text = SPEC + "\n[other]\na = nan\nb = -inf\n"
+    assert spec_file.put(text, SETTINGS, where="spec").endswith("\n[other]\na = nan\nb = -inf\n")
+    file = tmp_path / "a.toml"
+    for value in ("nan", "inf", "-inf"):
+        file.write_text(find_spec("cornell").read_text().replace("half_spp = 4", f"light_ratio = {value}"))
+        with pytest.raises(SpecError, match=f"transport.light_ratio = {value}: Input should be a finite number"):
+            load_spec(file)
+
+
+def test_what_is_no_toml_is_refused() -> None:
+    with pytest.raises(SpecError, match="spec: is not valid TOML"):
+        spec_file.put("[transport\n", SETTINGS, where="spec")
 
 
 def test_a_file_is_replaced_whole_and_keeps_its_mode(tmp_path: Path) -> None:

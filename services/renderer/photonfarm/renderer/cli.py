@@ -34,7 +34,10 @@ def doctor(store: Path, redis_url: str, as_json: bool) -> None:
 def work(
     store: Path, redis_url: str, name: str | None, scene_id: str | None, until_complete: bool, check: bool
 ) -> None:
-    """Render queued jobs into the store, on one core, until told to stop; start one per core."""
+    """Render queued jobs into the store, on one core, until told to stop; start one per core.
+
+    Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.
+    """
     from photonfarm.renderer import worker
 
     if check:
@@ -72,7 +75,8 @@ def scene_plan(spec: str, seconds: int | None, write: bool, again: bool, as_json
     loaded = load_spec(spec)
     backend.load(threads=1)
     from photonfarm.renderer.strategy import spec_file
-    from photonfarm.renderer.strategy.plan import lines, make_plan
+    from photonfarm.renderer.strategy.plan import make_plan
+    from photonfarm.renderer.strategy.printed import lines
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     plan = make_plan(loaded, file.parent, seconds=seconds, again=again, talk=partial(click.echo, err=True))
@@ -99,7 +103,7 @@ def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int
     try:
         scenes = rows.chosen(only, quick=quick)
     except ValueError as error:
-        raise click.UsageError(str(error)) from error
+        raise click.BadParameter(str(error), param_hint="--only") from error
     out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be rendered first
     found = report.examine(
         scenes, quick=quick, seed=seed, failures=out / "failures", tell=partial(click.echo, err=True)

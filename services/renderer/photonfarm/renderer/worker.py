@@ -27,8 +27,9 @@ import redis
 from pydantic import Field
 from redis import Redis
 from rq import SimpleWorker
-from rq.exceptions import DequeueTimeout
+from rq.exceptions import DequeueTimeout, InvalidJobOperation, NoSuchJobError
 from rq.serializers import JSONSerializer
+from rq.utils import as_text
 from rq.worker.base import StopRequested
 
 from photonfarm.renderer import jobs
@@ -53,6 +54,14 @@ STARTS_ALLOWED = 5
 """Starts of one job without an end, after which it counts as failed: it kills its workers."""
 
 STARTS_TTL_S = 6 * 3600
+
+GRACE_S = 5.0
+"""What a job in hand gets to end in once its worker is to stop: one that is nearly done is kept, and the worker is gone
+within the 10 s that Docker gives. A longer job is killed, and as it has no marker it is rendered again."""
+
+_QUEUE_TROUBLE = (QueueError, redis.RedisError, InvalidJobOperation, NoSuchJobError)
+"""Faults of the queue, not of the job: a Redis that lost its memory no longer knows the job in hand."""
+
 RQ_WORKER_TTL_S = 120
 """After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
 
@@ -94,9 +103,9 @@ def run_worker(
 ) -> None:
     """Render what is queued until told to stop, or with `until_complete` until nothing is missing.
 
-    SIGTERM and SIGINT end it after the current job, a second one at once. Further `settings` are those of
-    WorkerSettings. Raises QueueError if there is no Redis at the start (later outages are waited out), StoreError,
-    BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a second one at once. Further
+    `settings` are those of WorkerSettings. Raises QueueError if there is no Redis at the start (later outages are
+    waited out), StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
     """
     Store(store, create=True)
     queue.connect(redis_url).close()
@@ -131,6 +140,8 @@ class _Supervisor:
             while not self._stop.is_set():
                 started = time.monotonic()
                 code, message = self._run_child()
+                if code < 0 and self._stop.is_set():
+                    _free_job(self._settings)
                 if code == 0 or self._stop.is_set():
                     return
                 _raise_final(code, message)
@@ -175,6 +186,27 @@ class _Supervisor:
         self._stop.set()
         if self._child is not None:
             self._child.send_signal(signal.SIGKILL if again else signal.SIGTERM)
+        if not again:
+            threading.Thread(target=self._see_off, daemon=True).start()
+
+    def _see_off(self) -> None:
+        """End the child after the grace: its own handler waits for native code to return, which may take minutes."""
+        self._say(
+            f"worker {self._settings.name}: stopping; a job in hand that takes longer than {GRACE_S:g} s "
+            "will be rendered again"
+        )
+        time.sleep(GRACE_S)
+        if self._child is not None:
+            self._child.kill()
+
+
+def _free_job(settings: WorkerSettings) -> None:
+    """Let others have the job that a child was killed with at once, and do not count this start of it."""
+    with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
+        told = connection.get(queue.WORKER + settings.name)
+        queue.bury(connection, settings.name)
+        if told is not None:
+            connection.delete(STARTS + as_text(told).split()[-1])
 
 
 def _raise_final(code: int, message: str) -> None:
@@ -195,28 +227,36 @@ def _ending(code: int, message: str) -> str:
 
 def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     """The child's main function: settings from stdin, work, and the exit code; its last words go to stdout."""
-    with os.fdopen(os.dup(1), "w") as words:
-        os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
-        logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s")
-        settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
-        threading.Thread(target=_end_with_supervisor, daemon=True).start()
-        try:
-            store = Store(settings.store)
-            jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
-            return RenderWorker(settings, store, queue.connect(settings.redis_url)).run()
-        except PhotonfarmError as error:
-            words.write(f"{error}\n")
-            return error.exit_code
-        except redis.RedisError as error:
-            words.write(f"lost Redis: {error}\n")
-            return QueueError.exit_code
+    words = os.dup(1)
+    os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s")
+    settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_supervisor, daemon=True).start()
+    try:
+        store = Store(settings.store)
+        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
+        return RenderWorker(settings, store, queue.connect(settings.redis_url)).run()
+    except PhotonfarmError as error:
+        _leave_word(words, str(error))
+        return error.exit_code
+    except redis.RedisError as error:
+        _leave_word(words, f"lost Redis: {error}")
+        return QueueError.exit_code
+
+
+def _leave_word(words: int, message: str) -> None:
+    """Tell the supervisor, if it is still there."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(words, f"{message}\n".encode())
 
 
 def _end_with_supervisor() -> None:
-    """Stop after the current job once the supervisor is gone."""
+    """Stop once the supervisor is gone: after the job in hand, or in the middle of it after GRACE_S."""
     while os.read(0, 1):  # not through sys.stdin, whose lock would be held at the interpreter's end
         pass
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class RenderWorker(SimpleWorker):
@@ -313,7 +353,7 @@ class RenderWorker(SimpleWorker):
         ours = self._settings.scene_id in (None, job.id.rpartition("-")[0])
         if ours and isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
             self._fatal = error  # the next job would fail as well
-        elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
+        elif isinstance(error, Exception) and not isinstance(error, _QUEUE_TROUBLE):
             self._tainted = not isinstance(error, PhotonfarmError)
             with contextlib.suppress(redis.RedisError):
                 queue.record_failure(self.connection, job.id, f"{type(error).__name__}: {error}")

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from photonfarm.shared.hold_out import is_held_out
 from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
@@ -71,14 +72,13 @@ class SampleSource(Protocol):
         """The number of samples in all plans so far, complete or not."""
 
 
-def is_held_out(source: SampleSource, row: int, share: float) -> bool:
-    """Whether a row is kept from training: a hash of its configuration, not of when it arrived.
+def is_row_held_out(source: SampleSource, row: int, share: float) -> bool:
+    """Whether a row is kept from training, not by when it arrived but by what it is.
 
     All views and passes of a configuration are on one side. A static scene has one configuration; there the view
     decides, and all passes of a view are on one side.
     """
-    key = source.modification_key(row) if source.spec.groups else source.view_key(row)
-    return int.from_bytes(make_key("hold out", key)[:8], "little") < share * 2.0**64
+    return is_held_out(source.modification_key(row) if source.spec.groups else source.view_key(row), share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

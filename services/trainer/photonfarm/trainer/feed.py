@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self
 
 from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, is_held_out
+from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, is_row_held_out
 from photonfarm.trainer.settings import TrainSettings
 
 
@@ -117,7 +117,7 @@ class Feed:
 
     def _poll(self, seen: int) -> int:
         rows = self._source.refresh()
-        found = [(int(row), is_held_out(self._source, int(row), self._settings.hold_out)) for row in rows]
+        found = [(int(row), is_row_held_out(self._source, int(row), self._settings.hold_out)) for row in rows]
         with self._lock:
             self._arrived.extend(found)
             self._complete = 0 < self._source.planned() <= seen + len(rows)

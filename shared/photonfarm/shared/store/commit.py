@@ -121,7 +121,7 @@ class JobWriter:
                 if name not in self._shards:
                     self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
                 self._shards[name].append(row, values)
-            except Exception as error:  # noqa: BLE001 - raised again where rows are given
+            except Exception as error:
                 self._error = error
 
     def _join(self) -> None:

@@ -23,7 +23,7 @@ from photonfarm.shared.statistics import BlockTest, block_z_test
 from . import weight_check
 from .cameras import scaled
 from .case import ALL, Effort, Images, Scene, Settings
-from .runner import ROUNDING, SIGNIFICANCE
+from .runner import ROUNDING, SIGNIFICANCE, plus_minus
 from .truths import TRUTH_SEEDS, load, render
 
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
@@ -110,8 +110,8 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
     everything = list(checks(long=long))
     for name in names:
         if not any(check.name.startswith(name) for check in everything):
-            known = ", ".join(check.name for check in everything)
-            raise ValueError(f"no invariance is called {name!r} or begins so; allowed are {known}")
+            known = ", ".join(dict.fromkeys(f"{check.name.partition('-')[0]}-" for check in everything))
+            raise ValueError(f"no invariance is called {name!r} or begins so; they begin with {known}")
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
 
 
@@ -147,7 +147,7 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
         wanted = effort if settings.light_ratio else replace(effort, resolution=np.inf)
         test, said = _compare(_images(scene, settings, effort, 0), truth, wanted)
         faults += [f"{settings}: {fault}" for fault in said]
-        ratios.append(f"{settings}: {test.mean_ratio:.4f} ± {test.mean_ratio_standard_error:.4f}")
+        ratios.append(f"{settings}: {plus_minus(test.mean_ratio, test.mean_ratio_standard_error)}")
     return faults, "; ".join(ratios)
 
 
@@ -317,7 +317,8 @@ def _compare(a: Images, b: Images, effort: Effort) -> tuple[BlockTest, list[str]
 
 
 def _ratio(test: BlockTest) -> str:
-    return f"mean ratio {test.mean_ratio:.4f} ± {test.mean_ratio_standard_error:.4f}, largest z {test.z_max:.1f}"
+    ratio = plus_minus(test.mean_ratio, test.mean_ratio_standard_error)
+    return f"mean ratio {ratio}, largest z {test.z_max:.1f}"
 
 
 def _differences(a: Images, b: Images) -> Images:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 
 from . import cameras, closed_form, lights, surfaces
@@ -30,10 +31,7 @@ def chosen(
     for wanted in only:
         named = [item for item in everything if _is_called(item, wanted)]
         if not named:
-            raise ValueError(
-                f"no hard scene is called {wanted!r}; allowed are the rows 1 to {ROWS}, and "
-                f"{', '.join(item.label for item in everything)}"
-            )
+            raise ValueError(_unknown(wanted, everything))
         if not any(item in left for item in named):
             raise ValueError(
                 f"{wanted}: "
@@ -41,6 +39,16 @@ def chosen(
                 + " (connections,light_ratio)"
             )
     return [item for item in left if not only or any(_is_called(item, wanted) for wanted in only)]
+
+
+def _unknown(wanted: str, everything: Sequence[HardScene | Refusal]) -> str:
+    """One sentence; a name that is almost right is answered with the right one."""
+    if wanted.lstrip("-").isdigit():
+        return f"there is no row {wanted}; allowed are 1 to {ROWS}"
+    known = [name for item in everything for name in (item.label, item.name)]
+    near = difflib.get_close_matches(wanted, known, n=1)
+    meant = f"; do you mean {near[0]!r}?" if near else f"; allowed are the rows 1 to {ROWS} and names as in the report"
+    return f"there is no hard scene {wanted!r}{meant}"
 
 
 def _is_called(item: HardScene | Refusal, wanted: str) -> bool:

@@ -7,6 +7,7 @@ effort's resolution (else the test could not fail); and the brightest pixel keep
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,10 @@ from .truths import load, render
 SIGNIFICANCE = 4e-6
 """Probability that one right scene fails with one pair of settings: 0.1 % for 250 of them, more than there are."""
 ROUNDING = 1e-4
-"""Standard errors below this part of the mean count as this: ray offsets and float32 sums are not held to more."""
+"""Standard errors below this part of the mean count as this: ray offsets and float32 sums are not held to more.
+
+In the shining sphere (row 1) `path` itself is 0.04 % too bright at depth 2 and 0.07 % at depth 3.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +164,14 @@ def compare(images: Images, truth: Images, blocks: int) -> BlockTest:
     limit = two_sided_limit(1 - (1 - SIGNIFICANCE) ** (1 / z.size))
     ratio_error = float(each.std(ddof=1) / np.sqrt(len(each)))
     return BlockTest(z, float(np.abs(z).max()), limit, float(each.mean()), ratio_error, bool(np.isfinite(images).all()))
+
+
+def plus_minus(value: float, standard_error: float) -> str:
+    """A value near 1, two digits of its error, and as many of the value, at most float32's: "1.000260 ± 0.000026"."""
+    if not 0 < standard_error < np.inf:
+        return f"{value:.7f} ± {standard_error:g}"
+    digits = min(max(1 - math.floor(math.log10(standard_error)), 0), 7)
+    return f"{value:.{digits}f} ± " + (f"{standard_error:.{digits}f}" if digits < 7 else f"{standard_error:.1e}")
 
 
 def _max_over_mean(images: Images) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -17,7 +18,7 @@ _DECIDED = ("connections", "light_ratio", "half_spp")
 
 
 def digest(spec: SceneSpec) -> str:
-    """32 hexadecimal digits: the scene without what a plan decides, the candidates, and all code that renders.
+    """32 hexadecimal digits: the scene without what a plan decides, the candidates, the machine, all code that renders.
 
     So a plan that is written into its spec does not call for another one.
     """
@@ -25,7 +26,27 @@ def digest(spec: SceneSpec) -> str:
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
     scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
     scene = SceneSpec.model_validate(scene.model_dump())  # without the id that the copy has kept
-    return make_key("scene plan", scene.scene_id, repr(GRID), repr(sorted(versions().items())), _revision()).hex()
+    return make_key("scene plan", scene.scene_id, repr(GRID), repr(_machine()), _revision()).hex()
+
+
+def _machine() -> tuple[object, ...]:
+    """What times depend on beside the scene and the code: processor, cores, variant, versions of the packages.
+
+    The number of threads is not among them, as a pilot has one.
+    """
+    import mitsuba
+
+    return _processor(), os.cpu_count(), mitsuba.variant(), sorted(versions().items())
+
+
+def _processor() -> str:
+    """The model's name, where the system tells it; its kind elsewhere."""
+    try:
+        described = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        described = ""
+    names = [line.partition(":")[2].strip() for line in described.splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def _revision() -> bytes:

@@ -60,6 +60,7 @@ class Measurement(Frozen):
 
     film: Film  # of the pilot
     spp: int
+    half_spp: int  # of the spec when it was measured: what the time in `relative_cost` is that of
     views: int
     max_depth: int
     modelled: tuple[str, ...]
@@ -144,6 +145,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     return Measurement(
         film=film,
         spp=spp,
+        half_spp=half_spp,
         views=choice.views,
         max_depth=depth,
         modelled=tuple(content.sentences(found, depth)),

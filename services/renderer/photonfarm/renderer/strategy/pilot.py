@@ -7,6 +7,7 @@ with them most rare bright samples are the same, and differences between candida
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -37,7 +38,10 @@ class Candidate:
     light_ratio: float  # light paths per eye path; 0: plain path tracing
 
     def __str__(self) -> str:
-        return f"({self.connections}, {self.light_ratio:g})"
+        if not self.light_ratio:
+            return "plain path tracing"
+        few = {0: "without connections", 1: "with 1 connection"}
+        return f"light ratio {self.light_ratio:g} " + few.get(self.connections, f"with {self.connections} connections")
 
 
 PLAIN = Candidate(0, 0.0)
@@ -131,7 +135,6 @@ def _most_measured(pilot: _Pilot, every: Sequence[Candidate]) -> list[Candidate]
 class _Record:
     """One candidate's measurements in one view."""
 
-    tally: Tally = field(default_factory=Tally)
     errors: list[float] = field(default_factory=list)  # relMSE of an image, by each pair
     times_s: list[float] = field(default_factory=list)
 
@@ -158,6 +161,7 @@ class _Pilot:
         self._scouting_s = 0.0
         self.weights: dict[int, F32] = {}  # by view; black views are left out
         self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
+        self._tallies = {c: Tally() for c in candidates}
         self._shared: dict[int, list[float]] = {}  # by view, of each pair
 
     # ------------------------------------------------------------------------------------------------------ rendering
@@ -192,7 +196,7 @@ class _Pilot:
         self._shared.setdefault(view, []).append(shared)
         for (candidate, (a, b)), error in zip(pairs.items(), errors, strict=True):
             self._records[candidate][view].errors.append(error)
-            self._records[candidate][view].tally.add(a, b, self.weights[view])
+            self._tallies[candidate].add(a, b, self.weights[view], view)
 
     def _render(self, render: Render, candidate: Candidate, seed: int) -> F32:
         image = render(candidate, seed, self._spp)
@@ -220,14 +224,7 @@ class _Pilot:
         return self._time(candidate) * self._later.get(candidate, 1.0)
 
     def _missed(self, candidate: Candidate) -> float:
-        return float(
-            np.mean(
-                [
-                    missed(record.tally, [self._records[c][view].tally for c in self._candidates if c != candidate])
-                    for view, record in self._records[candidate].items()
-                ]
-            )
-        )
+        return missed(self._tallies[candidate], [tally for c, tally in self._tallies.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
         """relMSE that counts, by pairs and views, (pairs, views)."""
@@ -282,9 +279,11 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
     chosen = next(row for row in rows if row.candidate == best)
     reasons = []
     if best == PLAIN:
-        reasons.append("no candidate with light paths reaches the same error sooner than plain path tracing")
+        why = "nothing else reaches its error sooner" if rows[1:] else "there is nothing else to compare it with"
+        reasons.append(f"{best} is best: {why}")
     else:
-        reasons.append(f"{best} reaches the error of plain path tracing in {share(chosen)} of its time")
+        share = plus_minus(chosen.relative_cost, chosen.spread)
+        reasons.append(f"{best} is best: it reaches the error of {PLAIN} in {share} of the time")
     reasons += [
         f"{row.candidate} misses light that others find: {row.missed / row.error:.0%} of its error is inferred from "
         "that, and the true one may be larger"
@@ -293,12 +292,23 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
     ]
     if shared > 0.5 * chosen.error:
         reasons.append(
-            "rare bright samples that no candidate avoids are left out of the comparison: they add about "
-            f"{shared:.2g} to the relMSE of an image, which is {chosen.error:.2g} without them"
+            "rare bright samples that all settings compared have in common are left out of the comparison: they add "
+            f"about {shared:.2g} to the relMSE of an image, which is {chosen.error:.2g} without them"
         )
     return tuple(reasons)
 
 
-def share(row: Measured) -> str:
-    """A relative cost in words, "0.34 ± 0.02"."""
-    return f"{row.relative_cost:.3g}" + ("" if row.spread is None else f" ± {row.spread:.1g}")
+def plus_minus(value: float, spread: float | None) -> str:
+    """A value and its standard error, "0.34 ± 0.02", as `rounded`."""
+    return " ± ".join(filter(None, rounded(value, spread)))
+
+
+def rounded(value: float, spread: float | None) -> tuple[str, str]:
+    """A value and its standard error to the same decimal place; the second is empty where there is no error.
+
+    It is that of the error's first digit, but tenths for errors of 1 to 10 and ones above.
+    """
+    if not spread:
+        return f"{value:.3g}", ""
+    places = min(max(-math.floor(math.log10(spread)), int(spread < 10)), 6)
+    return f"{value:.{places}f}", f"{spread:.{places}f}"

@@ -30,10 +30,6 @@ class Saving:
     factor: float  # time of the others over that of the plan's, to equal error
     spread: float | None  # its standard error
 
-    def __str__(self) -> str:
-        spread = "" if self.spread is None else f" ± {self.spread:.1g}"
-        return f"the error of {self.over} in 1/{self.factor:.3g}{spread} of its time"
-
 
 @dataclass(frozen=True, slots=True)
 class Plan:
@@ -138,63 +134,3 @@ def _saving(row: Row, chosen: Row) -> Saving:
         return Saving(row.candidate, factor, None)
     relative = np.hypot(row.spread / row.relative_cost, chosen.spread / chosen.relative_cost)
     return Saving(row.candidate, factor, float(factor * relative))
-
-
-def lines(plan: Plan) -> list[str]:
-    """The plan for people to read."""
-    m = plan.measurement
-    real = m.film == plan.spec.film and m.spp == plan.spec.transport.half_spp
-    settings = f"{m.film.width} × {m.film.height} pixels, {m.spp} spp"
-    if not real:
-        settings += f" (the spec has {plan.spec.film.width} × {plan.spec.film.height}, {plan.spec.transport.half_spp})"
-    origin = "kept from an earlier pilot; --again measures anew" if plan.cached else "measured now"
-    return [
-        f"{plan.spec.name}: {plan.candidate.connections} connections, light ratio {plan.candidate.light_ratio:g}, "
-        f"half_spp {plan.half_spp}, photons {plan.photons.paths} × {plan.photons.depth}",
-        "",
-        "Modelled",
-        *(f"  {sentence}" for sentence in m.modelled),
-        f"  {plan.photons_reason}",
-        f"  both half-estimates: they cost {plan.halves_overhead:.0%} more than one image of twice the samples, and "
-        "without them no error could be measured free of noise",
-        "Left out",
-        *(f"  {sentence}" for sentence in (*m.left_out, *_unchosen(plan)) or ("nothing",)),
-        "Why",
-        *(f"  {reason}" for reason in (*m.reasons, *_too_costly(plan))),
-        *(f"  it reaches {saving}" for saving in plan.savings),
-        "",
-        *_table(plan),
-        "",
-        f"{origin}: {m.views} views, {settings}; {m.spent_s:.0f} s of CPU, {m.compiling_s:.0f} of them not measuring",
-    ]
-
-
-def _unchosen(plan: Plan) -> list[str]:
-    if plan.measurement.left_out or not plan.measurement.rows:
-        return []
-    if not plan.candidate.light_ratio:
-        return ["light paths: no ratio of them pays here"]
-    if not plan.candidate.connections:
-        return ["connections: light paths that are joined to the camera alone reach the same error sooner"]
-    return []
-
-
-def _too_costly(plan: Plan) -> list[str]:
-    best = plan.measurement.candidate
-    if plan.candidate == best or not plan.measurement.rows:
-        return []
-    return [
-        f"but one sample of {best} costs more than a half-estimate does now, so {plan.candidate} is taken; "
-        f"{best} will be with a larger half_spp"
-    ]
-
-
-def _table(plan: Plan) -> list[str]:
-    m = plan.measurement
-    head = f"{'connections':>11} {'light ratio':>11} {'images':>6} {'relMSE':>9} {'ms':>8} {'error × time':>16}"
-    return [head] + [
-        f"{row.connections:>11} {row.light_ratio:>11g} {row.images:>6} {row.error:>9.3g} "
-        f"{1e3 * row.time_s(m.spp):>8.1f} {row.relative_cost:>8.3g} ± {row.spread or 0:<5.1g}"
-        + ("  chosen" if row.candidate == plan.candidate else "")
-        for row in m.rows
-    ]

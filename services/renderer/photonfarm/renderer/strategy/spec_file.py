@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -12,6 +13,9 @@ from typing import Any
 
 from photonfarm.shared import scene
 from photonfarm.shared.errors import SpecError
+
+BYTE_ORDER_MARK = "\ufeff"
+"""Some editors begin a file with it."""
 
 Settings = Mapping[str, Mapping[str, int | float]]
 """Table → key → number."""
@@ -47,18 +51,27 @@ def write(file: Path, settings: Settings) -> None:
 
 def put(text: str, settings: Settings, *, where: str) -> str:
     """A TOML document with other numbers in some of its tables; SpecError if it cannot be edited safely."""
-    wanted = _merged(tomllib.loads(text), settings)
-    changed = text
-    for table, entries in settings.items():
-        changed = _put_table(changed, table, entries)
+    body = text.removeprefix(BYTE_ORDER_MARK)
+    mark = text[: len(text) - len(body)]
     try:
-        safe = tomllib.loads(changed) == wanted
+        wanted = _merged(tomllib.loads(body), settings)
+    except tomllib.TOMLDecodeError as error:
+        raise SpecError(f"{where}: is not valid TOML: {error}") from error
+    for table, entries in settings.items():
+        body = _put_table(body, table, entries)
+    try:
+        safe = _canonical(tomllib.loads(body)) == _canonical(wanted)
     except tomllib.TOMLDecodeError:
         safe = False
     if not safe:
         tables = " and ".join(f"[{table}]" for table in settings)
         raise SpecError(f"{where}: write {tables} as tables with a line per key, so that they can be edited in place")
-    return changed
+    return mark + body
+
+
+def _canonical(document: dict[str, Any]) -> str:
+    """Text to compare by: a NaN equals itself in it."""
+    return json.dumps(document, sort_keys=True, default=repr)
 
 
 def _merged(document: dict[str, Any], settings: Settings) -> dict[str, Any]:

@@ -1,0 +1,55 @@
+"""What is kept from training: whole configurations or, of a static scene, views, by a hash of what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.modification import Modification, rest
+from photonfarm.shared.plan import SHARD_ROWS, Known, PlannedRows, Request, expand
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import Store
+
+
+def check_hold_out(spec: SceneSpec, store: Path, share: float, request: Request) -> None:
+    """Raise SpecError if of all that is planned or requested nothing or everything would be held out.
+
+    Nothing is written. The trainer finds the same, but only once all is rendered.
+    """
+    wanted = request.model_copy(update={"passes": 1})
+    if spec.groups:
+        wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
+    keys = {key for rows in _planned(spec, store, wanted) for key in _units(spec, rows)}
+    held_out = sum(is_held_out(key, share) for key in keys)
+    found = f"hold_out = {share:g}: of the {len(keys)} {'configurations' if spec.groups else 'views'} planned"
+    if not held_out:
+        raise SpecError(f"{found} none is held out, and one is needed to validate on; raise it, or plan more")
+    if held_out == len(keys):
+        raise SpecError(f"{found} all are held out, and none is left to train on; lower it, or plan more")
+
+
+def is_held_out(unit: Key, share: float) -> bool:
+    """Whether what has this key is kept from training: a configuration or, of a static scene, a view."""
+    return int.from_bytes(make_key("hold out", unit)[:8], "little") < share * 2.0**64
+
+
+def _planned(spec: SceneSpec, store: Path, wanted: Request) -> Iterator[PlannedRows]:
+    """The rows of a scene's plans, and those of a request."""
+    if store.exists() and spec.scene_id in (opened := Store(store)).scene_ids():
+        yield from (plan.rows for plan in opened.scene(spec.scene_id).plans())
+    new = expand(spec, wanted, Known(), first_job=0, shard_rows=SHARD_ROWS).rows
+    if new is not None:
+        yield new
+
+
+def _units(spec: SceneSpec, rows: PlannedRows) -> Iterator[Key]:
+    """The keys of the configurations in these rows; of a static scene, those of its views."""
+    if spec.groups:
+        vectors = rows.modification[~np.isnan(rows.modification).any(axis=(1, 2))]
+        return (Modification.from_vector(vector).key(spec.scene_id) for vector in vectors)
+    configuration = rest(spec).key(spec.scene_id)
+    return (make_key("view", configuration, view) for view in rows.view[~np.isnan(rows.view).any(axis=1)])

@@ -1,0 +1,61 @@
+"""What a loaded scene gives: images of its seeds, buffers of its camera."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from photonfarm.renderer import backend
+from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.shared.modification import rest, sample_modification
+from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.view import Camera, View
+
+
+def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene, somewhere: View) -> None:
+    room.apply(rest(room.spec))
+    first, again, other = (room.render_half(somewhere, seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert np.any(first != other)
+    assert first.shape == (16, 24, 3)
+    assert first.dtype == np.float32
+
+
+def test_the_camera_of_the_sensor_is_that_of_the_spec(room: LoadedScene, somewhere: View) -> None:
+    mi = backend.load(1)
+    spec = room.spec
+    sensor = room._sensor.aim(somewhere)
+    camera = Camera.of(somewhere, spec)
+    x, y = np.meshgrid((np.arange(24) + 0.5) / 24, (np.arange(16) + 0.5) / 16)
+    place = mi.Point2f(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
+    ray, _ = sensor.sample_ray(0, 0, place, mi.Point2f(0.5))
+    np.testing.assert_allclose(np.array(ray.d).T.reshape(16, 24, 3), camera.rays(), atol=2e-6)
+    along = camera.rays() @ camera.forward
+    start = camera.origin + camera.rays() * (spec.view.near / along)[..., None]
+    np.testing.assert_allclose(np.array(ray.o).T.reshape(16, 24, 3), start, atol=1e-5)
+    np.testing.assert_allclose(np.array(ray.maxt).reshape(16, 24), (spec.view.far - spec.view.near) / along, rtol=1e-5)
+
+
+def test_buffers_agree_with_rays_through_the_moved_scene(room: LoadedScene, somewhere: View) -> None:
+    mi = backend.load(1)
+    modification = sample_modification(room.spec, 2, 3)
+    room.apply(modification)
+    camera = Camera.of(somewhere, room.spec)
+    depth = room.buffers(somewhere).depth
+    rays = camera.rays().reshape(-1, 3)
+    si = room.scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(float, camera.origin)), mi.Vector3f(*rays.T)))
+    hit = camera.origin + rays * (depth.ravel() / (rays @ camera.forward))[:, None]
+    np.testing.assert_allclose(hit, np.array(si.p).T, atol=2e-4)
+
+
+def test_a_static_scene_has_one_configuration(small: Callable[..., SceneSpec]) -> None:
+    cornell = LoadedScene.load(small(load_spec("cornell")))
+    assert not cornell.spec.groups
+    cornell.apply(rest(cornell.spec))
+    view = View(np.array([0, 1, 1.5], np.float32), np.array([0, 1, -1], np.float32))
+    assert cornell.render_half(view, 0).mean() > 0.05
+
+
+def test_no_photons_are_traced_where_the_spec_wants_none(small: Callable[..., SceneSpec]) -> None:
+    spec = small(load_spec("cornell"))
+    spec = spec.model_copy(update={"photons": spec.photons.model_copy(update={"paths": 0})})
+    assert LoadedScene.load(spec).photons(1) is None

@@ -3,6 +3,7 @@ worker's child that renders it. Arguments: seconds that each half takes, and a p
 "no backend": does not load).
 """
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -89,8 +90,10 @@ def command(pause_s: float = 0.0, purpose: str = "") -> tuple[str, ...]:
     return (sys.executable, str(Path(__file__)), str(pause_s), purpose)
 
 
-def start_worker(store: Path, url: str, child: tuple[str, ...], **settings: Any) -> subprocess.Popen[bytes]:
-    """A supervisor in a process of its own; its exit code is that of the command line."""
+def start_worker(
+    store: Path, url: str, child: tuple[str, ...], log: Path | None = None, **settings: Any
+) -> subprocess.Popen[bytes]:
+    """A supervisor in a process of its own; its exit code is that of the command line. It talks to `log` or a pipe."""
     code = """
 import json, sys
 from photonfarm.renderer.worker import run_worker
@@ -103,7 +106,8 @@ except PhotonfarmError as error:
 """
     settings = {"heartbeat_ttl_s": 2.0, "idle_s": 1, **settings}
     arguments = json.dumps([str(store), url, child, settings])
-    return subprocess.Popen([sys.executable, "-c", code, arguments], stderr=subprocess.PIPE)
+    with log.open("ab") if log else contextlib.nullcontext(subprocess.PIPE) as stderr:
+        return subprocess.Popen([sys.executable, "-c", code, arguments], stderr=stderr)
 
 
 def child_of(supervisor: subprocess.Popen[bytes]) -> int | None:

@@ -1,16 +1,16 @@
 # The images of docker-compose.yml: build one with --target redis, renderer or trainer.
-# They run as an unprivileged user; the store, the queue's journal and the scenes come in as volumes.
+# They run as an unprivileged user and write to nothing but volumes and /tmp; the store, the queue's journal, its
+# password and the scenes come in as volumes.
 
 FROM python:3.11-slim-bookworm AS redis
 RUN apt-get update \
     && apt-get install -y --no-install-recommends redis-server \
     && rm -rf /var/lib/apt/lists/* \
-    && install -d -o redis -g redis /data
+    && install -d -o redis -g redis /data /run/photonfarm
+COPY docker/redis.sh /usr/local/bin/photonfarm-redis
 USER redis
-VOLUME /data
-# The queue is disposable, but a journal saves the workers a reconcile; nothing may be evicted from a queue.
-CMD ["redis-server", "--dir", "/data", "--save", "", "--appendonly", "yes", "--appendfsync", "everysec", \
-     "--maxmemory-policy", "noeviction", "--protected-mode", "no", "--daemonize", "no"]
+VOLUME ["/data", "/run/photonfarm"]
+CMD ["photonfarm-redis"]
 
 FROM python:3.11-slim-bookworm AS shared
 ENV PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore PYTHONUNBUFFERED=1

@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,5 +63,46 @@ def test_a_plan_submitted_from_the_host_is_rendered_by_three_workers_and_trained
         state = json.loads(subprocess.check_output(["docker", "inspect", line]))[0]
         assert state["State"]["Running"]
         assert state["State"]["Health"]["Status"] in ("healthy", "starting")
-        if "redis" not in state["Name"]:
-            assert state["Config"]["User"].split(":")[0] == str(CONTAINER_UID)
+        assert_is_guarded(state)
+    assert "NOAUTH" in compose("exec", "-T", "redis", "redis-cli", "llen", "rq:queue:photonfarm", data=data)
+    password = compose("exec", "-T", "redis", "cat", "/run/photonfarm/redis_password", data=data).strip()
+    assert len(password) == 64
+    assert password not in compose("logs", "--no-color", data=data)
+    assert password not in compose("exec", "-T", "redis", "sh", "-c", "cat /proc/[0-9]*/cmdline", data=data)
+
+
+def assert_is_guarded(container: dict[str, Any]) -> None:
+    """It runs as nobody in particular, writes to nothing but its volumes and /tmp, and nobody outside reaches it."""
+    host = container["HostConfig"]
+    assert container["Config"]["User"].split(":")[0] in (str(CONTAINER_UID), "redis")
+    assert host["ReadonlyRootfs"]
+    assert host["CapDrop"] == ["ALL"]
+    assert not host["CapAdd"]
+    assert not host["Privileged"]
+    assert "no-new-privileges:true" in host["SecurityOpt"]
+    assert not any(container["NetworkSettings"]["Ports"].values())
+    assert not [name for name in container["Config"]["Env"] if "PASSWORD=" in name]
+
+
+@pytest.mark.timeout(2400)
+def test_a_plan_completes_while_a_container_is_killed_every_few_seconds(
+    photonfarm, data: Path, small_room: Path
+) -> None:
+    compose("up", "-d", "--build", "--scale", "renderer=4", "redis", "renderer", data=data)
+    store = data / "store"
+    request = ("--modifications", "60", "--views", "2", "--shard-rows", "4", "--no-queue", "--json")
+    planned = photonfarm("submit", small_room, "--store", store, *request)
+    assert planned.returncode == 0, planned.stderr
+    if os.geteuid() == 0:
+        subprocess.run(["chown", "-R", str(CONTAINER_UID), str(data)], check=True)
+    renderers = compose("ps", "-q", "renderer", data=data).split()
+    deadline, kills = time.monotonic() + 1800, 0
+    while len(list(store.glob("scenes/*/committed/*.json"))) < 30 and time.monotonic() < deadline:
+        time.sleep(5)
+        victim = renderers[kills % len(renderers)]
+        subprocess.run(["docker", "kill", victim], check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        subprocess.run(["docker", "start", victim], check=True, stdout=subprocess.DEVNULL)
+        kills += 1
+    (scene,) = json.loads(photonfarm("status", "--store", store, "--json").stdout)["scenes"]
+    assert (scene["samples_complete"], scene["jobs_committed"]) == (120, 30)
+    assert kills >= 4

@@ -104,7 +104,7 @@ try:
 except PhotonfarmError as error:
     sys.exit(error.exit_code)
 """
-    settings = {"heartbeat_ttl_s": 2.0, "idle_s": 1, **settings}
+    settings = {"heartbeat_ttl_s": 2.0, "idle_s": 1, "reserve_bytes": 0, **settings}
     arguments = json.dumps([str(store), url, child, settings])
     with log.open("ab") if log else contextlib.nullcontext(subprocess.PIPE) as stderr:
         return subprocess.Popen([sys.executable, "-c", code, arguments], stderr=stderr)
@@ -130,12 +130,12 @@ def refuse_to_load(spec: SceneSpec) -> AnalyticScene:
 
 
 def main() -> int:
-    from photonfarm.renderer import worker
+    from photonfarm.renderer import worker_child
 
     pause_s, purpose = sys.argv[1:]
     AnalyticScene.pause_s = float(pause_s)
     AnalyticScene.broken = purpose == "broken"
-    return worker.child(refuse_to_load if purpose == "no backend" else AnalyticScene.load)
+    return worker_child.child(refuse_to_load if purpose == "no backend" else AnalyticScene.load)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer.worker import GRACE_S
+from photonfarm.renderer.worker_settings import GRACE_S
 from photonfarm.shared.queue import STARTS, connect, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -103,6 +103,26 @@ def test_a_redis_that_dies_and_comes_back_empty_delays_and_loses_nothing(
         assert running.wait(60) == 0
     assert b"Redis" in running.stderr.read()
     assert_complete(scene, stored_bytes(scene), clean_bytes(10))
+
+
+def test_a_redis_that_forgets_the_job_in_hand_fails_no_job_and_costs_no_worker(
+    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
+) -> None:
+    scene = planned(3)
+    connection = connect(redis_server.url)
+    running = start(scene.folder.parent.parent, redis_server.url, analytic.command(0.3))
+    analytic.wait_for(lambda: connection.keys(f"{STARTS}*"), 60)
+    child = analytic.child_of(running)
+    for committed in range(3):
+        connection.flushall()
+        analytic.wait_for(lambda so_far=committed: len(scene.committed_jobs()) > so_far, 60)
+    assert analytic.child_of(running) == child
+    assert queue_status(connection).failed == {}
+    running.terminate()
+    assert running.wait(20) == 0
+    said = running.stderr.read().decode()
+    assert "failed" not in said
+    assert "starting again" not in said
 
 
 def test_a_killed_child_is_replaced_and_its_job_freed_at_once(
@@ -199,7 +219,7 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
     analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
 ) -> None:
     scene = planned(1)
-    running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=0.5)
+    running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=4.0)
     connection = connect(redis_server.url)
     starts = f"rq:photonfarm:starts:{scene.scene_id}-*"
     analytic.wait_for(lambda: sum(int(connection.get(key) or 0) for key in connection.keys(starts)) >= 2)

@@ -1,6 +1,7 @@
 """The worker as a whole: real queue, real store, real processes; only the scene is analytic."""
 
 import importlib.util
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -8,14 +9,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from rq.job import Callback, Job
-from rq.serializers import JSONSerializer
 
-from photonfarm.renderer.worker import check, run_worker
-from photonfarm.shared import queue
+from photonfarm.renderer.worker import check, render_job, run_worker
+from photonfarm.renderer.worker_settings import WorkerSettings
+from photonfarm.renderer.worker_talk import Talk
+from photonfarm.shared import queue, show
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.queue import connect, open_queue, queue_status
+from photonfarm.shared.queue import connect, job_name, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store, store_status
 
@@ -42,7 +43,7 @@ def scene(analytic: ModuleType, tmp_path: Path) -> SceneStore:
     return store.scene(store.plan(analytic.small_spec(), Request(modifications=6), shard_rows=3).scene_id)
 
 
-QUICK = {"until_complete": True, "idle_s": 1, "heartbeat_ttl_s": 2.0}
+QUICK = {"until_complete": True, "idle_s": 1, "heartbeat_ttl_s": 2.0, "reserve_bytes": 0}
 
 
 def test_a_worker_fills_an_empty_queue_from_the_store_and_stops_when_nothing_is_missing(
@@ -71,17 +72,59 @@ def test_a_child_is_replaced_after_so_many_jobs_or_bytes(
     assert len(starts.read_text()) == 3
 
 
-def test_a_scene_that_never_renders_ends_a_complete_run_with_its_reason(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and_can_be_repeated(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    connection, root, names = connect(server.url), tmp_path / "store", [job_name(scene.scene_id, j) for j in range(2)]
+    for _ in range(2):  # it has failed before
+        queue.record_failure(connection, names[0], "earlier")
+    queue.forget_failures(connection, set_aside=False)
     with pytest.raises(
         IncompleteError, match=r"2 jobs have failed; .*: half A of sample .* came out non-finite 3 times"
     ):
-        run_worker(tmp_path / "store", server.url, child=analytic.command(0, "broken"), **QUICK)
-    assert len(queue_status(connect(server.url)).failed) == 2
-    assert queue.reconcile(Store(tmp_path / "store"), connect(server.url), retry_failed=True) == 2
-    run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
-    assert scene.missing_jobs() == []
+        run_worker(root, server.url, child=analytic.command(0, "broken"), **QUICK)
+    failed = queue_status(connection).failed
+    assert {name: (failure.times, failure.set_aside) for name, failure in failed.items()} == {
+        names[0]: (3, True),
+        names[1]: (1, False),
+    }
+    command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
+    assert command in capfd.readouterr().err
+
+    show.status(root, server.url, as_json=True)
+    (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
+    assert cause["cause"] == "IncompleteError: half A of sample … came out non-finite … times"
+    assert (cause["failed"], cause["set_aside"]) == (2, 1)
+    assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
+    show.status(root, server.url, as_json=False)
+    shown = capfd.readouterr().out
+    assert "2 failed, of which 1 are set aside until `photonfarm submit --retry`" in shown
+    assert "2 × IncompleteError: half A of sample … came out non-finite … times" in shown
+    assert command in shown
+
+    analytic.AnalyticScene.broken = True
+    try:
+        with pytest.raises(IncompleteError, match="came out non-finite 3 times"):
+            render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)
+    finally:
+        analytic.AnalyticScene.broken = False
+    assert render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
+    assert not render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
+    show.status(root, server.url, as_json=True)
+    (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
+    assert [job["name"] for job in cause["jobs"]] == names[1:], "what has been committed since has not failed"
+    assert queue.reconcile(Store(root), connection, retry_failed=True) == 1
+
+
+@pytest.mark.parametrize(
+    ("scene_id", "job", "said"),
+    [("../../etc", 0, "holds no scene"), (None, 2, "has 2 jobs, numbered from 0; there is no job 2")],
+)
+def test_a_job_that_is_not_planned_cannot_be_rendered(
+    scene: SceneStore, tmp_path: Path, scene_id: str | None, job: int, said: str
+) -> None:
+    with pytest.raises(StoreError, match=said):
+        render_job(tmp_path / "store", scene_id or scene.scene_id, job)
 
 
 def test_a_machine_without_a_backend_ends_the_worker_and_fails_no_job(
@@ -98,33 +141,12 @@ def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
     """The other scene's job, queued by someone else, cannot be stored: that scene's failure and not the worker's."""
     store = Store(tmp_path / "store")
     other = store.scene(store.plan(analytic.small_spec(points=17), Request(modifications=6), shard_rows=3).scene_id)
-    other.storage.local("tmp").rmdir()
-    other.storage.local("tmp").write_text("a file where the folder should be")
+    (other.folder / "base").write_text("a file where a folder should be")
     queue.reconcile(store, connect(server.url), scene_id=other.scene_id, limit=1)
     run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1]
     assert list(queue_status(connect(server.url)).failed) == [f"{other.scene_id}-0"]
-
-
-def test_strangers_in_the_queue_are_refused_and_ours_go_on(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
-) -> None:
-    connection, owned = connect(server.url), tmp_path / "owned"
-    stranger = open_queue(connection)
-    stranger.job_class = Job
-    touch = Callback("os.system")
-    for i, function in enumerate(("os.system", "photonfarm.renderer.jobs.render_shard", "os.system")):
-        stranger.enqueue(function, kwargs={"command": f"touch {owned}"}, job_id=f"evil-{i}", on_failure=touch)
-    poison = stranger.enqueue("os.system", job_id="evil-pickle")
-    connection.hset(poison.key, "data", b"\x80\x04cos\nsystem\n(Vtouch\ntR.")
-    run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
-    assert scene.missing_jobs() == []
-    assert not owned.exists()
-    failed = stranger.failed_job_registry.get_job_ids(cleanup=False)
-    assert set(failed) == {"evil-0", "evil-1", "evil-2", "evil-pickle"}
-    why = Job.fetch("evil-0", connection=connection, serializer=JSONSerializer).latest_result().exc_string
-    assert "'os.system' is refused" in why
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:
@@ -159,3 +181,45 @@ def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(server: Embedded
         check(server.url)
     queue.beat(connection, "near", os.uname().nodename, None, ttl_s=60)
     check(server.url)
+
+
+# ------------------------------------------------------------------------------------------------------- what it says
+
+
+def settings_of(**changes: object) -> WorkerSettings:
+    return WorkerSettings.model_validate({"store": "s", "redis_url": "redis://u:hunter2@h/0", "name": "ada"} | changes)
+
+
+def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+    talk = Talk(settings_of(report_s=3600))
+    for job in range(5):
+        with talk.timing(f"job-{job}"):
+            pass
+    assert [record.getMessage() for record in caplog.records] == [
+        "worker ada: 1 jobs in 0 s, 0.00 s each; the last was job-0"
+    ]
+    caplog.clear()
+    talk = Talk(settings_of(report_s=1e-9))
+    for job in range(5):
+        with talk.timing(f"job-{job}"):
+            pass
+    assert len(caplog.records) == 5
+
+
+def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:
+    talk = Talk(settings_of(quiet=True))
+    with talk.timing("job"):
+        pass
+    for reason in (None, "the disk is full", "the disk is fuller", None, None):
+        talk.pausing(reason)
+    assert [record.getMessage() for record in caplog.records] == [
+        "worker ada: takes no jobs: the disk is full",
+        "worker ada: takes jobs again",
+    ]
+
+
+def test_settings_show_no_password_and_wrong_ones_neither() -> None:
+    assert "hunter2" not in repr(settings_of())
+    with pytest.raises(ValueError, match="max_jobs") as caught:
+        settings_of(max_jobs="hunter2")
+    assert "hunter2" not in str(caught.value)

@@ -1,7 +1,12 @@
 """Only our own function runs, and the queue is what the store lacks. All against a real server."""
 
 import importlib.util
+import os
 import pickle
+import socket
+import subprocess
+import time
+import traceback
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,12 +15,28 @@ import pytest
 import redis
 from rq.job import Callback, Job
 from rq.serializers import JSONSerializer
+from rq.webhook import Webhook
 
+from photonfarm.renderer.jobs import render_shard
 from photonfarm.shared import queue
 from photonfarm.shared.errors import IncompleteError, QueueError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.queue import FUNCTION, RenderJob, connect, job_name, open_queue, queue_status, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.queue import (
+    FAILED,
+    FUNCTION,
+    QUEUE,
+    QUEUE_LIMIT,
+    Failure,
+    RenderArguments,
+    RenderJob,
+    connect,
+    job_name,
+    open_queue,
+    queue_status,
+    reconcile,
+    with_password_of,
+)
+from photonfarm.shared.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.store import SceneStore, Store
 
 _spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
@@ -54,80 +75,147 @@ def scene(store: Store) -> SceneStore:
 # -------------------------------------------------------------------------------------------------- what may be run
 
 
-def stored(connection: redis.Redis, function: str, *, kwargs: object = KWARGS, name: str = NAME, **more: object) -> Job:
-    """A job written into Redis by plain RQ, read back by our class."""
-    job = Job.create(function, kwargs=kwargs, id=name, connection=connection, serializer=JSONSerializer, **more)
+def pushed(connection: redis.Redis, *names: str | bytes) -> None:
+    connection.rpush(open_queue(connection).key, *names)
+
+
+def stored(connection: redis.Redis, function: str = FUNCTION, **more: object) -> Job:
+    """A job of ours, written into Redis by plain RQ as somebody else likes it, and taken by our own code."""
+    job = Job.create(function, id=NAME, connection=connection, serializer=JSONSerializer, **more)
     job.save()
-    return RenderJob.fetch(name, connection=connection, serializer=JSONSerializer)
+    pushed(connection, NAME)
+    taken, strangers = queue.take(open_queue(connection))
+    assert isinstance(taken, RenderJob)
+    assert strangers == 0
+    return taken
 
 
-def test_our_function_with_good_arguments_is_allowed(connection: redis.Redis) -> None:
-    assert stored(connection, FUNCTION).arguments().job == 7
-
-
-@pytest.mark.parametrize(
-    "function", ["os.system", "photonfarm.renderer.jobs.serve", "builtins.eval", "subprocess.call"]
-)
-def test_any_other_function_is_refused(connection: redis.Redis, function: str, tmp_path: Path) -> None:
-    job = stored(connection, function, kwargs={"command": f"touch {tmp_path}/owned"})
-    with pytest.raises(QueueError, match=f"'{function}' is refused; only {FUNCTION} may be run"):
-        job.perform()
-    assert not (tmp_path / "owned").exists()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"scene_id": "../../etc", "job": 0},
-        {"scene_id": SCENE_ID, "job": -1},
-        {"scene_id": SCENE_ID, "job": "7"},
-        {"scene_id": SCENE_ID, "job": True},
-        {"scene_id": SCENE_ID.upper(), "job": 7},
-        {"scene_id": SCENE_ID, "job": 7, "store": "/elsewhere"},
-        {"scene_id": SCENE_ID},
-        {"scene_id": SCENE_ID, "job": 8},
-    ],
-)
-def test_our_function_with_other_arguments_is_refused(connection: redis.Redis, wrong: dict[str, object]) -> None:
-    with pytest.raises(QueueError, match=f"job {NAME}"):
-        stored(connection, FUNCTION, kwargs=wrong).perform()
-
-
-def test_positional_arguments_and_an_instance_are_refused(connection: redis.Redis) -> None:
-    for data in ([FUNCTION, None, [SCENE_ID, 7], {}], [FUNCTION, "text", [], KWARGS], [FUNCTION, None, [], [1]]):
-        job = stored(connection, FUNCTION)
-        job.data = JSONSerializer.dumps(data)
-        with pytest.raises(QueueError):
-            job.perform()
-
-
-def test_callbacks_and_webhooks_are_dropped_whoever_set_them(connection: redis.Redis) -> None:
-    evil = Callback("os.system")
-    job = stored(connection, FUNCTION, on_success=evil, on_failure=evil, on_stopped=evil)
-    connection.hset(job.key, "webhooks", '[{"url": "http://127.0.0.1:1/", "job_status": "finished"}]')
-    job.refresh()
+def assert_is_ours(job: Job) -> None:
+    assert (job.func_name, job.instance, job.args, job.kwargs) == (FUNCTION, None, (), KWARGS)
+    assert job.func is render_shard
     assert job.success_callback is job.failure_callback is job.stopped_callback is None
-    assert job.webhooks == []
+    assert (job.webhooks, job.retries_left, job.repeats_left, job.group_id) == ([], None, None, None)
+    assert (job.result_ttl, job.timeout, job.origin, job.get_status()) == (0, 7 * 86400, QUEUE, "queued")
 
 
-def test_pickled_data_are_never_unpickled(connection: redis.Redis, tmp_path: Path) -> None:
+def test_a_job_is_what_its_name_tells(connection: redis.Redis) -> None:
+    assert_is_ours(stored(connection, kwargs=KWARGS))
+
+
+@pytest.mark.parametrize("function", ["os.system", "photonfarm.renderer.jobs.serve", "builtins.eval"])
+def test_another_function_in_redis_is_not_looked_at(connection: redis.Redis, function: str) -> None:
+    assert_is_ours(stored(connection, function, args=["true"], kwargs={"command": "true"}))
+
+
+def test_callbacks_webhooks_retries_repetitions_and_groups_in_redis_are_not_looked_at(connection: redis.Redis) -> None:
+    evil = Callback("os.system")
+    webhook = Webhook("http://127.0.0.1:1/", "finished")
+    job = Job.create(
+        "os.system", id=NAME, connection=connection, serializer=JSONSerializer, timeout=1, result_ttl=-1,
+        on_success=evil, on_failure=evil, on_stopped=evil, webhooks=[webhook], group_id="evil", origin="elsewhere",
+    )  # fmt: skip
+    job.repeats_left, job.retries_left = 3, 3
+    job.save()
+    pushed(connection, NAME)
+    assert_is_ours(queue.take(open_queue(connection))[0])
+
+
+@pytest.mark.parametrize("field", ["data", "meta", "result", "status", "webhooks", "created_at"])
+def test_neither_pickles_nor_nonsense_are_read(connection: redis.Redis, field: str, tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> tuple[object, ...]:
             return (Path.touch, (tmp_path / "owned",))
 
-    job = stored(connection, FUNCTION)
-    connection.hset(job.key, "data", zlib.compress(pickle.dumps(Evil())))
-    job.refresh()
-    with pytest.raises(Exception, match=r"^$|deserial|decode"):
-        job.perform()
+    for evil in (pickle.dumps(Evil()), zlib.compress(pickle.dumps(Evil())), b"\xff" * 100):
+        connection.hset(f"rq:job:{NAME}", field, evil)
+        pushed(connection, NAME)
+        assert_is_ours(queue.take(open_queue(connection))[0])
     assert not (tmp_path / "owned").exists()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "os.system",
+        "../../etc/passwd-0",
+        f"../../{SCENE_ID}-7",
+        f"{SCENE_ID}/../x-7",
+        f"{SCENE_ID}--7",
+        f"{SCENE_ID}-07",
+        f"{SCENE_ID}-7\n",
+        f"{SCENE_ID}-٧",
+        f"{SCENE_ID.upper()}-7",
+        f"{SCENE_ID}-{1 << 48}",
+        SCENE_ID,
+        "",
+        "-",
+        "x" * 1_000_000,
+    ],
+)
+def test_what_is_not_named_as_a_job_is_thrown_away_and_what_comes_after_it_taken(
+    connection: redis.Redis, name: str
+) -> None:
+    pushed(connection, name, NAME)
+    listed = open_queue(connection)
+    job, strangers = queue.take(listed)
+    if job is None:  # well formed, and yet not a name
+        job, more = queue.take(listed)
+        strangers += more
+    assert strangers == 1
+    assert_is_ours(job)
+    assert queue.take(listed) == (None, 0)
+    assert connection.lrange(listed.intermediate_queue_key, 0, -1) == [NAME.encode()]
+    with pytest.raises(QueueError, match="job "):
+        RenderArguments.of(name)
+
+
+def test_a_job_named_in_a_dead_encoding_is_thrown_away(connection: redis.Redis) -> None:
+    pushed(connection, b"\xff\xfe-7", pickle.dumps(NAME))
+    assert queue.take(open_queue(connection)) == (None, 2)
+
+
+def test_what_redis_holds_of_a_job_stays_there(connection: redis.Redis) -> None:
+    """8 MB under the job's key, a bomb of zeros, and 8 MB in the queue itself."""
+    large = 8 << 20
+    connection.eval(
+        "local large = string.rep(string.rep('x', 1048576), 8) "
+        "redis.call('HSET', KEYS[1], 'data', large) redis.call('RPUSH', KEYS[2], large, ARGV[1])",
+        2, f"rq:job:{NAME}", open_queue(connection).key, NAME,
+    )  # fmt: skip
+    connection.hset(f"rq:job:{NAME}", "meta", zlib.compress(b"0" * large))
+    sent = connection.info("stats")["total_net_output_bytes"]
+    job, strangers = queue.take(open_queue(connection))
+    assert connection.info("stats")["total_net_output_bytes"] - sent < 20_000
+    assert_is_ours(job)
+    assert strangers == 1
+
+
+def test_entries_too_long_for_a_job_are_not_fetched_when_the_queue_is_filled(
+    connection: redis.Redis, store: Store, scene: SceneStore
+) -> None:
+    listed = open_queue(connection)
+    for key in (listed.key, listed.intermediate_queue_key):
+        pushed(connection, NAME)
+        connection.rpush(key, b"x" * 1_000_000)
+    connection.zadd(listed.started_job_registry.key, {b"x" * 1_000_000: 2e9})
+    sent = connection.info("stats")["total_net_output_bytes"]
+    assert reconcile(store, connection) == 10
+    assert connection.info("stats")["total_net_output_bytes"] - sent < 100_000
+
+
 def test_a_refused_job_does_not_run(connection: redis.Redis) -> None:
-    job = stored(connection, FUNCTION)
+    job = stored(connection)
     job.refuse("its worker died")
     with pytest.raises(IncompleteError, match="its worker died"):
         job.perform()
+
+
+def test_a_finished_job_sets_no_dependents_free(connection: redis.Redis) -> None:
+    listed = open_queue(connection)
+    Job.create("os.system", id="evil", connection=connection, serializer=JSONSerializer, origin=QUEUE).save()
+    connection.sadd(Job.dependents_key_for(NAME), "evil")
+    listed.enqueue_dependents(stored(connection))
+    assert listed.get_job_ids() == []
 
 
 # -------------------------------------------------------------------------------------------------------- reconcile
@@ -142,8 +230,8 @@ def test_everything_missing_is_queued_once(connection: redis.Redis, store: Store
     assert reconcile(store, connection) == 9
     assert queued(connection) == [job_name(scene.scene_id, job) for job in range(10) if job != 3]
     assert reconcile(store, connection) == 0
-    job = RenderJob.fetch(queued(connection)[0], connection=connection, serializer=JSONSerializer)
-    assert (job.func_name, job.arguments().scene_id, job.result_ttl) == (FUNCTION, scene.scene_id, 0)
+    job = Job.fetch(queued(connection)[0], connection=connection, serializer=JSONSerializer)  # as RQ's tools see it
+    assert (job.func_name, job.kwargs, job.result_ttl) == (FUNCTION, {"scene_id": scene.scene_id, "job": 0}, 0)
 
 
 def test_a_job_with_a_heartbeat_or_a_recent_failure_is_left_alone(
@@ -154,7 +242,7 @@ def test_a_job_with_a_heartbeat_or_a_recent_failure_is_left_alone(
     assert reconcile(store, connection) == 8
     status = queue_status(connection)
     assert (status.queued, status.running, status.workers) == (8, 1, 1)
-    assert status.failed == {job_name(scene.scene_id, 1): "it is broken"}
+    assert status.failed == {job_name(scene.scene_id, 1): Failure("it is broken", 1, set_aside=False)}
     assert reconcile(store, connection, retry_failed=True) == 1
     queue.bury(connection, "worker")
     assert reconcile(store, connection) == 1
@@ -208,18 +296,204 @@ def test_a_redis_that_goes_away_is_a_queue_error(store: Store, scene: SceneStore
             call()
 
 
-def test_the_permissions_that_the_documentation_names_suffice(
-    connection: redis.Redis, server: EmbeddedRedis, store: Store, scene: SceneStore
+def test_a_plan_of_any_size_leaves_at_most_ten_thousand_jobs_in_redis(connection: redis.Redis, store: Store) -> None:
+    store.plan(samples.small_spec(), Request(modifications=10_030), shard_rows=1)
+    assert reconcile(store, connection) == QUEUE_LIMIT == 10_000
+    assert reconcile(store, connection) == 0
+    assert len(open_queue(connection)) == 10_000
+
+
+# ---------------------------------------------------------------------------------------------------------- failures
+
+
+def test_a_job_that_fails_three_times_is_set_aside_until_asked_for(
+    connection: redis.Redis, store: Store, scene: SceneStore
 ) -> None:
-    rules = ["~rq:*", "~alive:*", "&rq:*", "+@read", "+@write", "+@transaction", "+@connection", "+@pubsub",
-             "+@blocking", "+@scripting", "-@dangerous", "+info", "+client|list", "+client|setname"]  # fmt: skip
-    connection.execute_command("ACL", "SETUSER", "worker", "on", ">secret", *rules)
-    url = server.url.replace("unix://", "unix://worker:secret@")
-    with connect(url) as limited:
+    name = job_name(scene.scene_id, 4)
+    for times in (1, 2):
+        assert queue.record_failure(connection, name, "broken") == Failure("broken", times, set_aside=False)
+        assert 0 < connection.ttl(FAILED + name) <= 3600
+        assert reconcile(store, connection, limit=100, retry_failed=True) == (10 if times == 1 else 0)
+        open_queue(connection).delete(delete_jobs=False)
+        assert reconcile(store, connection) == 10
+    assert queue.record_failure(connection, name, "broken").set_aside
+    open_queue(connection).delete(delete_jobs=False)
+    assert connection.ttl(FAILED + name) == -1
+    assert queue_status(connection).failed == {name: Failure("broken", 3, set_aside=True)}
+    assert reconcile(store, connection, retry_failed=True) == 9
+    assert reconcile(store, connection, retry_set_aside=True) == 1
+    assert queue_status(connection).failed == {}
+    assert queue.record_failure(connection, name, "broken").times == 1
+
+
+def test_a_job_that_has_ended_well_has_nothing_counted_against_it(connection: redis.Redis) -> None:
+    for _ in range(3):
+        queue.record_failure(connection, NAME, "broken")
+    queue.forget_failures_of(connection, NAME)
+    assert not connection.keys("rq:photonfarm:*")
+
+
+def test_failures_are_grouped_by_what_they_have_in_common() -> None:
+    def failed(reason: str, times: int = 1) -> Failure:
+        return Failure(reason, times, set_aside=times >= 3)
+
+    first, *others = queue.causes(
+        {
+            f"{SCENE_ID}-1": failed(f"IncompleteError: half A of sample {'ab' * 16} came out non-finite 3 times"),
+            f"{SCENE_ID}-2": failed(f"IncompleteError: half A of sample {'cd' * 16} came out non-finite 3 times", 3),
+            f"{SCENE_ID}-3": failed(f"IncompleteError: half B of sample {'ab' * 16} came out non-finite 3 times"),
+            f"{SCENE_ID}-4": failed("ValueError: cannot reshape array of size -12 into shape (4,3.5)"),
+            f"{SCENE_ID}-5": failed("ValueError: cannot reshape array of size 7 into shape (4,1e-3)"),
+            f"{SCENE_ID}-6": failed("IncompleteError: half A of sample … came out", 2),
+        }
+    )
+    assert first.cause == "IncompleteError: half A of sample … came out non-finite … times"
+    assert (list(first.jobs), first.set_aside, first.example) == (
+        [f"{SCENE_ID}-2", f"{SCENE_ID}-1"],
+        1,
+        f"{SCENE_ID}-2",
+    )
+    assert [len(cause.jobs) for cause in others] == [2, 1, 1]
+
+
+def test_what_a_stranger_writes_as_a_failure_cannot_speak_to_a_terminal(connection: redis.Redis) -> None:
+    connection.set(FAILED + NAME, b"\x1b]0;owned\x07\xff" + b"x" * 1_000_000)
+    connection.set(f"{FAILED}../../etc", "why")
+    connection.set(f"{FAILED}{SCENE_ID}-8; rm -rf ~", "why")
+    ((name, failure),) = queue_status(connection).failed.items()
+    assert name == NAME
+    assert failure.reason.startswith(" ]0;owned")
+    assert failure.reason.isprintable()
+    assert len(failure.reason) <= 2000
+
+
+def test_what_a_stranger_writes_as_a_heartbeat_is_no_trouble(connection: redis.Redis) -> None:
+    for i, value in enumerate(("", " ", "one", "a b c", b"\x00" * 5000)):
+        connection.set(f"{queue.WORKER}evil-{i}", value)
+    assert "host" not in queue.hosts(connection)
+    for i in range(5):
+        assert queue.bury(connection, f"evil-{i}") is None
+
+
+# ------------------------------------------------------------------------------------------------ what is consumed
+
+
+def test_what_trainers_have_used_is_told_by_scene_and_lost_with_redis(connection: redis.Redis) -> None:
+    other = "f" * 32
+    assert queue.consumed_samples(connection, [SCENE_ID]) == 0
+    queue.tell_consumed(connection, SCENE_ID, 100)
+    queue.tell_consumed(connection, other, 7)
+    assert queue.consumed_samples(connection, [SCENE_ID]) == 100
+    assert queue.consumed_samples(connection, [SCENE_ID, other]) == 107
+    connection.set(f"rq:photonfarm:consumed:{other}", "-12 or so")
+    assert queue.consumed_samples(connection, [SCENE_ID, other]) == 100
+
+
+# ------------------------------------------------------------------------------------------------------- permissions
+
+START = Path(__file__).parents[2] / "docker/redis.sh"
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, Path]]:
+    """The server as the compose file starts it: a port of it, and the file with its password."""
+    folder = tmp_path_factory.mktemp("guarded")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    environment = {
+        **os.environ, "REDIS_SERVER": str(server_binary()), "REDIS_DATA": str(folder), "REDIS_PORT": str(port),
+        "REDIS_BIND": "127.0.0.1", "PHOTONFARM_REDIS_PASSWORD_FILE": str(folder / "password"),
+    }  # fmt: skip
+    with (
+        (folder / "log").open("wb") as log,
+        subprocess.Popen(["sh", str(START)], env=environment, stdout=log) as process,
+    ):
+        deadline = time.monotonic() + 60
+        while "eady to accept connections" not in (folder / "log").read_text():
+            assert process.poll() is None, (folder / "log").read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield port, folder / "password"
+        process.terminate()
+
+
+def test_the_server_of_the_compose_file_lets_nobody_in_without_the_password(guarded: tuple[int, Path]) -> None:
+    port, password = guarded
+    for user in ("", "default:@", "default:wrong@", "photonfarm:wrong@", "photonfarm:@"):
+        with pytest.raises(QueueError, match="no Redis at"):
+            connect(f"redis://{user}127.0.0.1:{port}/0")
+    assert len(password.read_text().strip()) == 64
+
+
+def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
+    guarded: tuple[int, Path], store: Store, scene: SceneStore
+) -> None:
+    port, password = guarded
+    with connect(with_password_of(password, f"redis://127.0.0.1:{port}/0")) as limited:
         assert reconcile(store, limited) == 10
         queue.beat(limited, "worker", "host", "job", ttl_s=60)
+        queue.record_failure(limited, NAME, "broken")
+        queue.tell_consumed(limited, SCENE_ID, 1)
         assert queue_status(limited).queued == 10
         queue.bury(limited, "worker")
         assert queue.hosts(limited) == set()
-        with pytest.raises(redis.exceptions.NoPermissionError):
-            limited.flushall()
+        assert queue.take(open_queue(limited))[0] is not None
+        forbidden = (
+            ("FLUSHALL",), ("CONFIG", "GET", "dir"), ("KEYS", "*"), ("SHUTDOWN",), ("ACL", "LIST"),
+            ("SET", "other", "1"), ("PUBLISH", "rq:pubsub:x", "{}"), ("MODULE", "LIST"), ("REPLICAOF", "h", "1"),
+        )  # fmt: skip
+        for command in forbidden:
+            with pytest.raises(redis.exceptions.NoPermissionError):
+                limited.execute_command(*command)
+        with pytest.raises(redis.RedisError):
+            limited.set("rq:large", b"x" * (2 << 20))
+
+
+# ---------------------------------------------------------------------------------------------------------- passwords
+
+SECRET = "hunter2"
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"redis://user:{SECRET}@127.0.0.1:1/0",
+        f"redis://:{SECRET}@127.0.0.1:1/0",
+        f"redis://:{SECRET}/x@127.0.0.1:1/0",
+        f"redis://:12/{SECRET}@127.0.0.1:1/0",
+        f"redis://:{SECRET}?x@127.0.0.1:1/0",
+        f"redis://:{SECRET}#x@127.0.0.1:1/0",
+        f"redis://:a@{SECRET}@127.0.0.1:1/0",
+        f"redis://user:{SECRET}@127.0.0.1:port/0",
+        f"redis://127.0.0.1:1/0?password={SECRET}",
+        f"redis://127.0.0.1:1/0?password=x@{SECRET}",
+        f"unix://user:{SECRET}@/nowhere/redis.sock",
+        f"user:{SECRET}@127.0.0.1",
+        f"http://user:{SECRET}@127.0.0.1:1",
+        f"redis://user:{SECRET}@[127.0.0.1:1/0",
+    ],
+)
+def test_a_password_is_in_no_message_and_in_no_traceback(url: str) -> None:
+    with pytest.raises(QueueError) as caught:
+        connect(url)
+    assert SECRET not in "".join(traceback.format_exception(caught.value))
+    assert "no Redis at" in str(caught.value)
+
+
+def test_a_password_that_is_wrong_is_in_no_message(guarded: tuple[int, Path]) -> None:
+    with pytest.raises(QueueError, match="no Redis at redis:") as caught:
+        connect(f"redis://photonfarm:{SECRET}@127.0.0.1:{guarded[0]}/0")
+    assert SECRET not in "".join(traceback.format_exception(caught.value))
+
+
+def test_a_password_comes_from_a_file_where_the_url_has_none(tmp_path: Path) -> None:
+    file = tmp_path / "password"
+    file.write_text("a/b@c:d\n")
+    quoted = "a%2Fb%40c%3Ad"
+    assert with_password_of(file, "redis://h:1/0") == f"redis://photonfarm:{quoted}@h:1/0"
+    assert with_password_of(file, "rediss://ada@h:1/0?x=1") == f"rediss://ada:{quoted}@h:1/0?x=1"
+    for url in ("redis://ada:own@h:1/0", "unix:///run/redis.sock"):
+        assert with_password_of(file, url) == url
+    assert with_password_of(None, "redis://h:1/0") == "redis://h:1/0"
+    with pytest.raises(QueueError, match="the Redis password cannot be read: No such file"):
+        with_password_of(tmp_path / "none", "redis://h:1/0")

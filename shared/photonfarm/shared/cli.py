@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -55,20 +56,49 @@ def _fail(sentence: str, exit_code: int) -> NoReturn:
 # --------------------------------------------------------------------------------------------------- options they share
 
 
+class StorePlace(click.Path):
+    """A folder, as a Path; or the URL of a bucket, as it is written."""
+
+    name = "folder or url"
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The Path or the URL; fails for a URL that is not that of a bucket."""
+        from photonfarm.shared.store.storage import SCHEMES, is_url
+
+        if not is_url(value):
+            return super().convert(value, param, ctx)
+        scheme, _, bucket = value.partition("://")
+        if scheme not in SCHEMES or not bucket.strip("/"):
+            self.fail(f"{value!r} is neither a folder nor {'://…, '.join(SCHEMES)}://… with a bucket.", param, ctx)
+        return value
+
+
 def store_option(command: Command) -> Command:
-    """`--store DIR`, the sample store."""
+    """`--store`, the sample store."""
     return click.option(
-        "--store", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_STORE", default="store",
-        show_default=True, help="Folder of the sample store.",
+        "--store", type=StorePlace(), metavar="DIR|URL", envvar="PHOTONFARM_STORE", default="store", show_default=True,
+        help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
     )(command)  # fmt: skip
 
 
 def redis_option(command: Command) -> Command:
-    """`--redis URL`, the queue's server."""
+    """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
     return click.option(
         "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
-        help="The queue's Redis; a URL with a password belongs into the variable, not here.", show_envvar=True,
+        help="The queue's Redis. A password belongs not here but into the variable, or into a file that "
+        "PHOTONFARM_REDIS_PASSWORD_FILE names.", show_envvar=True, callback=_with_password,
     )(command)  # fmt: skip
+
+
+def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:  # noqa: ARG001
+    if not (file := os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")):
+        return url
+    from photonfarm.shared.queue import with_password_of
+
+    return with_password_of(Path(file), url)
 
 
 def json_option(command: Command) -> Command:
@@ -117,10 +147,18 @@ def scene_show(spec: str, as_json: bool) -> None:
 @store_option
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
 @json_option
 def submit(
-    spec: str, store: Path, redis_url: str, no_queue: bool, dry_run: bool, as_json: bool, **request: Any
+    spec: str,
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    retry: bool,
+    dry_run: bool,
+    as_json: bool,
+    **request: Any,
 ) -> None:
     """Plan samples of SPEC and queue them; what is planned already is not planned again."""
     from photonfarm.shared import show, submission
@@ -128,14 +166,62 @@ def submit(
     if dry_run:
         show.submission(submission.preview(spec, store, **request), as_json)
     else:
-        show.submission(submission.submit(spec, store, None if no_queue else redis_url, **request), as_json)
+        url = None if no_queue else redis_url
+        show.submission(submission.submit(spec, store, url, retry=retry, **request), as_json)
+
+
+@click.command("top-up")
+@click.argument("spec")
+@click.option(
+    "--spp",
+    required=True,
+    metavar="[+]N",
+    help="Samples per pixel: +64 adds 64 to what is planned of each view, 256 goes up to 256 in all.",
+)
+@click.option("--where", multiple=True, metavar="CONDITION", help="Which views, instead of all; see above.")
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
+@json_option
+def top_up(
+    spec: str,
+    spp: str,
+    where: tuple[str, ...],
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    as_json: bool,
+    **options: bool,
+) -> None:
+    r"""Plan more noisy passes of views of SPEC that are planned already, and queue them.
+
+    A pass has 2 × half_spp samples per pixel, so N is rounded up to whole passes. New passes are independent of
+    the old ones and share the buffers and photons that are there. Repeating +N adds again; repeating N adds nothing.
+
+    \b
+    Conditions, of which a view must meet every one that is given:
+      views=first:N      the first N that were planned, of those that meet the others
+      view=KEY           the view with this content key, or with one that begins so
+      modification=KEY   views of the configuration with this content key, or beginning
+      rows=A-B           views that the samples in rows A to B show; rows=A for one
+      plan=P             views that plan P brought
+      held-out[=SHARE]   views that training with this hold-out never sees (default 0.125)
+    """
+    from photonfarm.shared import show, submission
+
+    result = submission.top_up(spec, store, None if no_queue else redis_url, spp, where=where, **options)
+    show.submission(result, as_json)
+    noun = "pass" if result.passes == 1 else "passes"
+    click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)
 
 
 @click.command()
 @store_option
 @redis_option
 @json_option
-def status(store: Path, redis_url: str, as_json: bool) -> None:
+def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Show what is planned, committed, queued and failed."""
     from photonfarm.shared import show
 
@@ -157,7 +243,7 @@ def status(store: Path, redis_url: str, as_json: bool) -> None:
     help="Share of the configurations never trained on; a small plan needs a large one.",
 )
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
-def up(spec: str, store: Path, **options: Any) -> None:
+def up(spec: str, store: str | Path, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
 
     Ctrl-C stops it within seconds; the same command goes on from there.

@@ -12,10 +12,9 @@ from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.plan import SHARD_ROWS, Known, PlannedRows, Request, expand
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import Store
 
 
-def check_hold_out(spec: SceneSpec, store: Path, share: float, request: Request) -> None:
+def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Request) -> None:
     """Raise SpecError if of all that is planned or requested nothing or everything would be held out.
 
     Nothing is written. The trainer finds the same, but only once all is rendered.
@@ -37,9 +36,12 @@ def is_held_out(unit: Key, share: float) -> bool:
     return int.from_bytes(make_key("hold out", unit)[:8], "little") < share * 2.0**64
 
 
-def _planned(spec: SceneSpec, store: Path, wanted: Request) -> Iterator[PlannedRows]:
+def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> Iterator[PlannedRows]:
     """The rows of a scene's plans, and those of a request."""
-    if store.exists() and spec.scene_id in (opened := Store(store)).scene_ids():
+    from photonfarm.shared.store import Store  # here, as it plans top-ups by what is held out
+    from photonfarm.shared.store.storage import is_vacant
+
+    if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
         yield from (plan.rows for plan in opened.scene(spec.scene_id).plans())
     new = expand(spec, wanted, Known(), first_job=0, shard_rows=SHARD_ROWS).rows
     if new is not None:

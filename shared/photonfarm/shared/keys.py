@@ -1,6 +1,6 @@
 """Content keys and the seeds that follow from them.
 
-A key is the first 16 bytes of a BLAKE2b hash over typed, length-prefixed parts. Seeds and random streams are functions
+A key is a BLAKE2b hash of 16 bytes over typed, length-prefixed parts. Seeds and random streams are functions
 of a key and a purpose, so that no order of work, no worker and no clock enters what is rendered. Seed 0 is a seed.
 """
 
@@ -22,11 +22,18 @@ KEY_BYTES = 16
 
 def make_key(*parts: Part) -> Key:
     """The content key of a sequence of parts; equal parts in equal order give equal keys, on every machine."""
-    digest = hashlib.blake2b(digest_size=KEY_BYTES)
-    for part in parts:
-        tag, data = _encode(part)
-        digest.update(tag + len(data).to_bytes(8, "little") + data)
-    return digest.digest()
+    return key_of(encoded(*parts))
+
+
+def encoded(*parts: Part) -> bytes:
+    """The bytes that stand for a sequence of parts; those of a longer sequence begin with them."""
+    tagged = (_encode(part) for part in parts)
+    return b"".join(tag + len(data).to_bytes(8, "little") + data for tag, data in tagged)
+
+
+def key_of(encoded_parts: bytes) -> Key:
+    """The content key of parts that are encoded already."""
+    return hashlib.blake2b(encoded_parts, digest_size=KEY_BYTES).digest()
 
 
 def _encode(part: Part) -> tuple[bytes, bytes]:

@@ -6,7 +6,8 @@ A request names every combination of its modifications, of `views_per_modificati
 passes of each view. Configurations that come out equal (both objects removed, say) are one modification with
 as many views more, so that no view is drawn twice and the share of each configuration among the samples stays that
 of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
-different views of it.
+different views of it. Views that come out equal, since the spec fixes the camera, are one view: no sample is planned
+twice.
 
 The views of a configuration are numbered from 0; growing any number of a request therefore names a superset of the
 old samples, and only the new ones are planned. New views and passes refer to the rows that are there.
@@ -14,9 +15,11 @@ old samples, and only the new ones are planned. New views and passes refer to th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Self
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +27,17 @@ from pydantic import Field, ValidationError, model_validator
 
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.keys import KEY_BYTES, Key, make_key
-from photonfarm.shared.modification import Modification, rest, sample_modification
+from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.records import F32
+from photonfarm.shared.sampling import contents, modification_keys, modification_vectors, sample_keys, view_vectors
 from photonfarm.shared.scene import Frozen, SceneSpec, sentences
-from photonfarm.shared.view import sample_view
 
 SHARD_ROWS = 32
 """Samples per job, where neither the caller nor an older plan of the scene says otherwise."""
 
 MAX_SHARD_ROWS = 4096
 MAX_SAMPLES = 10_000_000
-"""Samples of one request: its plan is held in memory, at about 0.2 kB each."""
+"""Samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
 
 UNUSED = -1
 """A row reference of a row that holds nothing."""
@@ -45,6 +48,7 @@ Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 class Request(Frozen):
     """What to plan: modifications × views × passes, under one master seed."""
 
+    kind: Literal["samples"] = "samples"  # tells it from other requests in the store
     modifications: Count = 1
     views_per_modification: Count = 1
     passes: Annotated[int, Field(ge=1, le=65536)] = 1
@@ -94,31 +98,71 @@ class PlannedRows:
         )
 
 
-@dataclass(frozen=True, slots=True)
 class Known:
-    """What the older plans of a scene hold, for lookup by content."""
+    """What the older plans of a scene hold, for lookup by content; each table is made when it is first asked for."""
 
-    modifications: dict[bytes, int] = field(default_factory=dict)  # bytes of the vector → row
-    views: dict[tuple[int, bytes], int] = field(default_factory=dict)  # modification row, bytes of the vector → row
-    samples: set[Key] = field(default_factory=set)
+    def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
+        """Take the plans in their order, each with the number of its first row."""
+        self.plans = list(plans)
 
-    def add(self, rows: PlannedRows, first_row: int) -> None:
-        """Take in the rows of one more plan, whose first row has the number `first_row`."""
-        used = np.flatnonzero(rows.sample_modification != UNUSED)
-        end = first_row + len(rows.sample_modification)
-        for row in _own(rows.sample_modification[used], first_row, end):
-            self.modifications.setdefault(rows.modification[row - first_row].tobytes(), row)
-        views, first = np.unique(rows.sample_view[used], return_index=True)
-        for row, sample in zip(views.tolist(), used[first].tolist(), strict=True):
-            if first_row <= row < end:
-                modification_row = int(rows.sample_modification[sample])
-                self.views.setdefault((modification_row, rows.view[row - first_row].tobytes()), row)
-        self.samples.update(key.tobytes() for key in rows.sample_key[used])
+    @cached_property
+    def modifications(self) -> dict[bytes, int]:
+        """The row of each modification, by the bytes of its vector."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, _ = _own(rows.sample_modification, first_row)
+            _add(found, contents(rows.modification[row - first_row]), row)
+        return found
+
+    @cached_property
+    def views(self) -> dict[bytes, int]:
+        """The row of each view, by its `view_contents`."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, sample = _own(rows.sample_view, first_row)
+            _add(found, view_contents(rows.sample_modification[sample], rows.view[row - first_row]), row)
+        return found
+
+    @cached_property
+    def samples(self) -> set[Key]:
+        """The keys of all samples."""
+        found: set[Key] = set()
+        for _, rows in self.plans:
+            data = rows.sample_key[rows.sample_modification != UNUSED].tobytes()
+            found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
+        return found
 
 
-def _own(references: NDArray[np.int64], first_row: int, end: int) -> list[int]:
-    rows = np.unique(references)
-    return rows[(rows >= first_row) & (rows < end)].tolist()
+def _add(found: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
+    for key, row in zip(keys, rows.tolist(), strict=True):
+        found.setdefault(key, row)
+
+
+def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct rows of a plan that its own samples refer to, and the first sample that does."""
+    rows, first = np.unique(references, return_index=True)
+    own = (rows >= first_row) & (rows < first_row + len(references))
+    return rows[own], first[own]
+
+
+def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[bytes]:
+    """What views (N, 6) of the modifications in some rows (N,) are looked up by."""
+    rows = modification_rows.astype("<i8").tobytes()
+    return [rows[8 * i : 8 * i + 8] + view for i, view in enumerate(contents(views))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
+
+    modification: F32  # (M, G, 4)
+    modification_row: NDArray[np.int64]  # (M,) the row of one that is planned already, or UNUSED
+    view: F32  # (V, 6)
+    view_row: NDArray[np.int64]  # (V,) the row of one that is planned already, or UNUSED
+    sample_modification: NDArray[np.int64]  # (S,) which of the modifications
+    sample_view: NDArray[np.int64]  # (S,) which of the views
+    sample_pass: NDArray[np.int32]  # (S,)
+    sample_key: NDArray[np.uint8]  # (S, 16)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,35 +180,32 @@ def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, s
     Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
     the job of its first sample; so does everything that a job must render lie in the job's own rows.
     """
-    new = [sample for sample in _samples(spec, request) if sample.key not in known.samples]
-    if not new:
-        return Expansion(None, 0, request.samples)
-    jobs = -(-len(new) // shard_rows)
-    rows = PlannedRows.empty(jobs * shard_rows, len(spec.groups))
-    packing = _Packing(rows, known, first_job * shard_rows, shard_rows)
-    for sample in new:
-        packing.place(sample)
-    return Expansion(rows, len(new), request.samples - len(new))
+    candidates, named = _candidates(spec, request, known)
+    rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    new = len(candidates.sample_pass)
+    return Expansion(rows, new, named - new)
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    modification: F32  # (G, 4)
-    view: F32  # (6,)
-    pass_: int
-    key: Key
+def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:
+    """The new samples of a request, and how many it names, known or new."""
+    modifications, counts = _configurations(spec, request)
+    of_view = np.repeat(np.arange(len(counts)), counts)
+    index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
+    of_modification = modification_keys(spec, modifications)
+    views = view_vectors(spec, [of_modification[m] for m in of_view.tolist()], request.seed, index)
+    modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
+    view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
 
-
-def _samples(spec: SceneSpec, request: Request) -> Iterator[_Sample]:
-    """Every sample of a request, by modification, view and pass; the same one never twice."""
-    for modification, views in _configurations(spec, request):
-        modification_key = modification.key(spec.scene_id)
-        for index in views:
-            view = sample_view(spec, modification_key, request.seed, index)
-            for pass_ in range(request.passes):
-                yield _Sample(
-                    modification.vector, view.vector, pass_, sample_key(spec.scene_id, modification, view.vector, pass_)
-                )
+    view = np.repeat(np.arange(len(views)), request.passes)
+    pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
+    keys = sample_keys(spec.scene_id, modifications[of_view[view]], views[view], pass_)
+    distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
+    new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
+    found = Candidates(
+        modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
+        np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
+    )  # fmt: skip
+    return found, len(distinct)
 
 
 def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int) -> Key:
@@ -172,58 +213,50 @@ def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int)
     return make_key("sample", scene_id, modification.vector, view, pass_)
 
 
-def _configurations(spec: SceneSpec, request: Request) -> Iterator[tuple[Modification, range]]:
-    """The distinct configurations of a request in order of appearance, each with the indices of its views.
+def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.int64]]:
+    """The distinct configurations of a request in order of appearance (M, G, 4), each with its number of views (M,).
 
-    The n-th appearance of a configuration, stands for views n·V … n·V + V − 1 of it.
+    The n-th appearance of a configuration stands for views n·V … n·V + V − 1 of it.
     """
     each = request.views_per_modification
     if not spec.groups:
-        yield rest(spec), range(request.modifications * each)
-        return
-    counts: dict[bytes, int] = {}
-    found: dict[bytes, Modification] = {}
-    for index in range(request.modifications):
-        modification = sample_modification(spec, request.seed, index)
-        content = modification.vector.tobytes()
-        counts[content] = counts.get(content, 0) + 1
-        found.setdefault(content, modification)
-    for content, modification in found.items():
-        yield modification, range(counts[content] * each)
+        return rest(spec).vector[None], np.array([request.modifications * each])
+    vectors = modification_vectors(spec, request.seed, request.modifications)
+    counts = Counter(contents(vectors))
+    distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, len(spec.groups), 4)
+    return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
 
 
-class _Packing:
-    """Places samples one after the other, and what they are the first to need with them."""
+def pack(candidates: Candidates, *, first_row: int, shard_rows: int) -> PlannedRows | None:
+    """Samples as rows from `first_row` on, in their order; None if there are none."""
+    count = len(candidates.sample_pass)
+    if not count:
+        return None
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
+    modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
+    rows.modification[modification_row[new] - first_row] = candidates.modification[new]
+    view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
+    rows.view[view_row[new] - first_row] = candidates.view[new]
+    rows.sample_modification[:count] = modification_row[candidates.sample_modification]
+    rows.sample_view[:count] = view_row[candidates.sample_view]
+    rows.sample_pass[:count] = candidates.sample_pass
+    rows.sample_key[:count] = candidates.sample_key
+    return rows
 
-    def __init__(self, rows: PlannedRows, known: Known, first_row: int, shard_rows: int) -> None:
-        self.rows = rows
-        self.first_row = first_row
-        self.shard_rows = shard_rows
-        self.modifications = dict(known.modifications)
-        self.views = dict(known.views)
-        self.count = 0
-        self.next_modification = self.next_view = first_row
 
-    def place(self, sample: _Sample) -> None:
-        if self.count % self.shard_rows == 0:  # a new job starts
-            self.next_modification = self.next_view = self.first_row + self.count
-        modification = self._modification_row(sample.modification)
-        self.rows.sample_modification[self.count] = modification
-        self.rows.sample_view[self.count] = self._view_row(modification, sample.view)
-        self.rows.sample_pass[self.count] = sample.pass_
-        self.rows.sample_key[self.count] = np.frombuffer(sample.key, np.uint8)
-        self.count += 1
+def _place(
+    references: NDArray[np.int64], known_row: NDArray[np.int64], first_row: int, shard_rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The row of each thing that samples refer to, and which of the things are new.
 
-    def _modification_row(self, vector: F32) -> int:
-        row = self.modifications.setdefault(vector.tobytes(), self.next_modification)
-        if row == self.next_modification:
-            self.rows.modification[row - self.first_row] = vector
-            self.next_modification += 1
-        return row
-
-    def _view_row(self, modification_row: int, vector: F32) -> int:
-        row = self.views.setdefault((modification_row, vector.tobytes()), self.next_view)
-        if row == self.next_view:
-            self.rows.view[row - self.first_row] = vector
-            self.next_view += 1
-        return row
+    A new one takes the next free row in the job of the first sample that refers to it.
+    """
+    thing, sample = np.unique(references, return_index=True)
+    order = np.argsort(sample)
+    thing, sample = thing[order], sample[order]
+    new = known_row[thing] == UNUSED
+    thing, job = thing[new], sample[new] // shard_rows
+    before = np.searchsorted(job, job)  # new things of earlier jobs: `job` ascends
+    rows = known_row.copy()
+    rows[thing] = first_row + job * shard_rows + np.arange(len(thing)) - before
+    return rows, thing

@@ -133,6 +133,7 @@ class EmbeddedRedis:
             "appendfsync": "everysec",
             "save": "",
             "maxmemory-policy": "noeviction",
+            "proto-max-bulk-len": "1mb",  # ours are far smaller
             "daemonize": "no",
         }
 

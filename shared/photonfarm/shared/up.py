@@ -36,7 +36,7 @@ Process = subprocess.Popen[bytes]
 
 def run_farm(
     spec: str,
-    store: Path,
+    store: str | Path,
     *,
     workers: int,
     run: Path,
@@ -62,7 +62,7 @@ def run_farm(
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(spec, store, redis.url, shard_rows=shard_rows, **request)
+        planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         environment = _environment(spec, store, redis.url)
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
@@ -102,7 +102,7 @@ def _unwound_by_sigterm() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _environment(spec: str, store: Path, redis_url: str) -> dict[str, str]:
+def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]:
     """What our processes are told; also the folder of the spec, where its scene file may lie."""
     scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
     told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}

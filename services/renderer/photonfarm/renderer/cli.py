@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -16,7 +18,7 @@ from photonfarm.shared.cli import json_option, redis_option, store_option
 @store_option
 @redis_option
 @json_option
-def doctor(store: Path, redis_url: str, as_json: bool) -> None:
+def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Try each part on this machine, and say what to do about what does not work."""
     from photonfarm.renderer.doctor import examine
     from photonfarm.shared import show
@@ -24,15 +26,42 @@ def doctor(store: Path, redis_url: str, as_json: bool) -> None:
     sys.exit(show.findings(examine(store, redis_url), as_json))
 
 
+def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
+    if found is None:
+        raise click.BadParameter(f"{size!r} is no size; write it as 500MB or 2GB")
+    return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
+
+
 @click.command()
 @store_option
 @redis_option
 @click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
 @click.option("--scene", "scene_id", help="Work for this scene id alone.")
+@click.option("--job", type=click.IntRange(0), help="Render this one job of --scene here, without Redis, and end.")
 @click.option("--until-complete", is_flag=True, help="Stop when nothing is missing.")
+@click.option(
+    "--reserve",
+    "reserve_bytes",
+    callback=_bytes,
+    default="1GB",
+    show_default=True,
+    metavar="SIZE",
+    help="Take no job while less of the store's disk is free.",
+)
+@click.option(
+    "--ahead", type=click.FloatRange(0, min_open=True), metavar="RATIO",
+    help="Take no job while more samples are committed than RATIO × those that the trainer has used.",
+)  # fmt: skip
+@click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
 def work(
-    store: Path, redis_url: str, name: str | None, scene_id: str | None, until_complete: bool, check: bool
+    store: str | Path,
+    redis_url: str,
+    scene_id: str | None,
+    job: int | None,
+    check: bool,
+    **settings: Any,
 ) -> None:
     """Render queued jobs into the store, on one core, until told to stop; start one per core.
 
@@ -42,8 +71,13 @@ def work(
 
     if check:
         worker.check(redis_url)
+    elif job is None:
+        worker.run_worker(store, redis_url, scene_id=scene_id, **settings)
+    elif scene_id is None:
+        raise click.UsageError("--job needs --scene: jobs are numbered within a scene")
     else:
-        worker.run_worker(store, redis_url, name=name, scene_id=scene_id, until_complete=until_complete)
+        rendered, seconds = worker.render_job(store, scene_id, job)
+        click.echo(f"job {job} rendered and committed in {seconds:.1f} s" if rendered else f"job {job} is committed")
 
 
 @click.command()
@@ -51,7 +85,7 @@ def work(
 @store_option
 @click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
-def preview(spec: str, store: Path, count: int, out: Path) -> None:
+def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
     """Write a contact sheet of SPEC's samples: A, B, albedo, normal, depth, photons."""
     from photonfarm.renderer.preview import write_contact_sheet
     from photonfarm.shared.scene import load_spec

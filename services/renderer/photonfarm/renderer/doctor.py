@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from photonfarm.shared.errors import PhotonfarmError, QueueError, StoreError
+from photonfarm.shared.store.storage import store_errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +24,7 @@ class Finding:
     exit_code: int = 0  # of the command, if this does not work and is needed
 
 
-def examine(store: Path, redis_url: str) -> Iterator[Finding]:
+def examine(store: str | Path, redis_url: str) -> Iterator[Finding]:
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
     yield _tried("renderer", _renders)
@@ -64,7 +65,9 @@ def _renders() -> str:
     return f"{mi.variant()}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"
 
 
-def _writes(store: Path) -> str:
+def _writes(store: str | Path) -> str:
+    if isinstance(store, str):
+        return _writes_to_bucket(store)
     try:
         folder = next(p for p in (store.absolute(), *store.absolute().parents) if p.exists())
         with tempfile.TemporaryDirectory(dir=folder, prefix=".doctor-"):
@@ -72,6 +75,14 @@ def _writes(store: Path) -> str:
     except OSError as error:
         raise StoreError(f"{store}: cannot be written: {error.strerror}") from error
     return f"{store} can be written, {free_gb:.0f} GB free"
+
+
+def _writes_to_bucket(url: str) -> str:
+    from photonfarm.shared.store.objects import ObjectStorage
+
+    with store_errors("write", url):
+        ObjectStorage(url).check()
+    return f"{url} can be written, and does not overwrite where it must not"
 
 
 def _starts_redis() -> str:

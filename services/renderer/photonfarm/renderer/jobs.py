@@ -98,10 +98,10 @@ class ShardRenderer:
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit one job; False if it was committed already.
 
-        Raises QueueError for a job of another store, BackendError if the scene file here is not the planned one,
-        IncompleteError if renders stay non-finite or buffers are.
+        Raises QueueError for a job that is not planned in this store, BackendError if the scene file here is not the
+        planned one, IncompleteError if renders stay non-finite or buffers are.
         """
-        if scene_id not in self._store.scene_ids():
+        if scene_id not in self._store.scene_ids() or job >= self._store.scene(scene_id).jobs():
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
         stored = self._store.scene(scene_id)
         if stored.is_committed(job):

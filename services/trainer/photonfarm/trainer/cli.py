@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli import json_option, store_option
+from photonfarm.shared.cli import json_option, redis_option, store_option
 
 run_option = click.option(
     "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
@@ -20,6 +20,7 @@ run_option = click.option(
 @click.argument("spec", required=False)
 @store_option
 @run_option
+@redis_option
 @click.option(
     "--preset",
     type=click.Choice(["small", "paper"]),
@@ -40,14 +41,20 @@ run_option = click.option(
 @click.option("--threads", type=click.IntRange(1), help="Processor threads of torch.  [default: 1]")
 @click.option("--device", help="cpu or cuda.  [default: cpu]")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
-def train(spec: str | None, store: Path, run: Path, preset: str, check: bool, **settings: Any) -> None:
-    """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene."""
+def train(
+    spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, check: bool, **settings: Any
+) -> None:
+    """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
+
+    Redis, where there is one, is told how many samples have been used, for `photonfarm work --ahead`.
+    """
     from photonfarm.trainer import service
 
     if check:
         service.check(run)
     else:
-        service.run(spec, store, run, preset, {k: v for k, v in settings.items() if v is not None})
+        changes = {k: v for k, v in settings.items() if v is not None}
+        service.run(spec, store, run, preset, changes, redis_url)
 
 
 @click.command()
@@ -55,7 +62,7 @@ def train(spec: str | None, store: Path, run: Path, preset: str, check: bool, **
 @run_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
-def report(store: Path, run: Path, out: Path, as_json: bool) -> None:
+def report(store: str | Path, run: Path, out: Path, as_json: bool) -> None:
     """Write report.html and report.json: what was learned, at which cost, with pictures."""
     from photonfarm.trainer.report import write_report
 

@@ -104,7 +104,7 @@ def _shown(feed: Feed, network: Cnn, rows: list[int], errors: HeldOut, size: int
     return found
 
 
-def production(store: Path, scene_id: str) -> SceneStatus:
+def production(store: str | Path, scene_id: str) -> SceneStatus:
     """What the store says of a scene: samples planned and complete, and the processor time they took."""
     for status in store_status(Store(store)):
         if status.scene_id == scene_id:

@@ -14,7 +14,7 @@ from photonfarm.trainer.page import page
 from photonfarm.trainer.store_source import StoreSource
 
 
-def write_report(store: Path, run: Path, out: Path) -> dict[str, Any]:
+def write_report(store: str | Path, run: Path, out: Path) -> dict[str, Any]:
     """Write report.html and report.json of a run into the folder `out`; returns the figures of the latter.
 
     Both the untrained and the last network are evaluated, on the held-out samples that the store now has, the

@@ -6,17 +6,19 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from pydantic import ValidationError
+from redis import Redis, RedisError
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.estimate import stated
 from photonfarm.shared.scene import load_spec, sentences
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.storage import is_vacant
 from photonfarm.trainer.settings import TrainSettings, small
 
 T = TypeVar("T")
@@ -25,13 +27,21 @@ PRESETS: dict[str, Callable[..., TrainSettings]] = {"small": small, "paper": Tra
 
 POLL_S = 1.0
 ALIVE_FILE = "alive"
+TELL_S = 5.0  # between figures for the workers
 ALIVE_S = 60.0  # a run whose sign of life is older is taken for dead
 
 
-def run(spec: str | None, store: Path, folder: Path, preset: str, changes: dict[str, Any]) -> None:
+def run(
+    spec: str | None,
+    store: str | Path,
+    folder: Path,
+    preset: str,
+    changes: dict[str, Any],
+    redis_url: str | None = None,
+) -> None:
     """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint.
 
-    Waiting for a scene, its base and its samples counts as time spent.
+    Waiting for a scene, its base and its samples counts as time spent. With a Redis, workers are told what is used.
     """
     from photonfarm.trainer.loop import stop_on_signals, train
     from photonfarm.trainer.model import usable_device
@@ -42,14 +52,20 @@ def run(spec: str | None, store: Path, folder: Path, preset: str, changes: dict[
     scene_id = load_spec(spec).scene_id if spec else _begun_on(folder)
     began = time.monotonic()
     with stop_on_signals() as stop, _sign_of_life(folder):
-        if not (store / "scenes").is_dir():
+        if is_vacant(store):
             click.echo(f"waiting for a store and a scene in {store}", err=True)
         scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
         if scene_id is None:
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
-        outcome = train(source, settings, folder, stop=stop, listen=_tell, waited=waited)
+        with _consumption_told(redis_url, scene_id) as used:
+
+            def listen(record: dict[str, Any]) -> None:
+                used(record)
+                _tell(record)
+
+            outcome = train(source, settings, folder, stop=stop, listen=listen, waited=waited)
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 
@@ -81,12 +97,12 @@ def _begun_on(folder: Path) -> str | None:
     return str(checkpoint.load(begun)["scene_id"]) if begun.exists() else None
 
 
-def _only_scene(store: Path) -> str | None:
+def _only_scene(store: str | Path) -> str | None:
     """The scene of a store that has one; None while there is no store or no scene; SpecError if there are several."""
     try:
         ids = Store(store).scene_ids()
     except StoreError:
-        if store.exists() and any(store.iterdir()):
+        if not is_vacant(store):
             raise
         return None
     if len(ids) > 1:
@@ -126,6 +142,40 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
         ended.set()
         thread.join()
         (folder / ALIVE_FILE).unlink(missing_ok=True)
+
+
+@contextmanager
+def _consumption_told(redis_url: str | None, scene_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """What takes the records of training; a thread tells Redis now and then how many samples have been used by them.
+
+    Each counts once, and held-out ones as soon as they are seen. A Redis that is not there is none of our trouble.
+    """
+    used: int | None = None  # a run that continues knows only with its first record
+    ended = threading.Event()
+
+    def take(record: dict[str, Any]) -> None:
+        nonlocal used
+        if "draws" in record:
+            used = min(record["draws"], record["samples"])
+
+    def tell() -> None:
+        from photonfarm.shared import queue
+
+        connection: Redis | None = None
+        while redis_url is not None and not ended.wait(TELL_S):
+            if used is None:
+                continue
+            with suppress(QueueError, RedisError):
+                connection = connection or queue.connect(redis_url)
+                queue.tell_consumed(connection, scene_id, used)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield take
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _tell(record: dict[str, Any]) -> None:

@@ -108,7 +108,9 @@ class JobWriter:
         array = self._arrays[name]
         if values.shape != array.shape:
             raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
-        self._waiting.put((name, row % self._plan.shard_rows, _cast(values, array, row)))
+        if not _stays_finite(values, array.dtype):
+            raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
+        self._waiting.put((name, row % self._plan.shard_rows, values))
         self._raise_error()
 
     def _write(self) -> None:
@@ -216,18 +218,19 @@ class JobWriter:
 
 
 def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
-    """Which array takes a sample, and what is stored there: float16 and scaled, or as it is where that cannot hold it.
+    """Which array takes a sample, and what it is given: scaled, or as it is where float16 cannot hold that."""
+    with np.errstate(over="ignore", under="ignore"):
+        scaled = radiance * np.float32(2.0**exponent)
+    return ("radiance", scaled) if _stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
 
-    65504 is the largest float16 and 65520 the first number that rounds to infinity.
+
+def _stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
+    """Whether all values are finite in the type that they are stored in, to which the writer's thread rounds them.
+
+    65504 is the largest float16 and 65520 the first number that rounds to infinity; likewise for float32. NaN is in no
+    range.
     """
-    with np.errstate(over="ignore", under="ignore"):
-        scaled = (radiance * np.float32(2.0**exponent)).astype(np.float16)
-    return ("radiance", scaled) if np.isfinite(scaled).all() else ("radiance_wide", radiance)
-
-
-def _cast(values: NDArray[Any], array: schema.ArraySchema, row: int) -> NDArray[Any]:
-    with np.errstate(over="ignore", under="ignore"):
-        stored = values.astype(array.dtype, copy=False)
-    if stored.dtype.kind == "f" and not np.isfinite(stored).all():
-        raise IncompleteError(f"{array.name} of row {row} holds a value that is not finite in {array.dtype.name}")
-    return stored
+    if stored.kind != "f":
+        return True
+    end = {2: 65520.0, 4: 2.0**128 - 2.0**103}[stored.itemsize]
+    return bool(-end < values.min() and values.max() < end)

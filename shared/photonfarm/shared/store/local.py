@@ -7,6 +7,7 @@ a whole file, and the first one stays. Folders are synced before anything announ
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import os
 import shutil
@@ -105,6 +106,18 @@ class LocalStorage:
             return False
         sync(final.parent)
         return True
+
+    def move(self, name: str, new_name: str) -> None:
+        """Rename a file; raises FileNotFoundError."""
+        final = self.root / new_name
+        _make_folder(final.parent)
+        if final.exists():  # a rename would replace it
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(final))
+        (self.root / name).rename(final)
+
+    def move_folder(self, folder: str, new_folder: str) -> None:
+        """Rename a folder, at once; raises FileNotFoundError."""
+        self.move(folder, new_folder)
 
     def settle(self, names: Iterable[str]) -> None:
         """Sync the folders that the names are in."""

@@ -11,17 +11,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import UNUSED, PlannedRows, Request
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import schema
+from photonfarm.shared.store import declarations, schema
 from photonfarm.shared.store.storage import Storage, store_errors
+from photonfarm.shared.top_up import AnyRequest, TopUp
 from photonfarm.shared.view import View
 
 NAME_DIGITS = 6
+
+_REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +34,7 @@ class StoredPlan:
 
     number: int
     folder: str  # its name in the storage
-    request: Request
+    request: Request | TopUp
     first_job: int
     jobs: int
     shard_rows: int
@@ -92,13 +96,16 @@ def folder(scene: str, number: int) -> str:
     return f"{scene}/plans/{number:0{NAME_DIGITS}d}"
 
 
-def build(part: Path, spec: SceneSpec, request: Request, rows: PlannedRows, *, first_job: int, shard_rows: int) -> None:
+def build(
+    part: Path, spec: SceneSpec, request: Request | TopUp, rows: PlannedRows, *, first_job: int, shard_rows: int
+) -> None:
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
     import zarr
     from zarr.storage import LocalStore
 
     count = len(rows.sample_modification)
     attributes: Any = {
+        **declarations.stamp(),
         "scene": spec.scene_id,
         "request": request.model_dump(mode="json"),
         "first_job": first_job,
@@ -106,16 +113,18 @@ def build(part: Path, spec: SceneSpec, request: Request, rows: PlannedRows, *, f
         "shard_rows": shard_rows,
     }
     group = zarr.open_group(LocalStore(part), mode="w-", zarr_format=3, attributes=attributes)
-    for name, (dimensions, about) in schema.PLAN_INPUTS.items():
-        schema.create_input(group, name, getattr(rows, name), dimensions, about)
+    for declared in declarations.PLAN_INPUTS:
+        schema.create_input(group, declared, getattr(rows, declared.name))
     schema.create_outputs(group, spec, count, shard_rows)
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan]) -> list[StoredPlan]:
     """The plans of a scene in order, those already loaded taken over."""
     with store_errors("list the plans", f"{storage.where}/{scene}"):
-        numbers = sorted(int(name) for name in storage.names(f"{scene}/plans") if name.isdecimal())
-    return loaded + [_load(storage, scene, number) for number in numbers[len(loaded) :]]
+        numbers = sorted(int(name) for name in storage.names(f"{scene}/plans") if name.isdecimal())[len(loaded) :]
+        if numbers and not storage.exists(f"{folder(scene, numbers[-1])}/zarr.json"):  # in a bucket it comes last
+            del numbers[-1]
+    return loaded + [_load(storage, scene, number) for number in numbers]
 
 
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
@@ -127,7 +136,7 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
         group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
         rows = PlannedRows(**{field.name: _whole(group, field.name) for field in fields(PlannedRows)})
         about: dict[str, Any] = dict(group.attrs)
-        request = Request.model_validate(about["request"])
+        request = _REQUEST.validate_python(about["request"], extra="ignore")  # of a later program
         first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
     except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}") from error

@@ -1,6 +1,6 @@
 """The store as the trainer sees it: complete samples, while more of them arrive.
 
-Shape letters: H W image.
+Shape letters: B batch, R rows of the scene, H W image.
 
 A sample is complete when the jobs of its own row, of its view's row and of its modification's row are committed. Rows
 are read straight from the shards, every byte checked against its checksum.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,11 @@ from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
-from photonfarm.shared.store.plans import SampleRow, StoredPlan
+from photonfarm.shared.store.batch import Batch
+from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
 from photonfarm.shared.store.shards import Shard
-from photonfarm.shared.store.storage import open_storage
+from photonfarm.shared.store.storage import open_storage, store_errors
 from photonfarm.shared.store.store import FORMAT_FILE, check_format
 from photonfarm.shared.view import View
 
@@ -44,7 +46,7 @@ class Sample:
 
 
 OPEN_SHARDS = 256
-"""Files kept open by a reader; a process may have 1024 as a rule."""
+"""Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
 
 
 class SceneReader:
@@ -60,6 +62,7 @@ class SceneReader:
         self._plans: list[StoredPlan] = []
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
+        self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards = _OpenShards()
 
     @property
@@ -97,7 +100,7 @@ class SceneReader:
             return np.zeros(0, np.int64)
         _ = self.spec
         committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
-        self._plans = plans.load_all(self._storage, self._name, self._plans)
+        self._load_plans()
         if committed == self._committed:
             return np.zeros(0, np.int64)
         complete = plans.complete_rows(self._plans, committed)
@@ -108,30 +111,79 @@ class SceneReader:
         self._committed, self._complete = committed, complete
         return np.flatnonzero(complete & ~before)
 
+    def _load_plans(self) -> None:
+        known, self._plans = len(self._plans), plans.load_all(self._storage, self._name, self._plans)
+        if len(self._plans) > known:
+            inputs = [plan.rows for plan in self._plans]
+            self._view_row = np.concatenate([rows.sample_view for rows in inputs])
+            self._modification_row = np.concatenate([rows.sample_modification for rows in inputs])
+            self._pass = np.concatenate([rows.sample_pass for rows in inputs])
+
     # ---------------------------------------------------------------------------------------------------------- samples
+
+    def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
+        """Complete samples in the order of `rows`, in the types they are stored in; every byte has been checked.
+
+        They are read into the first places of `out`, and what is returned is these; without, into new memory. Raises
+        CorruptError if their bytes are not what was committed; what `out` holds is then undefined.
+        """
+        chosen = np.asarray(rows, np.int64)
+        self._check_complete(chosen)
+        if out is None:
+            out = Batch.empty(self.spec, len(chosen))
+        if len(chosen) > len(out):
+            raise ValueError(f"rows: {len(chosen)} samples do not fit a batch of {len(out)}")
+        batch = out.first(len(chosen))
+        batch.rows[:], batch.view_rows[:] = chosen, self._view_row[chosen]
+        batch.modification_rows[:] = self._modification_row[chosen]
+        batch.wide.clear()
+        with store_errors("read samples", self._storage.where):
+            for place, row in enumerate(chosen.tolist()):
+                self._read_radiance(row, place, batch)
+            for name, memory in batch.buffers.items():
+                for place, row in enumerate(batch.view_rows.tolist()):
+                    self._read_into(name, row, memory[place])
+        return batch
 
     def read(self, row: int) -> Sample:
         """One complete sample; raises CorruptError if its bytes are not what was committed."""
-        sample = self._sample(row)
-        return Sample(
+        batch = self.read_batch([row])
+        buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
+        sample = Sample(
             row,
-            plans.modification_at(self._plans, sample.modification_row),
-            plans.view_at(self._plans, sample.view_row),
-            self._radiance(row),
-            self._buffers(sample.view_row),
-            sample.pass_,
+            plans.modification_at(self._plans, int(batch.modification_rows[0])),
+            plans.view_at(self._plans, int(batch.view_rows[0])),
+            batch.linear(0),
+            ViewBuffers(**buffers),
+            int(self._pass[row]),
         )
+        if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values())):
+            raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
+        return sample
 
     def read_photons(self, row: int) -> Photons:
         """The photons of a sample's modification; raises StoreError for a scene without photons."""
         if not self.spec.photons.paths:
             raise StoreError(f"scene {self._scene_id} has photons.paths = 0; no photons are stored")
         modification_row = self.modification_row(row)
-        return Photons(**{f.name: self._stored(f"photon_{f.name}", modification_row) for f in fields(Photons)})
+        with store_errors("read photons", self._storage.where):
+            bounce = self._read("photon_bounce", modification_row)
+            floats = [f.name for f in fields(Photons) if f.name != "bounce"]
+            read = {
+                name: self._read(f"photon_{name}", modification_row).astype(np.float32, copy=False) for name in floats
+            }
+        return Photons(**read, bounce=bounce)
+
+    def rows_of_view(self, view_row: int) -> NDArray[np.int64]:
+        """The complete samples that show the view in a row, ascending: its passes."""
+        rows = np.flatnonzero(self._view_row == view_row)
+        rows = rows[rows < len(self._complete)]  # a plan may be younger than the last marker
+        return rows[self._complete[rows]]
 
     def modification_row(self, row: int) -> int:
         """The row of a sample's modification: equal for all samples of one configuration."""
-        return self._sample(row).modification_row
+        self._check_complete(np.array([row]))
+        return int(self._modification_row[row])
 
     def modification_key(self, row: int) -> Key:
         """The content key of a sample's configuration, by whose hash samples are held out."""
@@ -139,8 +191,9 @@ class SceneReader:
 
     def view_key(self, row: int) -> Key:
         """The content key of a sample's configuration and view: equal for all passes of one view."""
-        view = plans.view_at(self._plans, self._sample(row).view_row)
-        return make_key("view", self.modification_key(row), view.vector)
+        modification_key = self.modification_key(row)
+        view = plans.view_at(self._plans, int(self._view_row[row]))
+        return make_key("view", modification_key, view.vector)
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud; raises StoreError while they are not there."""
@@ -148,78 +201,66 @@ class SceneReader:
 
     # ----------------------------------------------------------------------------------------------------------- arrays
 
-    def _sample(self, row: int) -> SampleRow:
-        if not 0 <= row < len(self._complete) or not self._complete[row]:
-            raise StoreError(f"row {row} of scene {self._scene_id} is not complete")
-        sample = plans.sample_at(self._plans, row)
-        if sample is None:
-            raise StoreError(f"row {row} of scene {self._scene_id} is not used")
-        return sample
+    def _check_complete(self, rows: NDArray[np.int64]) -> None:
+        there = (rows >= 0) & (rows < len(self._complete))
+        there[there] = self._complete[rows[there]]
+        if not there.all():
+            raise StoreError(f"row {int(rows[~there][0])} of scene {self._scene_id} is not complete")
 
-    def _radiance(self, row: int) -> F32:
-        shard, array = self._shard("radiance", row), self._arrays["radiance"]
-        if shard is None or self._within(row) not in shard:
-            shard, array = self._shard("radiance_wide", row), self._arrays["radiance_wide"]
-        return self._floats(shard, array, row) * np.float32(2.0 ** -array.attributes["radiance_exponent"])
+    def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
+        shard, within = self._shard("radiance", row)
+        if shard is not None and within in shard:
+            shard.read_into(within, batch.radiance[place])
+            return
+        batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
+        batch.wide[place] = self._read("radiance_wide", row)
 
-    def _buffers(self, view_row: int) -> ViewBuffers:
-        return ViewBuffers(**{f.name: self._stored(f.name, view_row) for f in fields(ViewBuffers)})
-
-    def _stored(self, name: str, row: int) -> NDArray[Any]:
-        """A row of an array, in float32 if it holds floats."""
+    def _read(self, name: str, row: int) -> NDArray[Any]:
         array = self._arrays[name]
-        shard = self._shard(name, row)
-        return self._floats(shard, array, row) if array.dtype.kind == "f" else self._row(shard, array, row)
-
-    def _floats(self, shard: Shard | None, array: schema.ArraySchema, row: int) -> F32:
-        wide = self._row(shard, array, row).astype(np.float32)
-        if shard is not None and not np.isfinite(wide).all():
-            raise CorruptError(f"{shard.path}: {array.name} of row {row} is not finite")
-        return wide
-
-    def _row(self, shard: Shard | None, array: schema.ArraySchema, row: int) -> NDArray[Any]:
-        values = None if shard is None else shard.read(self._within(row))
-        if values is None:
-            raise CorruptError(
-                f"{self._storage.where}/{self._file(array.name, row)}: row {row} is committed, but missing"
-            )
+        values = np.empty(array.shape, array.dtype)
+        self._read_into(name, row, values)
         return values
 
-    def _within(self, row: int) -> int:
-        return row % self._plans[0].shard_rows
+    def _read_into(self, name: str, row: int, values: NDArray[Any]) -> None:
+        shard, within = self._shard(name, row)
+        if shard is None or within not in shard:
+            file = self._file(name, row // self._plans[0].shard_rows)
+            raise CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
+        shard.read_into(within, values)
 
-    def _file(self, name: str, row: int) -> str:
-        plan = plans.plan_of(self._plans, row)
-        return plan.shard(name, self._arrays[name], row // plan.shard_rows)
+    def _file(self, name: str, job: int) -> str:
+        plan = plans.plan_of(self._plans, job * self._plans[0].shard_rows)
+        return plan.shard(name, self._arrays[name], job)
 
-    def _shard(self, name: str, row: int) -> Shard | None:
-        """The shard of a row; None if there is none, which may be of `radiance` and `radiance_wide` alone."""
-        file, array = self._file(name, row), self._arrays[name]
-        shard = self._shards.get(file)
+    def _shard(self, name: str, row: int) -> tuple[Shard | None, int]:
+        """The shard of a row, and which of its rows it is; None if there is none, which may be of radiance alone."""
+        job, within = divmod(row, self._plans[0].shard_rows)
+        shard = self._shards.get((name, job))
         if shard is None:
+            file, array = self._file(name, job), self._arrays[name]
             if array.kind == "sample" and not self._storage.exists(file):
-                return None
+                return None, within
             shard = Shard(self._storage.local(file), array, self._plans[0].shard_rows)
-            self._shards.put(file, shard)
-        return shard
+            self._shards.put((name, job), shard)
+        return shard, within
 
 
 class _OpenShards:
-    """The shards used last; one that is dropped is closed once nobody reads it any more."""
+    """The shards used last, by array and job; one that is dropped is closed once nobody reads it any more."""
 
     def __init__(self) -> None:
-        self._shards: OrderedDict[str, Shard] = OrderedDict()
+        self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()
         self._lock = threading.Lock()
 
-    def get(self, file: str) -> Shard | None:
+    def get(self, key: tuple[str, int]) -> Shard | None:
         with self._lock:
-            if file in self._shards:
-                self._shards.move_to_end(file)
-            return self._shards.get(file)
+            if key in self._shards:
+                self._shards.move_to_end(key)
+            return self._shards.get(key)
 
-    def put(self, file: str, shard: Shard) -> None:
+    def put(self, key: tuple[str, int], shard: Shard) -> None:
         with self._lock:
-            self._shards[file] = shard
+            self._shards[key] = shard
             while len(self._shards) > OPEN_SHARDS:
                 self._shards.popitem(last=False)
 

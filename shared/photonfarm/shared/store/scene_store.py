@@ -16,12 +16,13 @@ from pydantic import ValidationError
 
 from photonfarm.shared.errors import CorruptError, SpecError, StoreError
 from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Known, Request, expand
-from photonfarm.shared.records import BasePointCloud, Geometry, arrays_of
+from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import markers, plans, schema
+from photonfarm.shared.store import declarations, markers, plans, schema
 from photonfarm.shared.store.commit import JobWriter
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.storage import Storage, store_errors
+from photonfarm.shared.top_up import TopUp, expand_top_up
 
 SCENES = "scenes"
 
@@ -68,16 +69,20 @@ class SceneStore:
         self._plans = plans.load_all(self.storage, self.name, self._plans)
         return self._plans
 
-    def plan(self, request: Request, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
-        """Plan what is new of a request; racing submitters try again, each against the other's plan."""
+    def plan(self, request: Request | TopUp, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
+        """Plan what is new of a request; racing submitters try again, each against the other's plan.
+
+        Raises SpecError for a request or a number of rows that cannot be.
+        """
         while True:
             found = self.plans()
             rows_per_job = self._shard_rows(found, shard_rows)
             first_job = found[-1].end_job if found else 0
-            known = Known()
-            for plan in found:
-                known.add(plan.rows, plan.first_row)
-            expansion = expand(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
+            known = Known((plan.first_row, plan.rows) for plan in found)
+            if isinstance(request, TopUp):
+                expansion = expand_top_up(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
+            else:
+                expansion = expand(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0)
             with store_errors("write a plan", self.storage.where):
@@ -183,12 +188,11 @@ def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) 
     import zarr
     from zarr.storage import LocalStore
 
-    root = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3)
+    root = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3, attributes=declarations.stamp())
     for name, record in records.items():
-        group = root.create_group(name)
-        for field, values in arrays_of(record).items():
-            axes = (field, "component") if values.ndim == 2 else (field,)
-            schema.create_input(group, field, values, axes, "see photonfarm.shared.records; scene units, at rest")
+        group = root.create_group(name, attributes=declarations.stamp())
+        for declared in declarations.BASE[name]:
+            schema.create_input(group, declared, getattr(record, declared.name))
 
 
 def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-
-import numpy as np
+from functools import partial
 
 from photonfarm.shared.store.scene_store import SceneStore
 from photonfarm.shared.store.store import Store
@@ -25,16 +25,24 @@ class SceneStatus:
     redrawn: int  # renders thrown away for a non-finite value
 
 
+_READERS = 8
+"""Markers read at a time: a bucket answers after milliseconds, whoever asks."""
+
+_BLOCK = 256
+"""Markers that a reader takes at a time, and forgets once they are summed up."""
+
+
 def store_status(store: Store) -> list[SceneStatus]:
-    """The status of every scene; reads every marker."""
+    """The status of every scene; reads every marker, and holds few of them at a time."""
     return [_scene_status(scene) for scene in store.scenes()]
 
 
 def _scene_status(scene: SceneStore) -> SceneStatus:
     progress = scene.progress()
-    committed = scene.committed_jobs()
-    markers = [scene.marker(job) for job in sorted(committed)]
-    sizes = [file["size"] for marker in markers for file in marker["files"].values()]
+    committed = sorted(scene.committed_jobs())
+    with ThreadPoolExecutor(_READERS) as readers:
+        blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
+        sums = list(readers.map(partial(_sums, scene), blocks))
     return SceneStatus(
         scene.scene_id,
         scene.spec.name,
@@ -42,7 +50,18 @@ def _scene_status(scene: SceneStore) -> SceneStatus:
         progress.committed_samples,
         scene.jobs(),
         len(committed),
-        int(np.sum(sizes, dtype=np.int64)),
-        float(sum(marker["figures"]["core_s"] for marker in markers)),
-        sum(marker["figures"]["redrawn"] for marker in markers),
+        sum(size_bytes for size_bytes, _, _ in sums),
+        sum((core_s for _, core_s, _ in sums), 0.0),
+        sum(redrawn for _, _, redrawn in sums),
     )
+
+
+def _sums(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int]:
+    """Bytes, processor seconds and renders thrown away of some committed jobs."""
+    size_bytes, core_s, redrawn = 0, 0.0, 0
+    for job in jobs:
+        marker = scene.marker(job)
+        size_bytes += sum(file["size"] for file in marker["files"].values())
+        core_s += marker["figures"]["core_s"]
+        redrawn += marker["figures"]["redrawn"]
+    return size_bytes, core_s, redrawn

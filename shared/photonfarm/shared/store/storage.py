@@ -62,6 +62,18 @@ class Storage(Protocol):
     def adopt_folder(self, part: Path, folder: str) -> bool:
         """Give a folder that is a Zarr group its name, at once; False if the name was taken, which keeps the part."""
 
+    def move(self, name: str, new_name: str) -> None:
+        """Give the bytes of a name another one, which nothing has; raises FileNotFoundError.
+
+        The bytes are never without a name; in between they may have both.
+        """
+
+    def move_folder(self, folder: str, new_folder: str) -> None:
+        """Give all names below a folder that is a Zarr group to another folder, which does not exist.
+
+        The group's own zarr.json goes first, if not all go at once. Raises FileNotFoundError if there is none.
+        """
+
     def settle(self, names: Iterable[str]) -> None:
         """Return once these names are as durable as their bytes."""
 
@@ -69,11 +81,37 @@ class Storage(Protocol):
         """Remove parts that dead writers left; how many."""
 
 
-def open_storage(root: str | Path) -> Storage:
-    """The storage of a folder's path or of a bucket's URL, which need not exist yet."""
-    from photonfarm.shared.store.local import LocalStorage
+SCHEMES = ("s3", "gs", "az")
+"""Of the URLs of buckets."""
 
-    return LocalStorage(Path(root))
+
+def is_url(root: str | Path) -> bool:
+    """Whether a store's place is meant as a URL."""
+    return isinstance(root, str) and "://" in root
+
+
+def open_storage(root: str | Path) -> Storage:
+    """The storage of a folder's path or of a bucket's URL, which need not exist yet; raises StoreError for others."""
+    if not is_url(root):
+        from photonfarm.shared.store.local import LocalStorage
+
+        return LocalStorage(Path(root))
+    if str(root).partition("://")[0] not in SCHEMES:
+        raise StoreError(f"{root}: is no URL of a bucket; they begin with {'://, '.join(SCHEMES)}://")
+    try:
+        from photonfarm.shared.store.objects import ObjectStorage
+    except ModuleNotFoundError as error:
+        raise StoreError(
+            f"{root}: a store in a bucket needs the package {error.name}; pip install 'photonfarm-shared[objects]'"
+        ) from error
+    return ObjectStorage(str(root))
+
+
+def is_vacant(root: str | Path) -> bool:
+    """Whether nothing lies where a store could be, so that one may be made there; raises StoreError."""
+    storage = open_storage(root)
+    with store_errors("look into the store", storage.where):
+        return not storage.names("")
 
 
 def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:

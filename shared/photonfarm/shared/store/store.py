@@ -8,7 +8,7 @@ from pathlib import Path
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import SHARD_ROWS, Known, Request, expand
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import schema
+from photonfarm.shared.store import declarations
 from photonfarm.shared.store.local import TMP
 from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore
 from photonfarm.shared.store.storage import STRAY_AGE_S, Storage, open_storage, put_json, store_errors
@@ -35,7 +35,7 @@ class Store:
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
             if foreign and not self.storage.exists(FORMAT_FILE):  # nobody made one in the meantime
                 raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
-            put_json(self.storage, {"format": schema.FORMAT, "version": schema.VERSION}, FORMAT_FILE)
+            put_json(self.storage, declarations.stamp(), FORMAT_FILE)
 
     def scene_ids(self) -> list[str]:
         """The scenes that are there, in order of their ids."""
@@ -88,8 +88,4 @@ def check_format(storage: Storage) -> None:
         raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise CorruptError(f"{file}: is not the document of a store: {error}") from error
-    if name != schema.FORMAT or version != schema.VERSION:
-        raise StoreError(
-            f"{storage.where}: has format {name!r} version {version!r}; this program reads and writes "
-            f"{schema.FORMAT!r} version {schema.VERSION}"
-        )
+    declarations.check_version(name, version, storage.where)

@@ -1,0 +1,128 @@
+"""Rendered contents for stores that are measured: each configuration and view once, whatever asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photonfarm.shared.keys import Key
+from photonfarm.shared.modification import Modification
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import Figures, SceneStore
+from photonfarm.shared.view import View
+
+FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
+
+
+class Contents:
+    """What a worker renders, kept. All passes of a view have the same half-estimates: noise is stored raw."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        from photonfarm.renderer import backend
+
+        backend.load(threads=1)
+        from photonfarm.renderer.scenes import LoadedScene
+
+        self.spec = spec
+        self._scene = LoadedScene.load(spec)
+        self._made: dict[tuple[str, Key], Any] = {}
+        self._applied: Key = b""
+        self.base: tuple[Geometry, BasePointCloud] = self._scene.base()
+
+    def halves(self, modification: Modification, view: View) -> F32:
+        """Half-estimates A and B, (2, H, W, 3)."""
+        return self._get("halves", modification, view, lambda: self._scene.render_halves(view, (1, 2)))
+
+    def buffers(self, modification: Modification, view: View) -> ViewBuffers:
+        """The image-space buffers."""
+        return self._get("buffers", modification, view, lambda: self._scene.buffers(view))
+
+    def photons(self, modification: Modification) -> Photons:
+        """The photons."""
+        return self._get("photons", modification, None, lambda: self._scene.photons(3))
+
+    def _get(self, what: str, modification: Modification, view: View | None, make: Any) -> Any:
+        key = modification.key(self.spec.scene_id)
+        name = (what, key + (view.vector.tobytes() if view else b""))
+        if name not in self._made:
+            if self._applied != key:
+                self._scene.apply(modification)
+                self._applied = key
+            self._made[name] = make()
+        return self._made[name]
+
+    def pool(self) -> Pool:
+        """All that has been made so far, in no relation to each other."""
+        of = {what: [value for (kind, _), value in self._made.items() if kind == what] for what in _KINDS}
+        return Pool(of["halves"], of["buffers"], of["photons"])
+
+
+_KINDS = ("halves", "buffers", "photons")
+
+
+class Pool:
+    """Contents for any number of samples, dealt in turn; goes through a file, for other processes."""
+
+    def __init__(self, halves: list[F32], buffers: list[ViewBuffers], photons: list[Photons]) -> None:
+        self._of: dict[str, list[Any]] = {"halves": halves, "buffers": buffers, "photons": photons}
+        self._dealt = dict.fromkeys(self._of, 0)
+
+    def halves(self, *_: Any) -> F32:
+        """The next half-estimates."""
+        return self._next("halves")
+
+    def buffers(self, *_: Any) -> ViewBuffers:
+        """The next buffers."""
+        return self._next("buffers")
+
+    def photons(self, *_: Any) -> Photons:
+        """The next photons."""
+        return self._next("photons")
+
+    def _next(self, what: str) -> Any:
+        self._dealt[what] += 1
+        return self._of[what][self._dealt[what] % len(self._of[what])]
+
+    def save(self, path: Path) -> None:
+        """Write all into one .npz file."""
+        arrays = {f"halves/{i}": values for i, values in enumerate(self._of["halves"])}
+        for what in ("buffers", "photons"):
+            for i, record in enumerate(self._of[what]):
+                arrays |= {f"{what}/{i}/{field.name}": getattr(record, field.name) for field in fields(record)}
+        np.savez(path, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Pool:
+        """What `save` has written."""
+        with np.load(path) as file:
+            arrays = dict(file)
+
+        def records(what: str, kind: Any) -> Iterator[Any]:
+            for i in range(sum(name.startswith(f"{what}/") for name in arrays) // len(fields(kind))):
+                yield kind(**{field.name: arrays[f"{what}/{i}/{field.name}"] for field in fields(kind)})
+
+        halves = [values for name, values in arrays.items() if name.startswith("halves/")]
+        return cls(halves, list(records("buffers", ViewBuffers)), list(records("photons", Photons)))
+
+
+def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
+    """Give a job its contents in the order that a worker has, as fast as they are taken."""
+    rows = scene.job_rows(job)
+    modifications = set(rows.new_modifications if scene.spec.photons.paths else ())
+    views = set(rows.new_views)
+    with scene.job_writer(job) as out:
+        for sample in rows.samples:
+            modification, view = rows.modifications[sample.modification_row], rows.views[sample.view_row]
+            if sample.modification_row in modifications:
+                out.photons(sample.modification_row, contents.photons(modification))
+            if sample.view_row in views:
+                out.buffers(sample.view_row, contents.buffers(modification, view))
+            modifications.discard(sample.modification_row)
+            views.discard(sample.view_row)
+            out.radiance(sample.row, contents.halves(modification, view))
+        out.commit(FIGURES)

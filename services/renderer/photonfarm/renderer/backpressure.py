@@ -1,0 +1,106 @@
+"""When a worker should take no job: the disk is nearly full, or the trainer is far behind.
+
+Neither fails a job, and both pass by themselves. They hold back what has not begun; the job in hand is finished.
+"""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from redis import Redis
+
+from photonfarm.shared import queue
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.local import LocalStorage
+
+AHEAD_MINIMUM = 256
+"""Samples that may be committed before any has been used: a trainer waits for its first few, also held-out ones."""
+
+AHEAD_LOOK_S = 5.0
+"""Between counts of what is committed, which lists every marker."""
+
+FULL_S = 30.0
+"""How long a disk that refused a commit is left alone, where the reserve does not tell when there is space again."""
+
+
+class DiskReserve:
+    """Keeps some of a store's disk free; a store that is not on a disk of ours has no end."""
+
+    def __init__(self, store: Store, reserve_bytes: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take a store and how much of its disk is to stay free."""
+        self._root = store.storage.root if isinstance(store.storage, LocalStorage) else None
+        self._reserve_bytes = reserve_bytes
+        self._clock = clock
+        self._refused_until = 0.0
+
+    def refused(self) -> None:
+        """The disk has just refused a write, whatever it says of its space: quotas are not seen there."""
+        self._refused_until = self._clock() + FULL_S
+
+    def reason(self) -> str | None:
+        """Why no job should be taken now; None if there is none."""
+        if self._clock() < self._refused_until:
+            return "the disk is full; trying again now and then"
+        free = _free_bytes(self._root)
+        if free is None or free >= self._reserve_bytes:
+            return None
+        return (
+            f"{free / 1e9:.1f} GB are free on the disk of {self._root}, and {self._reserve_bytes / 1e9:g} GB are to "
+            "stay free (--reserve)"
+        )
+
+
+def _free_bytes(root: Path | None) -> int | None:
+    return None if root is None else shutil.disk_usage(root).free
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error means that there is no space, on the disk or in a quota."""
+    cause = error.__cause__ if error.__cause__ is not None else error
+    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+class TrainerPace:
+    """Keeps committed samples ≤ ratio × those that the trainer has used, or AHEAD_MINIMUM if that is more.
+
+    Over the scenes that the worker works for, together.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        connection: Redis,
+        ratio: float,
+        *,
+        scene_id: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Take where both numbers are found."""
+        self._store = store
+        self._connection = connection
+        self._ratio = ratio
+        self._scene_id = scene_id
+        self._clock = clock
+        self._due = 0.0
+        self._reason: str | None = None
+
+    def reason(self) -> str | None:
+        """Why no job should be taken now; None if there is none. Raises redis.RedisError."""
+        if self._clock() >= self._due:
+            self._reason = self._look()
+            self._due = self._clock() + AHEAD_LOOK_S
+        return self._reason
+
+    def _look(self) -> str | None:
+        scenes = self._store.scenes(self._scene_id)
+        committed = sum(scene.progress().committed_samples for scene in scenes)
+        if committed <= AHEAD_MINIMUM:
+            return None
+        used = queue.consumed_samples(self._connection, [scene.scene_id for scene in scenes])
+        if committed <= self._ratio * used:
+            return None
+        return f"{committed} samples are committed, and the trainer has used {used} (--ahead {self._ratio:g})"

@@ -1,0 +1,262 @@
+"""The worker's child: an RQ worker that keeps its scenes warm, for our jobs alone.
+
+What RQ leaves out is here: a deadline that also ends native code, recycling, and filling the queue when idle. What it
+has too much of is left out: commands over pub/sub, scheduled jobs, maintenance that loads strangers' jobs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import redis
+from redis import Redis
+from rq import SimpleWorker
+from rq.serializers import JSONSerializer
+from rq.worker.base import StopRequested
+
+from photonfarm.renderer import jobs
+from photonfarm.renderer.backpressure import DiskReserve, TrainerPace, is_full
+from photonfarm.renderer.heartbeat import Heart
+from photonfarm.renderer.worker_settings import GRACE_S, RECYCLED, WorkerSettings
+from photonfarm.renderer.worker_talk import Talk
+from photonfarm.shared import queue
+from photonfarm.shared.errors import (
+    BackendError,
+    CorruptError,
+    IncompleteError,
+    PhotonfarmError,
+    QueueError,
+    StoreError,
+)
+from photonfarm.shared.queue import STARTS, RenderArguments, RenderJob
+from photonfarm.shared.store import Store
+
+STARTS_ALLOWED = 5
+"""Starts of one job without an end, after which it counts as failed: it kills its workers."""
+
+STARTS_TTL_S = 6 * 3600
+
+RQ_WORKER_TTL_S = 120
+"""After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
+
+POLL_S = 0.2
+"""Between looks at an empty queue."""
+
+log = logging.getLogger(__name__)
+
+
+def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
+    """The child's main function: settings from stdin, work, and the exit code; its last words go to stdout."""
+    words = os.dup(1)
+    os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
+    settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s")
+    threading.Thread(target=_end_with_supervisor, daemon=True).start()
+    try:
+        store = Store(settings.store)
+        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
+        return RenderWorker(settings, store, queue.connect(settings.redis_url)).run()
+    except PhotonfarmError as error:
+        _leave_word(words, str(error))
+        return error.exit_code
+    except redis.RedisError as error:
+        _leave_word(words, f"lost Redis: {error}")
+        return QueueError.exit_code
+
+
+def _leave_word(words: int, message: str) -> None:
+    """Tell the supervisor, if it is still there."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(words, f"{message}\n".encode())
+
+
+def _end_with_supervisor() -> None:
+    """Stop once the supervisor is gone: after the job in hand, or in the middle of it after GRACE_S."""
+    while os.read(0, 1):  # not through sys.stdin, whose lock would be held at the interpreter's end
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class RenderWorker(SimpleWorker):
+    """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
+
+    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis) -> None:
+        """Register nothing yet."""
+        self._queue = queue.open_queue(connection)
+        super().__init__(
+            [self._queue],
+            name=f"{settings.name}-{os.getpid()}-{time.time_ns():x}",
+            connection=connection,
+            job_class=RenderJob,
+            serializer=JSONSerializer,
+            exception_handlers=[self._on_failure],
+            log_job_description=False,
+            worker_ttl=RQ_WORKER_TTL_S,
+        )
+        self._settings = settings
+        self._store = store
+        self._fatal: PhotonfarmError | None = None
+        self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
+        self._failed = False  # the job in hand
+        self._heart = Heart(settings)
+        self._disk = DiskReserve(store, settings.reserve_bytes)
+        self._pace = (
+            None
+            if settings.ahead is None
+            else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
+        )
+        self._talk = Talk(settings)
+
+    def run(self) -> int:
+        """Work until stopped, complete or due for a successor; the exit code, 0 only if all is complete."""
+        self._heart.start()
+        self.bootstrap(logging_level="WARNING")
+        self._install_signal_handlers()
+        done = 0
+        try:
+            while not self._stop_requested:
+                self.heartbeat()
+                job = self._take()
+                if job is None:
+                    if self._fill_or_finish():
+                        return 0
+                    continue
+                self.execute_job(job, self._queue)
+                done += 1
+                if self._fatal:
+                    raise self._fatal
+                worn = done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+                if worn or self._tainted:
+                    return RECYCLED
+        except StopRequested:
+            pass
+        finally:
+            with contextlib.suppress(redis.RedisError):
+                self._heart.end()
+                self.teardown()
+        return RECYCLED  # for a supervisor that has not been told to stop itself
+
+    def subscribe(self) -> None:
+        """Nothing: whoever may write to Redis could stop workers and jobs by RQ's commands, and nobody needs them."""
+
+    def run_maintenance_tasks(self) -> None:
+        """Nothing: `reconcile` does what is needed, without loading strangers' jobs."""
+
+    def get_heartbeat_ttl(self, job: RenderJob) -> int:  # noqa: ARG002
+        """How long RQ's own records of a running job last, in seconds."""
+        return int(self._settings.deadline_s) + 60
+
+    # ---------------------------------------------------------------------------------------------------- taking a job
+
+    def _take(self) -> RenderJob | None:
+        """The next job; None if for a while there was none, or none should be taken."""
+        held_back = self._disk.reason() or (self._pace.reason() if self._pace else None)
+        self._talk.pausing(held_back)
+        until = time.monotonic() + self._settings.idle_s
+        while True:
+            job, strangers = (None, 0) if held_back else queue.take(self._queue)
+            if strangers:
+                log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
+            if job is not None or time.monotonic() >= until:
+                return job
+            time.sleep(POLL_S)
+
+    def _fill_or_finish(self) -> bool:
+        """Look at the store, as there is no coordinator; True if there is nothing left to wait for."""
+        if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
+            return False
+        self._store.sweep()
+        if not self._settings.until_complete:
+            return False
+        missing = {
+            queue.job_name(scene.scene_id, job)
+            for scene in self._store.scenes(self._settings.scene_id)
+            for job in scene.missing_jobs()
+        }
+        failed = queue.queue_status(self.connection).failed
+        if missing and missing <= failed.keys():
+            first = sorted(missing)[0]
+            raise IncompleteError(
+                f"{len(missing)} jobs have failed; {first}: {failed[first].reason}. `photonfarm status` has the "
+                "causes, and commands that repeat them"
+            )
+        return not missing
+
+    # ------------------------------------------------------------------------------------------------------------- jobs
+
+    def execute_job(self, job: RenderJob, queue: Any) -> None:
+        """Run one job under a heartbeat and a deadline."""
+        self._failed = False
+        with self._heart.working(job.id), self._talk.timing(job.id):
+            starts = int(self.connection.incr(STARTS + job.id))
+            self.connection.expire(STARTS + job.id, STARTS_TTL_S)
+            if starts > STARTS_ALLOWED:
+                job.refuse(f"it was started {starts - 1} times, and each time its worker died or lost Redis")
+            super().execute_job(job, queue)
+            self._settle(job.id)
+
+    def _settle(self, name: str) -> None:
+        """Count nothing against a job that has ended, but its failures."""
+        if self._failed:
+            self.connection.delete(STARTS + name)
+        else:
+            queue.forget_failures_of(self.connection, name)
+
+    def _on_failure(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> bool:  # noqa: ARG002
+        """Decide what a failed job means: for the job, for this worker, or nothing."""
+        if self._is_committed(job.id):
+            log.warning("job %s is committed; what Redis keeps of it was not: %s", job.id, error)
+            return False
+        self._failed = True
+        log.warning("job %s failed: %s", job.id, error)
+        ours = self._settings.scene_id in (None, job.id.rpartition("-")[0])
+        if is_full(error):
+            self._disk.refused()
+        elif ours and isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
+            self._fatal = error  # the next job would fail as well
+        elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
+            self._tainted = not isinstance(error, PhotonfarmError)
+            with contextlib.suppress(redis.RedisError):
+                self._record(job.id, f"{type(error).__name__}: {error}")
+        return False
+
+    def _is_committed(self, name: str) -> bool:
+        with contextlib.suppress(PhotonfarmError, OSError):
+            arguments = RenderArguments.of(name)
+            return self._store.scene(arguments.scene_id).is_committed(arguments.job)
+        return False
+
+    def _record(self, name: str, reason: str) -> None:
+        failure = queue.record_failure(self.connection, name, reason)
+        if failure.set_aside:
+            log.warning(
+                "job %s has failed %d times and is set aside; photonfarm submit --retry queues it again, and this "
+                "repeats it: %s",
+                name,
+                failure.times,
+                queue.repeating_command(self._settings.store, name),
+            )
+
+
+def _resident_bytes() -> int:
+    """Memory of this process now; its peak where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+if __name__ == "__main__":
+    sys.exit(child())

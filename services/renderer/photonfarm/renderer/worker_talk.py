@@ -1,0 +1,53 @@
+"""What a worker says while all is well: a line after its first job and then one a minute, and why it pauses."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+
+from photonfarm.renderer.worker_settings import WorkerSettings
+
+log = logging.getLogger(__name__)
+
+
+class Talk:
+    """Counts jobs, and says how it goes; nothing if the settings say quiet, but for what holds the worker up."""
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        """Count from now on."""
+        log.setLevel(logging.WARNING if settings.quiet else logging.INFO)
+        self._name = settings.name
+        self._every_s = settings.report_s
+        self._jobs = 0
+        self._seconds = 0.0
+        self._said = -settings.report_s
+        self._pausing = False
+
+    @contextlib.contextmanager
+    def timing(self, name: str) -> Iterator[None]:
+        """A job, as long as the block runs."""
+        began = time.monotonic()
+        yield
+        now = time.monotonic()
+        self._jobs += 1
+        self._seconds += now - began
+        if now - self._said >= self._every_s:
+            self._said = now
+            log.info(
+                "worker %s: %d jobs in %.0f s, %.2f s each; the last was %s",
+                self._name,
+                self._jobs,
+                self._seconds,
+                self._seconds / self._jobs,
+                name,
+            )
+
+    def pausing(self, reason: str | None) -> None:
+        """Say once that no jobs are taken, and once that they are again."""
+        if reason and not self._pausing:
+            log.warning("worker %s: takes no jobs: %s", self._name, reason)
+        elif self._pausing and not reason:
+            log.warning("worker %s: takes jobs again", self._name)
+        self._pausing = bool(reason)

@@ -1,0 +1,72 @@
+"""Connections to Redis, whose passwords appear in no message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from urllib.parse import quote, urlsplit
+
+import redis
+from redis import Redis
+from redis.backoff import ExponentialBackoff
+from redis.retry import Retry
+
+from photonfarm.shared.errors import QueueError
+
+SOCKET_TIMEOUT_S = 30
+USER = "photonfarm"
+"""Who a URL without a name logs in as, when its password comes from a file."""
+
+
+def connect(url: str) -> Redis:
+    """A connection that has answered once; raises QueueError with a sentence if there is no Redis or it refuses us."""
+    shown = without_password(url)
+    try:
+        connection = Redis.from_url(
+            _checked(url), socket_timeout=SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=_retry()
+        )
+    except (ValueError, TypeError):  # their text may hold a piece of the password
+        raise QueueError(
+            f"no Redis at {shown}: a URL is redis://[user:password@]host:port/0, rediss://… or unix:///path, "
+            "and in a name or password every one of / ? # @ : % is written as %2F %3F %23 %40 %3A %25"
+        ) from None
+    try:
+        connection.ping()
+    except (redis.RedisError, OSError) as error:
+        raise QueueError(f"no Redis at {shown}: {error}") from error
+    return connection
+
+
+def _checked(url: str) -> str:
+    if url.count("@") > 1 or ("@" in url and "@" not in urlsplit(url).netloc):
+        raise ValueError
+    return url
+
+
+def _retry() -> Retry:
+    """Three tries within a second, against hiccups; longer outages are the supervisor's to wait out."""
+    return Retry(ExponentialBackoff(cap=0.5, base=0.1), 3)
+
+
+def without_password(url: str) -> str:
+    """A URL for messages: without name, password and options, also where it is not a proper URL."""
+    scheme, separator, rest = url.partition("://") if "://" in url else ("", "", url)
+    before_options = rest.partition("?")[0]
+    if "@" in rest and "@" not in before_options:  # in a password with a ?, or in an option
+        return f"{scheme}{separator}…"
+    return f"{scheme}{separator}{before_options.rpartition('@')[2]}"
+
+
+def with_password_of(file: Path | None, url: str) -> str:
+    """A URL of a TCP port with the password in a file, unless it has one already; raises QueueError.
+
+    A file is where Docker puts secrets; unlike variables it shows in no `docker inspect` and is inherited by nobody.
+    """
+    parts = urlsplit(url)
+    if file is None or parts.scheme not in ("redis", "rediss") or ":" in parts.netloc.rpartition("@")[0]:
+        return url
+    try:
+        password = file.read_text().strip()
+    except OSError as error:
+        raise QueueError(f"{file}: the Redis password cannot be read: {error.strerror}") from error
+    user, _, host = parts.netloc.rpartition("@")
+    return parts._replace(netloc=f"{user or USER}:{quote(password, safe='')}@{host}").geturl()

@@ -1,0 +1,26 @@
+"""What the trainer tells the workers: how many samples of a scene it has used, so that they need not run far ahead.
+
+A number that is told again and again: a Redis that loses it has it back within seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from redis import Redis
+from rq.utils import as_text
+
+CONSUMED = "rq:photonfarm:consumed:"
+CONSUMED_TTL_S = 7 * 86400
+"""A trainer that is down for a while, or has ended, is still waited for: that is what the ratio asks for."""
+
+
+def tell_consumed(connection: Redis, scene_id: str, samples: int) -> None:
+    """Say how many samples of a scene have been used, each counted once."""
+    connection.set(CONSUMED + scene_id, samples, ex=CONSUMED_TTL_S)
+
+
+def consumed_samples(connection: Redis, scene_ids: Iterable[str]) -> int:
+    """How many samples of these scenes trainers have used, by what they said last; 0 where none has said anything."""
+    told = [as_text(connection.getrange(CONSUMED + scene_id, 0, 20)) for scene_id in scene_ids]
+    return sum(int(samples) for samples in told if samples.isdecimal())

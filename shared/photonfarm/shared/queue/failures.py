@@ -1,0 +1,128 @@
+"""Jobs that failed: why, how often, which are set aside, and what they have in common.
+
+A failed job is left alone for an hour and tried again; one that has failed three times is set aside, until
+`photonfarm submit --retry`. A Redis that loses its memory forgets this as well: the job fails three times again then.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from redis import Redis
+from rq.utils import as_text
+
+from photonfarm.shared.errors import QueueError
+from photonfarm.shared.queue.heartbeat import names_below
+from photonfarm.shared.queue.job import FAILURE_TTL_S, STARTS, RenderArguments
+
+FAILED = "rq:photonfarm:failed:"
+FAILURES = "rq:photonfarm:failures:"
+
+FAILURES_ALLOWED = 3
+"""Failures of one job after which it is set aside: by then it is no accident of one worker or one hour."""
+
+FAILURES_TTL_S = 7 * 86400
+REASON_LETTERS = 2000
+
+_VARYING = re.compile(r"\b[0-9a-f]{8,}\b|[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
+"""What differs between failures of one cause: ids and numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why a job is not queued now."""
+
+    reason: str  # the error's class and message
+    times: int  # how often it has failed
+    set_aside: bool  # else it is tried again within the hour
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Failures whose error and message are the same but for ids and numbers."""
+
+    cause: str  # the message with … for what differs
+    set_aside: int
+    jobs: dict[str, Failure]  # by name, those set aside first
+
+    @property
+    def example(self) -> str:
+        """The name of one of the jobs."""
+        return next(iter(self.jobs))
+
+
+def record_failure(connection: Redis, name: str, reason: str) -> Failure:
+    """Leave a job alone, and say why: for a while, or for good once it has failed too often."""
+    times = int(connection.incr(FAILURES + name))
+    connection.expire(FAILURES + name, FAILURES_TTL_S)
+    set_aside = times >= FAILURES_ALLOWED
+    said = _printable(reason)
+    connection.set(FAILED + name, said, ex=None if set_aside else FAILURE_TTL_S)
+    return Failure(said, times, set_aside)
+
+
+def forget_failures(connection: Redis, *, set_aside: bool) -> None:
+    """Have failed jobs queued again; those that are set aside only if asked to, which then begin anew."""
+    for name in failed_names(connection):
+        if set_aside:
+            connection.delete(FAILED + name, FAILURES + name, STARTS + name)
+        elif connection.ttl(FAILED + name) >= 0:
+            connection.delete(FAILED + name, STARTS + name)
+
+
+def forget_failures_of(connection: Redis, name: str) -> None:
+    """Forget what was counted against a job, which has ended well."""
+    connection.delete(STARTS + name, FAILURES + name, FAILED + name)
+
+
+def failed_names(connection: Redis) -> set[str]:
+    """The jobs that are not to be queued, since they failed lately or too often."""
+    return {name for name in names_below(connection, FAILED) if _is_a_jobs(name)}
+
+
+def read_failures(connection: Redis) -> dict[str, Failure]:
+    """The failed jobs by name."""
+    found = {}
+    for name in sorted(failed_names(connection)):
+        with connection.pipeline(transaction=False) as pipeline:
+            pipeline.getrange(FAILED + name, 0, 4 * REASON_LETTERS)
+            pipeline.getrange(FAILURES + name, 0, 20)
+            pipeline.ttl(FAILED + name)
+            reason, times, ttl = pipeline.execute()
+        if ttl != -2:  # it has not just run out
+            counted = as_text(times)
+            said = _printable(reason.decode(errors="replace"))
+            found[name] = Failure(said, int(counted) if counted.isdecimal() else 1, set_aside=ttl == -1)
+    return found
+
+
+def causes(failures: Mapping[str, Failure]) -> list[Cause]:
+    """Failures by their cause, the most frequent first."""
+    grouped: dict[str, dict[str, Failure]] = {}
+    for name, failure in sorted(failures.items(), key=lambda item: (not item[1].set_aside, item[0])):
+        grouped.setdefault(_VARYING.sub("…", failure.reason), {})[name] = failure
+    found = [Cause(cause, sum(f.set_aside for f in jobs.values()), jobs) for cause, jobs in grouped.items()]
+    return sorted(found, key=lambda cause: -len(cause.jobs))
+
+
+def repeating_command(store: str | Path, name: str) -> str:
+    """What renders a job again in the foreground, and prints its error whole."""
+    job = RenderArguments.of(name)
+    return shlex.join(["photonfarm", "work", "--store", str(store), "--scene", job.scene_id, "--job", str(job.job)])
+
+
+def _is_a_jobs(name: str) -> bool:
+    try:
+        RenderArguments.of(name)
+    except QueueError:
+        return False
+    return True
+
+
+def _printable(text: str) -> str:
+    """A line for terminals, which obey what is in it that does not print."""
+    return "".join(letter if letter.isprintable() else " " for letter in text[:REASON_LETTERS])

@@ -1,0 +1,165 @@
+"""What `photonfarm store …` prints: sentences and tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shlex
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.store.check import Progress as Tell
+from photonfarm.shared.store.check import SceneReport, StoreReport, said
+from photonfarm.shared.store.find import FoundSample, Matches
+from photonfarm.shared.store.findings import Finding, Group, Remedy
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Tell]:
+    """Something to tell how far a check is: a bar on a terminal, a line per scene elsewhere; both to stderr."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _line
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[read]}"), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def tell(scene: str, done: int, total: int, size_bytes: int) -> None:
+            if scene not in tasks:
+                tasks[scene] = bars.add_task(scene, total=total, read="")
+            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs, {size_bytes / 1e6:,.0f} MB")
+
+        yield tell
+
+
+def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
+    if done == total:
+        click.echo(f"{scene}: {total} jobs read, {size_bytes / 1e6:,.1f} MB", err=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------- check
+
+
+def check(report: StoreReport, as_json: bool) -> None:
+    """What was read and found, by scene and cause, and what to do."""
+    if as_json:
+        click.echo(json.dumps(_document(report), indent=2))
+        return
+    for scene in report.scenes:
+        _scene(scene)
+    if report.parts:
+        click.echo(f"tmp: {report.parts} unfinished files; workers sweep those of the dead")
+    if report.quarantine:
+        click.echo(f"set aside to {report.quarantine}, with a record of why; workers render what is missing now")
+    wrong = sum(_wrong(scene) for scene in report.scenes)
+    if not wrong:
+        click.echo("nothing is wrong")
+    elif not report.repaired:
+        click.echo(f"{wrong} findings; --repair sets aside what can be written again")
+    elif report.exit_code == StoreError.exit_code:
+        click.echo("something is still wrong, which cannot be repaired here")
+
+
+def _wrong(scene: SceneReport) -> int:
+    return sum(group.count for group in scene.groups if group.cause.remedy is not Remedy.LOOK)
+
+
+def _scene(scene: SceneReport) -> None:
+    read = f"{scene.jobs} jobs, {scene.samples} samples, {scene.size_bytes / 1e6:,.1f} MB"
+    click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
+    if scene.halves is not None:
+        click.echo(f"  A against B: {said(scene.halves)}")
+    if scene.back_facing_share is not None:
+        click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
+    for group in scene.groups:
+        click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")
+        for finding in group.first:
+            click.echo(f"      {_named(finding)}")
+        if group.count > len(group.first):
+            click.echo(f"      and {group.count - len(group.first)} more")
+    if scene.set_aside:
+        click.echo(f"  set aside: {', '.join(scene.set_aside)}")
+
+
+def _named(finding: Finding) -> str:
+    job, row = (f"{what} {n}" if n is not None else "" for what, n in (("job", finding.job), ("row", finding.row)))
+    return ", ".join(part for part in (job, row, finding.file or "") if part) + f": {finding.detail}"
+
+
+def _document(report: StoreReport) -> dict[str, Any]:
+    return {
+        "exit_code": report.exit_code,
+        "quarantine": report.quarantine,
+        "parts": report.parts,
+        "scenes": [
+            {**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes
+        ],
+    }  # fmt: skip
+
+
+def _group(group: Group) -> dict[str, Any]:
+    first = [
+        {"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
+    ]  # fmt: skip
+    cause = group.cause
+    return {"cause": cause.label, "means": cause.sentence, "remedy": cause.remedy.value, "count": group.count,
+            "first": first}  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------------- find
+
+
+def found(matches: Matches, store: str | Path, as_json: bool) -> None:
+    """Samples: what they are, where they lie, and how to look at one and render it."""
+    if as_json:
+        samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
+        click.echo(json.dumps({"count": matches.count, "nearest": matches.nearest, "samples": samples}, indent=2))
+        return
+    for sample in matches.samples:
+        _sample(sample, store)
+    if matches.count > len(matches.samples):
+        click.echo(f"{matches.count - len(matches.samples)} more; --limit shows more of them", err=True)
+    if not matches.count:
+        near = "" if matches.nearest is None else f"; the nearest is {matches.nearest:g} scene units away"
+        click.echo(f"no sample fits{near}", err=True)
+
+
+def _sample(sample: FoundSample, store: str | Path) -> None:
+    state = "complete" if sample.complete else "not complete"
+    click.echo(f"{sample.scene_name} {sample.scene_id}, row {sample.row}, pass {sample.pass_}: {state}")
+    click.echo(f"  key           {sample.key}")
+    vector = ", ".join(f"{value:.9g}" for group in sample.modification for value in group) or "static"
+    click.echo(f"  modification  {sample.modification_key}  row {sample.modification_row}: {vector}")
+    view = ", ".join(f"{value:.9g}" for value in sample.view)
+    click.echo(f"  view          {sample.view_key}  row {sample.view_row}: {view}")
+    for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
+        click.echo(f"  job           {job}: {'committed' if committed else 'missing'}")
+    for place in sample.places:
+        held = "" if place.there else "  (not there)"
+        click.echo(f"  {place.array:<16} {place.file}  inner chunk {place.chunk}, index {place.index}{held}")
+    for what, command in commands(sample, store).items():
+        click.echo(f"  {what:<13} {command}")
+
+
+def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
+    """The command lines to look at a sample, and to render what is missing of it."""
+    listed = {}
+    if sample.complete:
+        program = (
+            "from photonfarm.shared.store import SceneReader; "
+            f"r = SceneReader({str(store)!r}, {sample.scene_id!r}); r.refresh(); print(r.read({sample.row}))"
+        )
+        listed["look at it"] = shlex.join(["python", "-c", program])
+    for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
+        if not committed:
+            words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
+            listed[f"render job {job}"] = shlex.join(words)
+    return listed

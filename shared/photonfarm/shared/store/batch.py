@@ -1,0 +1,56 @@
+"""Memory for a batch of samples, as they are stored: read into again and again, without a copy or conversion.
+
+Shape letters: B batch, H W image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.records import F32
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import schema
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Samples in the types that they are stored in; what `SceneReader.read_batch` fills."""
+
+    radiance_exponent: int
+    radiance: NDArray[
+        np.float16
+    ]  # (B, 2, H, W, 3) linear × 2^radiance_exponent, halves A and B; NaN: see `wide`
+    buffers: dict[str, NDArray[Any]]  # depth (B, H, W) float32; albedo, normal (B, H, W, 3) float16; or none of them
+    rows: NDArray[np.int64]  # (B,) row of each sample, of its view and of its modification
+    view_rows: NDArray[np.int64]
+    modification_rows: NDArray[np.int64]
+    wide: dict[int, F32] = field(default_factory=dict)  # by place: (2, H, W, 3) unscaled, where float16 cannot hold it
+
+    @classmethod
+    def empty(cls, spec: SceneSpec, size: int, *, buffers: bool = True) -> Batch:
+        """Memory for `size` samples of a scene; without that for buffers, they are not read."""
+        arrays = schema.output_arrays(spec)
+        names = [name for name, array in arrays.items() if array.kind == "view" and buffers]
+        memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
+        rows = np.zeros((3, size), np.int64)
+        return cls(spec.radiance_exponent, memory.pop("radiance"), memory, *rows)
+
+    def __len__(self) -> int:
+        """How many samples it holds, or has memory for."""
+        return len(self.rows)
+
+    def first(self, count: int) -> Batch:
+        """The first samples of the same memory."""
+        rows = {name: getattr(self, name)[:count] for name in ("rows", "view_rows", "modification_rows")}
+        buffers = {name: values[:count] for name, values in self.buffers.items()}
+        return replace(self, radiance=self.radiance[:count], buffers=buffers, **rows)
+
+    def linear(self, place: int) -> F32:
+        """The radiance of one sample as it was rendered, (2, H, W, 3) linear, unscaled."""
+        if place in self.wide:
+            return self.wide[place]
+        return self.radiance[place].astype(np.float32) * np.float32(2.0**-self.radiance_exponent)

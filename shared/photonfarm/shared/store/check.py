@@ -1,0 +1,186 @@
+"""`photonfarm store check`: reads everything that a store holds, says what is wrong with it, and sets that aside.
+
+Nothing is deleted and no value is changed. One scene after the other, and one row after the other: memory is what the
+plans take, 32 bytes a sample, and one row of each array for each thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
+from photonfarm.shared.store import markers
+from photonfarm.shared.store.content_check import Tally
+from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, Remedy
+from photonfarm.shared.store.halves import SIGNIFICANCE, HalvesResult, HalvesTest
+from photonfarm.shared.store.job_check import Checked, marker_files
+from photonfarm.shared.store.job_pool import JobPool
+from photonfarm.shared.store.local import TMP
+from photonfarm.shared.store.plan_check import PlanCheck
+from photonfarm.shared.store.quarantine import Quarantine
+from photonfarm.shared.store.repeated_seeds import equal_samples
+from photonfarm.shared.store.scene_store import SCENES, read_spec
+from photonfarm.shared.store.storage import Storage, store_errors
+from photonfarm.shared.store.store import Store
+from photonfarm.shared.store.strangers import strangers
+
+Progress = Callable[[str, int, int, int], None]
+"""Is told the scene's name, jobs checked, jobs to check, and bytes read."""
+
+
+AT_ONCE = 32
+"""Jobs handed to the threads at a time, in whose order findings are told."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneReport:
+    """What was read and found of one scene."""
+
+    scene_id: str
+    name: str | None  # None if its spec cannot be read
+    jobs: int  # committed ones that were checked
+    samples: int
+    size_bytes: int
+    back_facing_share: float | None  # of the pixels that meet something; None if none does
+    halves: HalvesResult | None
+    groups: tuple[Group, ...]
+    set_aside: tuple[str, ...]  # "job 12", "base", "spec"
+
+
+@dataclass(frozen=True, slots=True)
+class StoreReport:
+    """What was read and found of a store."""
+
+    scenes: tuple[SceneReport, ...]
+    parts: int  # unfinished files
+    repaired: bool  # whether what can be repaired was set aside
+    quarantine: str | None  # the folder that it was moved to
+
+    @property
+    def exit_code(self) -> int:
+        """0: nothing is wrong; 7: what was wrong is set aside, to be written again; 4: something is still wrong."""
+        remedies = {group.cause.remedy for scene in self.scenes for group in scene.groups} - {Remedy.LOOK}
+        if not remedies:
+            return 0
+        return StoreError.exit_code if Remedy.REPORT in remedies or not self.repaired else IncompleteError.exit_code
+
+
+def check_store(
+    store: Store, scene_id: str | None = None, *, when: str, repair: bool = False, tell: Progress | None = None
+) -> StoreReport:
+    """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
+
+    Safe while workers, readers and other checks are at work. Raises StoreError if the scene is not there, or the store
+    cannot be read.
+    """
+    storage = store.storage
+    with store_errors("check the store", storage.where):
+        ids = sorted(storage.names(SCENES)) if scene_id is None else [scene_id]
+        if scene_id is not None and not storage.names(f"{SCENES}/{scene_id}"):
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}")
+        quarantine = Quarantine(storage, when)
+        reports = []
+        for each in ids:
+            checking = _SceneChecking(storage, each, len(ids), tell or (lambda *_: None))
+            reports.append(checking.run(quarantine if repair else None))
+        return StoreReport(tuple(reports), len(storage.names(TMP)), repair, quarantine.folder)
+
+
+def said(halves: HalvesResult) -> str:
+    """The outcome of the test between A and B in words."""
+    return (
+        f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
+        f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
+        f"± {halves.standard_error:.2%} over {halves.samples} samples"
+    )
+
+
+class _SceneChecking:
+    """One scene on its way through the check."""
+
+    def __init__(self, storage: Storage, scene_id: str, scenes: int, tell: Progress) -> None:
+        self._storage = storage
+        self._scene_id = scene_id
+        self._name = f"{SCENES}/{scene_id}"
+        self._tell = tell
+        self._findings = Findings()
+        self._markers: dict[int, bytes] = {}  # of jobs with findings
+        self._scenes = scenes
+        self._tally = Tally(HalvesTest(scenes))
+
+    def run(self, quarantine: Quarantine | None) -> SceneReport:
+        """Check everything; set aside what is damaged, unless `quarantine` is None."""
+        try:
+            spec = read_spec(self._storage, self._scene_id)
+        except StoreError as error:
+            detail = str(error).partition(": ")[2]
+            self._add([Finding(Cause.SPEC, detail, self._scene_id, file=f"{self._name}/spec.json")])
+            aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
+            return self._report(None, aside)
+        committed = sorted(markers.jobs(self._storage, self._name))
+        plans = PlanCheck(self._storage, spec, self._name)
+        self._add(plans.check_plans())
+        self._add(plans.check_base(needed=bool(committed)))
+        scene = None
+        if plans.shard_rows is not None:
+            scene = Checked(self._storage, self._scene_id, self._name, spec, plans.plans, plans.shard_rows)
+            self._jobs(scene, committed)
+            self._add(strangers(scene))
+        return self._report(spec.name, self._repair(scene, quarantine) if quarantine else [])
+
+    def _jobs(self, scene: Checked, committed: list[int]) -> None:
+        with JobPool(scene, self._scenes) as pool:
+            for done in range(0, len(committed), AT_ONCE):
+                jobs = committed[done : done + AT_ONCE]
+                self._tell(scene.spec.name, done, len(committed), pool.size_bytes)
+                for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
+                    if found:
+                        self._markers[job] = marker
+                        self._add(found)
+            for tally in pool.tallies:
+                self._tally.add(tally)
+        self._tell(scene.spec.name, len(committed), len(committed), self._tally.size_bytes)
+        self._add(equal_samples(scene, self._tally))
+        if (halves := self._tally.halves.result()) is not None and not halves.passed:
+            self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+
+    def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
+        self._findings.add(found)
+
+    def _report(self, name: str | None, set_aside: list[str]) -> SceneReport:
+        tally = self._tally
+        share = tally.back_facing_pixels / tally.hit_pixels if tally.hit_pixels else None
+        return SceneReport(
+            self._scene_id, name, tally.jobs, tally.samples, tally.size_bytes, share, tally.halves.result(),
+            self._findings.groups(), tuple(set_aside),
+        )  # fmt: skip
+
+    # ----------------------------------------------------------------------------------------------------------- repair
+
+    def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
+        aside = []
+        for job, why in sorted(self._findings.jobs.items()):
+            if scene is not None and self._set_aside(scene, quarantine, job, why):
+                aside.append(f"job {job}")
+        if why := self._findings.of(Cause.BASE):
+            quarantine.base(self._name, why)
+            aside.append("base")
+            committed = markers.jobs(self._storage, self._name)
+            jobs = scene.plans[-1].end_job if scene is not None and scene.plans else 0
+            if scene is not None and committed.issuperset(range(jobs)) and jobs:
+                # nothing is missing, and only a job that is rendered writes the base
+                reason = Finding(Cause.BASE, "this job is whole: it is rendered again for the base", self._scene_id)
+                self._set_aside(scene, quarantine, jobs - 1, [reason])
+                aside.append(f"job {jobs - 1}")
+        return aside
+
+    def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
+        marker = self._markers.get(job)
+        if marker is None:  # found when all samples were looked at
+            marker = self._storage.read(markers.name_of(self._name, job))
+        try:
+            files = {*scene.files_of(job).values(), *marker_files(marker, self._name, job)}
+        except CorruptError:
+            files = set(scene.files_of(job).values())
+        return quarantine.job(self._name, job, marker, sorted(files), why)

@@ -1,0 +1,124 @@
+"""What `photonfarm store check` can find, and what it has found: grouped by cause, the first of each kept by name."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+from itertools import chain
+
+NAMED = 5
+"""Findings of one cause that a report names; the rest is counted."""
+
+REASONS = 20
+"""Findings of one job that its quarantine record tells."""
+
+
+class Remedy(Enum):
+    """What helps against a cause."""
+
+    RENDER = "render again"  # the job is set aside, and workers find it missing
+    BASE = "write the base again"  # it is set aside, and the next job writes it
+    SUBMIT = "submit the spec again"  # it is set aside, and written by the next submission
+    REPORT = "cannot be repaired here"
+    LOOK = "may be right: worth a look"  # no error, and no exit code
+
+
+class Cause(Enum):
+    """Why something is found: its name in JSON, the sentence for it, and what helps."""
+
+    MARKER = "marker", "a marker that cannot be read, or does not tell its job's files", Remedy.RENDER
+    NO_PLAN = "no-plan", "a marker of a job that no plan has", Remedy.RENDER
+    MISSING_FILE = "missing-file", "committed, but a file is missing", Remedy.RENDER
+    SIZE = "size", "a file has another size than its marker tells", Remedy.RENDER
+    CHECKSUM = "checksum", "stored bytes are not what was committed", Remedy.RENDER
+    MISSING_ROW = "missing-row", "committed, but a row is missing", Remedy.RENDER
+    UNUSED_ROW = "unused-row", "a row that the plan does not use holds data", Remedy.RENDER
+    NOT_FINITE = "not-finite", "a stored value is NaN or infinite", Remedy.RENDER
+    EQUAL_HALVES = "equal-halves", "halves A and B of a sample are equal: one seed, used twice", Remedy.RENDER
+    EQUAL_SAMPLES = "equal-samples", "halves of different samples are equal: one seed, used twice", Remedy.RENDER
+    HALVES_DIFFER = "halves-differ", "A and B are not distributed alike: one of them is biased", Remedy.REPORT
+    SPEC = "spec", "the scene's spec is missing or not what was stored", Remedy.SUBMIT
+    PLAN = (
+        "plan",
+        "a plan is not what was stored: what its rows are is lost; what is rendered stays, checked by its markers",
+        Remedy.REPORT,
+    )
+    BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
+    BLACK = "black", "both halves are black: no light, or the camera is inside something", Remedy.LOOK
+    EMPTY_VIEW = "empty-view", "nothing is met in the whole view", Remedy.LOOK
+    BACK_FACING = "back-facing", "every first hit of the view is seen from behind", Remedy.LOOK
+    NO_MARKER = "no-marker", "files without a marker: a worker is at it, or has died", Remedy.LOOK
+    FOREIGN_FILE = "foreign-file", "a file that no store writes", Remedy.LOOK
+    PARTS = "parts", "unfinished files in tmp; workers sweep those of the dead", Remedy.LOOK
+
+    def __init__(self, label: str, sentence: str, remedy: Remedy) -> None:
+        self.label = label
+        self.sentence = sentence
+        self.remedy = remedy
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found."""
+
+    cause: Cause
+    detail: str
+    scene_id: str | None = None
+    job: int | None = None
+    row: int | None = None  # of the scene
+    file: str | None = None  # its name in the store
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """All findings of one cause."""
+
+    cause: Cause
+    count: int
+    first: tuple[Finding, ...]
+
+
+class Findings:
+    """Takes findings in, in memory that does not grow with their number but with that of the jobs they concern."""
+
+    def __init__(self) -> None:
+        self._count: Counter[Cause] = Counter()
+        self._first: dict[Cause, list[Finding]] = {}
+        self.jobs: dict[int, list[Finding]] = {}  # jobs to render again, each with its first reasons
+
+    def add(self, found: Iterable[Finding]) -> None:
+        """Take more findings in."""
+        for finding in found:
+            self._count[finding.cause] += 1
+            _keep(self._first.setdefault(finding.cause, []), finding, NAMED)
+            if finding.job is not None and finding.cause.remedy is Remedy.RENDER:
+                _keep(self.jobs.setdefault(finding.job, []), finding, REASONS)
+
+    def of(self, cause: Cause) -> list[Finding]:
+        """The first findings of a cause."""
+        return self._first.get(cause, [])
+
+    def groups(self) -> tuple[Group, ...]:
+        """Everything found, by cause."""
+        return tuple(Group(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause])
+
+
+def joined(groups: Iterable[tuple[Group, ...]]) -> tuple[Group, ...]:
+    """The groups of several scenes as those of one store."""
+    every = list(chain.from_iterable(groups))
+    return tuple(
+        Group(
+            cause,
+            sum(group.count for group in every if group.cause is cause),
+            tuple(chain.from_iterable(group.first for group in every if group.cause is cause))[:NAMED],
+        )
+        for cause in Cause
+        if any(group.cause is cause for group in every)
+    )
+
+
+def _keep(kept: list[Finding], finding: Finding, most: int) -> None:
+    if len(kept) < most:
+        kept.append(finding)

@@ -1,0 +1,205 @@
+"""Reads everything that one committed job has stored: its marker, its files, each of their rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import markers, plans, schema
+from photonfarm.shared.store.content_check import ContentCheck, Tally, is_finite
+from photonfarm.shared.store.findings import Cause, Finding
+from photonfarm.shared.store.plans import JobRows, StoredPlan
+from photonfarm.shared.store.shards import Shard
+from photonfarm.shared.store.storage import Storage
+
+KINDS: tuple[schema.Kind, ...] = ("sample", "view", "modification")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """A scene that is being checked, and what is known of it."""
+
+    storage: Storage
+    scene_id: str
+    name: str  # of its folder
+    spec: SceneSpec
+    plans: list[StoredPlan] | None  # None if one is damaged: then only what markers tell can be checked
+    shard_rows: int
+
+    def files_of(self, job: int) -> dict[str, str]:
+        """The names that a job's files may have, by array; none for a job of no plan that is known."""
+        for plan in self.plans or []:
+            if plan.first_job <= job < plan.end_job:
+                arrays = schema.output_arrays(self.spec).items()
+                return {name: plan.shard(name, array, job) for name, array in arrays}
+        return {}
+
+
+def marker_files(marker: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
+    """The files that a marker names, with their sizes and checksums; raises CorruptError if it is not this job's."""
+    files = markers.parse(marker, job, markers.name_of(scene, job))["files"]
+    return {f"{scene}/{name}": about for name, about in files.items()}
+
+
+class JobCheck:
+    """Checks jobs of a scene one after the other, with the same memory for each."""
+
+    def __init__(self, scene: Checked, tally: Tally) -> None:
+        self._scene = scene
+        self._tally = tally
+        self._arrays = schema.output_arrays(scene.spec)
+        self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
+        self._contents = ContentCheck(scene.spec, tally)
+
+    def run(self, job: int) -> tuple[list[Finding], bytes]:
+        """What is found of a job, and its marker; nothing if that is taken back in the meantime."""
+        storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
+        try:
+            content = storage.read(name)
+            found = list(self._of(job, content))
+            if not found or storage.read(name) == content:
+                return found, content
+        except FileNotFoundError:
+            pass
+        return [], b""
+
+    def _of(self, job: int, marker: bytes) -> Iterator[Finding]:
+        scene, name = self._scene, markers.name_of(self._scene.name, job)
+        own = scene.files_of(job)
+        if scene.plans is not None and not own:
+            yield self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
+            return
+        try:
+            files = marker_files(marker, scene.name, job)
+        except CorruptError as error:
+            yield self._finding(Cause.MARKER, job, _said(error), name)
+            return
+        self._tally.jobs += 1
+        shards: dict[str, Shard] = {}
+        for file, about in files.items():
+            yield from self._open(job, file, about, shards)
+        rows = None if scene.plans is None else plans.job_rows(scene.plans, job)
+        if rows is not None:
+            yield from self._against_plan(rows, files, own, shards)
+        for kind in KINDS:
+            yield from self._rows(job, kind, files, shards, rows)
+
+    # ------------------------------------------------------------------------------------------------------------ files
+
+    def _open(self, job: int, file: str, about: dict[str, Any], shards: dict[str, Shard]) -> Iterator[Finding]:
+        """Open a file that the marker names, by its array, and compare it with what the marker tells."""
+        array = self._arrays.get(_array_of(file))
+        if array is None:
+            yield self._finding(Cause.MARKER, job, "the marker names it, and the scene has no such array", file)
+            return
+        try:
+            size = self._scene.storage.size(file)
+        except FileNotFoundError:
+            yield self._finding(Cause.MISSING_FILE, job, "the marker names it", file)
+            return
+        self._tally.size_bytes += size
+        if size != about["size"]:
+            yield self._finding(Cause.SIZE, job, f"has {size} bytes; {about['size']} were committed", file)
+            return
+        try:
+            shard = Shard(self._scene.storage.local(file), array, self._scene.shard_rows)
+            crc32c = shard.summary()["crc32c"]
+        except CorruptError as error:
+            yield self._finding(Cause.CHECKSUM, job, _said(error), file)
+            return
+        shards[array.name] = shard
+        if crc32c != about["crc32c"]:
+            detail = f"its checksums have the CRC-32C {crc32c}; {about['crc32c']} was committed"
+            yield self._finding(Cause.CHECKSUM, job, detail, file)
+
+    def _against_plan(
+        self, rows: JobRows, files: dict[str, dict[str, Any]], own: dict[str, str], shards: dict[str, Shard]
+    ) -> Iterator[Finding]:
+        """What the plan wants and the files do not have, and the other way round."""
+        for file in sorted(files.keys() - own.values()):
+            yield self._finding(Cause.MARKER, rows.job, "the marker names it, and it is another job's", file)
+        for file in sorted(own.values() - files.keys()):
+            if self._scene.storage.exists(file):
+                yield self._finding(
+                    Cause.FOREIGN_FILE, rows.job, "is there, and the job's marker does not name it", file
+                )
+        samples = {sample.row for sample in rows.samples}
+        wanted = {"sample": samples, "view": rows.new_views, "modification": rows.new_modifications}
+        held = {name: self._held(rows.job, shard) for name, shard in shards.items()}
+        unread = {name for name, file in own.items() if file in files and name not in shards}  # found already
+        for name, array in self._arrays.items():
+            for row in sorted(held.get(name, set()) - wanted[array.kind]):
+                yield self._finding(Cause.UNUSED_ROW, rows.job, "the plan has no such row", own[name], row)
+            if array.kind != "sample" and name not in unread:
+                for row in sorted(wanted[array.kind] - held.get(name, set())):
+                    yield self._finding(Cause.MISSING_ROW, rows.job, "the plan has it", own[name], row)
+        narrow, wide = held.get("radiance", set()), held.get("radiance_wide", set())
+        for row in sorted(narrow & wide & samples):
+            yield self._finding(Cause.UNUSED_ROW, rows.job, "radiance has it already", own["radiance_wide"], row)
+        if not unread & {"radiance", "radiance_wide"}:
+            for row in sorted(samples - narrow - wide):
+                yield self._finding(Cause.MISSING_ROW, rows.job, "radiance_wide lacks it too", own["radiance"], row)
+
+    def _held(self, job: int, shard: Shard) -> set[int]:
+        first = job * self._scene.shard_rows
+        return {first + i for i in range(self._scene.shard_rows) if i in shard}
+
+    # ------------------------------------------------------------------------------------------------------------- rows
+
+    def _rows(
+        self,
+        job: int,
+        kind: schema.Kind,
+        files: dict[str, dict[str, Any]],
+        shards: dict[str, Shard],
+        rows: JobRows | None,
+    ) -> Iterator[Finding]:
+        """Read every row of a kind, and look at those that are whole."""
+        names = {_array_of(file): file for file in files}
+        for i in range(self._scene.shard_rows):
+            row, values = job * self._scene.shard_rows + i, {}
+            for name in (name for name, shard in shards.items() if self._arrays[name].kind == kind and i in shard):
+                if fault := self._read(shards[name], name, i):
+                    yield self._finding(fault[0], job, fault[1], names[name], row)
+                else:
+                    values[name] = self._memory[name]
+            for cause, detail in self._content(row, values, rows):
+                yield self._finding(cause, job, detail, row=row)
+
+    def _read(self, shard: Shard, name: str, i: int) -> tuple[Cause, str] | None:
+        """Read a row into the array's memory; what is wrong with it, if anything."""
+        values = self._memory[name]
+        try:
+            shard.read_into(i, values)
+        except CorruptError as error:
+            return Cause.CHECKSUM, _said(error)
+        if values.dtype.kind == "f" and not is_finite(values):
+            return Cause.NOT_FINITE, name
+        return None
+
+    def _content(self, row: int, values: dict[str, NDArray[Any]], rows: JobRows | None) -> Iterator[tuple[Cause, str]]:
+        halves = values.get("radiance", values.get("radiance_wide"))
+        if halves is not None:
+            yield from self._contents.radiance(row, halves)
+        if "depth" in values and "normal" in values:
+            view = None if rows is None else rows.views.get(row)
+            yield from self._contents.view(values["depth"], values["normal"], view)
+
+    def _finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
+        return Finding(cause, detail, self._scene.scene_id, job, row, file)
+
+
+def _array_of(file: str) -> str:
+    """The array that a file named by a marker belongs to."""
+    return file.rsplit("/", 2)[1]
+
+
+def _said(error: CorruptError) -> str:
+    """What an error says, without the file, which the finding names."""
+    return str(error).partition(": ")[2] or str(error)

@@ -1,0 +1,207 @@
+"""Reads what a scene's jobs are made from and refer to: its plans and its base.
+
+A chunk that is missing is read by Zarr as fill values, in silence; so the chunks are counted first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.plan import UNUSED, PlannedRows
+from photonfarm.shared.records import BasePointCloud, Geometry
+from photonfarm.shared.sampling import sample_keys
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import plans, schema
+from photonfarm.shared.store.findings import Cause, Finding
+from photonfarm.shared.store.plans import StoredPlan
+from photonfarm.shared.store.scene_store import read_base
+from photonfarm.shared.store.storage import Storage
+
+_UNREADABLE = (ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError)
+"""What zarr-python raises for damaged metadata and chunks."""
+
+_INPUTS = tuple(field.name for field in fields(PlannedRows))
+
+
+class PlanCheck:
+    """Checks the plans and the base of one scene."""
+
+    def __init__(self, storage: Storage, spec: SceneSpec, scene: str) -> None:
+        self._storage = storage
+        self._spec = spec
+        self._scene = scene  # its folder
+        self.shard_rows: int | None = None  # as the first plan that can be read tells
+        self.plans: list[StoredPlan] | None = None  # once checked; None if one is damaged
+
+    # ------------------------------------------------------------------------------------------------------------ plans
+
+    def check_plans(self) -> Iterator[Finding]:
+        """What is wrong with the plans."""
+        numbers = sorted(int(name) for name in self._storage.names(f"{self._scene}/plans") if name.isdecimal())
+        found = [Finding(Cause.PLAN, f"plan {n} is missing", self._id) for n in set(range(len(numbers))) - set(numbers)]
+        for number in numbers:
+            found += self._plan(plans.folder(self._scene, number))
+        if not found:
+            try:
+                self.plans = plans.load_all(self._storage, self._scene, [])
+            except CorruptError as error:
+                found.append(Finding(Cause.PLAN, str(error), self._id))
+        yield from found
+        if self.plans:
+            references = list(self._references(self.plans))
+            yield from references or self._keys(self.plans)
+            self.plans = None if references else self.plans
+
+    @property
+    def _id(self) -> str:
+        return self._spec.scene_id
+
+    def _plan(self, folder: str) -> Iterator[Finding]:
+        """What is wrong with the files of a plan."""
+        import zarr
+
+        try:
+            group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
+            jobs, shard_rows = (int(str(group.attrs[name])) for name in ("jobs", "shard_rows"))
+        except _UNREADABLE as error:
+            yield Finding(Cause.PLAN, f"cannot be read: {error}", self._id, file=f"{folder}/zarr.json")
+            return
+        self.shard_rows = self.shard_rows or shard_rows
+        for name in _INPUTS:
+            if detail := self._array(group, folder, name, jobs * shard_rows):
+                yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/{name}")
+        for array in schema.output_arrays(self._spec).values():
+            if detail := _declaration(group, array, jobs, shard_rows):
+                yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
+
+    def _array(self, group: Any, folder: str, name: str, rows: int | None = None) -> str:
+        """What is wrong with an array of inputs or of the base; empty if nothing is."""
+        try:
+            array = group[name]
+            if rows is not None and array.shape[0] != rows:
+                return f"has {array.shape[0]} rows; the plan has {rows}"
+            held = set(self._storage.names(f"{folder}/{name}"))
+            if missing := [key for key in _chunk_names(array) if key not in held]:
+                return f"chunk {missing[0]} is missing"
+            values = np.asarray(array[...])
+        except _UNREADABLE as error:
+            return f"cannot be read: {error}"
+        return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
+
+    def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
+        """Rows and jobs that do not follow each other, and samples that refer to rows that hold nothing."""
+        modification, view = _stacked(found)
+        first_job = 0
+        for plan in found:
+            used = plan.rows.sample_modification != UNUSED
+            wrong = used != (plan.rows.sample_view != UNUSED)
+            for references, vectors in (
+                (plan.rows.sample_modification, modification),
+                (plan.rows.sample_view, view),
+            ):
+                within = used & (references >= 0) & (references < plan.end_row)
+                wrong |= used & ~within
+                wrong[within] |= np.isnan(vectors[references[within]]).any(axis=tuple(range(1, vectors.ndim)))
+            if wrong.any():
+                row = plan.first_row + int(np.argmax(wrong))
+                detail = f"{np.count_nonzero(wrong)} samples refer to rows that hold no modification or view"
+                yield Finding(Cause.PLAN, detail, self._id, row=row, file=plan.folder)
+            if plan.first_job != first_job or plan.shard_rows != found[0].shard_rows:
+                detail = f"begins at job {plan.first_job}; the plan before it ends at {first_job}"
+                yield Finding(Cause.PLAN, detail, self._id, file=plan.folder)
+            first_job = plan.end_job
+
+    def _keys(self, found: list[StoredPlan]) -> Iterator[Finding]:
+        """Samples whose content key is not that of their content, or is another sample's as well."""
+        modification, view = _stacked(found)
+        for plan in found:
+            rows = plan.rows
+            used = np.flatnonzero(rows.sample_modification != UNUSED)
+            contents = modification[rows.sample_modification[used]], view[rows.sample_view[used]]
+            keys = sample_keys(self._id, *contents, rows.sample_pass[used])
+            stored = (rows.sample_key[i].tobytes() for i in used)
+            wrong = [plan.first_row + int(i) for i, key, kept in zip(used, keys, stored, strict=True) if key != kept]
+            if wrong:
+                detail = f"{len(wrong)} samples have a key that is not of their modification, view and pass"
+                yield Finding(Cause.PLAN, detail, self._id, row=wrong[0], file=f"{plan.folder}/sample_key")
+        every = np.concatenate([plan.rows.sample_key[plan.rows.sample_modification != UNUSED] for plan in found])
+        if repeated := len(every) - len(np.unique(every, axis=0)):
+            detail = f"{repeated} keys are planned more than once"
+            yield Finding(Cause.PLAN, detail, self._id, file=f"{self._scene}/plans")
+
+    # ------------------------------------------------------------------------------------------------------------- base
+
+    def check_base(self, *, needed: bool) -> Iterator[Finding]:
+        """What is wrong with geometry and base point cloud; `needed` once a job is committed."""
+        import zarr
+
+        folder = f"{self._scene}/base"
+        if not self._storage.exists(f"{folder}/zarr.json"):
+            if needed:
+                yield Finding(Cause.BASE, "is missing, and jobs are committed", self._id, file=folder)
+            return
+        found = []
+        for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
+            try:
+                group: Any = zarr.open_group(
+                    self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False
+                )
+                names = [(field.name, group[part]) for field in fields(record)]
+            except _UNREADABLE as error:
+                found.append(Finding(Cause.BASE, f"cannot be read: {error}", self._id, file=f"{folder}/{part}"))
+                continue
+            for name, parent in names:
+                if detail := self._array(parent, f"{folder}/{part}", name):
+                    found.append(Finding(Cause.BASE, detail, self._id, file=f"{folder}/{part}/{name}"))
+        yield from found
+        if not found and (detail := _base_references(*read_base(self._storage, self._scene), len(self._spec.groups))):
+            yield Finding(Cause.BASE, detail, self._id, file=folder)
+
+
+def _chunk_names(array: Any) -> Iterator[str]:
+    """The file names of all chunks of an array of one file each."""
+    if array.size:
+        grid = [-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True)]
+        for index in np.ndindex(*grid):
+            yield ".".join(["c", *map(str, index)])
+
+
+def _declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:
+    """What is wrong with the declaration of an output array, which other programs read it by; empty if nothing is."""
+    try:
+        declared = group[array.name]
+        found = declared.shape, declared.dtype, declared.chunks, declared.shards
+    except _UNREADABLE as error:
+        return f"cannot be read: {error}"
+    shape = array.shape
+    expected = (jobs * shard_rows, *shape), array.dtype, (1, *shape), (shard_rows, *shape)
+    return "" if found == expected else f"declares {found}; {expected} is right"
+
+
+def _stacked(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The modification vectors (R, G, 4) and view vectors (R, 6) of all rows of a scene."""
+    return (
+        np.concatenate([plan.rows.modification for plan in found]),
+        np.concatenate([plan.rows.view for plan in found]),
+    )
+
+
+def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> str:
+    """Which index points at nothing; empty if none does."""
+    limits: dict[str, tuple[NDArray[Any], int]] = {
+        "geometry/faces": (geometry.faces, len(geometry.vertices)),
+        "geometry/face_shape": (geometry.face_shape, len(geometry.shape_group)),
+        "geometry/shape_group": (geometry.shape_group, groups),
+        "cloud/group": (cloud.group, groups),
+        "cloud/face": (cloud.face, len(geometry.faces)),
+    }
+    for name, (index, limit) in limits.items():
+        if index.size and int(index.max()) >= limit:
+            return f"{name} holds the index {int(index.max())}; {limit - 1} is the largest that is there"
+    return ""

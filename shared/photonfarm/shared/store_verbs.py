@@ -1,0 +1,87 @@
+"""The verbs `photonfarm store …`: looking into a store, without Mitsuba, torch or Redis."""
+
+from __future__ import annotations
+
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from photonfarm.shared.cli import json_option, store_option
+
+
+def scene_option(command: click.decorators.FC) -> click.decorators.FC:
+    """`--scene ID`, one scene of the store."""
+    return click.option("--scene", metavar="ID", help="This scene alone: its id, how it begins, or its name.")(command)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--repair", is_flag=True, help="Set what is damaged aside, for the workers to write it again.")
+@json_option
+def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> None:
+    """Read everything that is stored, and say what is wrong with it; nothing is ever deleted or changed.
+
+    Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
+    that differ by more than chance, views from behind. Safe while workers and trainers are at work.
+
+    --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
+    missing and render them again.
+
+    Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside and is to be written again, 4 something is wrong
+    (also what --repair cannot repair, which the text says).
+    """
+    from photonfarm.shared import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.check import check_store
+    from photonfarm.shared.store.find import scene_named
+
+    opened = Store(store)
+    scene_id = None if scene is None else scene_named(opened, scene)
+    with show_store.progress() as tell:
+        report = check_store(
+            opened, scene_id, when=datetime.now(UTC).isoformat(timespec="seconds"), repair=repair, tell=tell
+        )
+    show_store.check(report, as_json)
+    sys.exit(report.exit_code)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--modification", metavar="VECTOR|KEY", help="4 numbers per movable group (x, y, z, present), or a key.")
+@click.option("--view", metavar="VECTOR|KEY", help="6 numbers (camera position, look-at point), or a key.")
+@click.option("--sample", metavar="KEY", help="The sample of a key: 32 hexadecimal digits.")
+@click.option("--row", type=click.IntRange(0), help="The sample in a row.")
+@click.option("--job", type=click.IntRange(0), help="The samples of a job.")
+@click.option("--tolerance", type=click.FloatRange(0), default=1e-3, show_default=True,
+              help="How far a position may be from the one given, in scene units; 0: bit by bit.")  # fmt: skip
+@click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="Samples to print.")
+@json_option
+def find(
+    store: str | Path,
+    scene: str | None,
+    modification: str | None,
+    view: str | None,
+    sample: str | None,
+    row: int | None,
+    job: int | None,
+    tolerance: float,
+    limit: int,
+    as_json: bool,
+) -> None:
+    """Look samples up by what they are: their rows, passes, files, and whether they are complete.
+
+    Conditions narrow each other; without any, all samples are listed. The nearest come first. Vectors are numbers
+    with commas or blanks between them, as printed.
+    """
+    from photonfarm.shared import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.find import Query, find_samples, scene_named
+
+    opened = Store(store)
+    query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
+    ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
+    show_store.found(find_samples(opened, ids, query, limit=limit), store, as_json)

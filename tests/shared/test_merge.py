@@ -1,0 +1,191 @@
+"""Passes merge exactly: the truth is Python's fractions, and neither order nor grouping leaves a trace."""
+
+import importlib.util
+from dataclasses import fields
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.estimate import clean_error
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.merge import MAX_PASSES, Merged, Moments, merge_rows, merge_view
+from photonfarm.shared.top_up import TopUp
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+HALF = np.float32(np.finfo(np.float16).smallest_subnormal)
+TINY, HUGE = np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max
+
+radiance = st.floats(width=32, allow_nan=False, allow_infinity=False) | st.floats(0, 4, width=16)
+
+
+def passes_of(values: list[float]) -> list[np.ndarray]:
+    """One-pixel passes, (2, 1, 1, 3) each: in channel 1, B and A are neighbours in the list."""
+    pairs = np.array(values, np.float32).reshape(-1, 2)
+    return [np.stack([np.roll([a, b, a], i).reshape(1, 1, 3) for i in range(2)]) for a, b in pairs]
+
+
+def moments_of(passes: list[np.ndarray]) -> Moments:
+    moments = Moments()
+    for halves in passes:
+        moments.add(halves)
+    return moments
+
+
+def assert_equal(a: Merged, b: Merged) -> None:
+    for field in fields(Merged):
+        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), strict=True)
+
+
+def truth(passes: list[np.ndarray], channel: int) -> tuple[float, float, float, float]:
+    halves = [[Fraction(float(p[half, 0, 0, channel])) for p in passes] for half in range(2)]
+    both = halves[0] + halves[1]
+    mean = sum(both) / len(both)
+    m2 = sum((x - mean) ** 2 for x in both)
+    return float(mean), float(m2), *(float(sum(half) / len(half)) for half in halves)
+
+
+@given(st.lists(radiance, min_size=2, max_size=12).filter(lambda values: len(values) % 2 == 0))
+def test_mean_m2_and_both_half_means_are_the_exact_ones_rounded_once(values: list[float]) -> None:
+    passes = passes_of(values)
+    merged = moments_of(passes).merged()
+    assert (merged.passes, merged.count) == (len(passes), len(values))
+    for channel in range(3):
+        found = tuple(float(image[0, 0, channel]) for image in (merged.mean, merged.m2, merged.half_a, merged.half_b))
+        assert found == truth(passes, channel)
+
+
+@given(st.lists(radiance, min_size=16, max_size=16), st.permutations(range(8)), st.lists(st.integers(0, 3), min_size=8))
+@settings(max_examples=60)
+def test_any_order_and_any_grouping_give_equal_bits(values: list[float], order: list[int], group: list[int]) -> None:
+    passes = passes_of(values)
+    groups = [Moments() for _ in range(4)]
+    for i in order:
+        groups[group[i]].add(passes[i])
+    total = Moments()
+    for part in groups:
+        total.update(part)
+    assert_equal(total.merged(), moments_of(passes).merged())
+
+
+def test_what_float64_would_lose_between_a_huge_and_a_tiny_value_is_kept() -> None:
+    passes = passes_of([HUGE, TINY, -HUGE, TINY, HALF, 0.0])
+    merged = moments_of(passes).merged()
+    assert float(np.float64(HUGE) + TINY) == float(HUGE)
+    assert merged.mean[0, 0, 1] == float((2 * Fraction(float(TINY)) + Fraction(float(HALF))) / 6)
+    assert merged.m2[0, 0, 1] == truth(passes, 1)[1]
+
+
+def test_a_variance_far_below_the_mean_is_not_lost() -> None:
+    """Σx² − (Σx)²/n in float64 would be off by all of it: the values differ in the last bit of 24."""
+    passes = passes_of([16777215.0, 16777214.0, 16777215.0, 16777214.0])
+    assert moments_of(passes).merged().m2[0, 0, 1] == 1.0
+
+
+def test_an_image_of_many_blocks_agrees_with_numpy_to_its_own_rounding() -> None:
+    rng = np.random.default_rng(3)
+    passes = [rng.exponential(1, (2, 120, 160, 3)).astype(np.float16).astype(np.float32) for _ in range(4)]
+    merged, all_halves = moments_of(passes).merged(), np.concatenate(passes).astype(np.float64)
+    np.testing.assert_allclose(merged.mean, all_halves.mean(0), rtol=1e-14)
+    np.testing.assert_allclose(merged.standard_error, all_halves.std(0, ddof=1) / np.sqrt(8), rtol=1e-11)
+    np.testing.assert_allclose(merged.half_b, np.mean([p[1] for p in passes], axis=0, dtype=np.float64), rtol=1e-14)
+
+
+def test_the_merged_halves_are_two_independent_estimates_for_the_error_against_the_clean_image() -> None:
+    """Standard normal noise, 4 passes, 30 000 values: the error against the clean image is 0 ± σ²/4/√30000, 4 sigma."""
+    rng = np.random.default_rng(4)
+    merged = moments_of([rng.normal(5, 1, (2, 100, 100, 3)).astype(np.float32) for _ in range(4)]).merged()
+    clean = np.full((100, 100, 3), 5, np.float32)
+    bound = 4 * 0.25 / np.sqrt(30_000)
+    assert abs(clean_error(clean, merged.half_a, merged.half_b)) < bound
+    assert abs(clean_error(clean, merged.half_a, merged.half_a)) > bound
+
+
+def test_what_cannot_be_merged_is_refused() -> None:
+    moments = moments_of(passes_of([1.0, 2.0]))
+    with pytest.raises(ValueError, match="not finite"):
+        moments.add(np.full((2, 1, 1, 3), np.inf, np.float32))
+    with pytest.raises(ValueError, match=r"\(2, 2, 1, 3\) does not add"):
+        moments.add(np.zeros((2, 2, 1, 3), np.float32))
+    many = moments_of(passes_of([1.0, 2.0]))
+    many.passes = MAX_PASSES
+    with pytest.raises(ValueError, match="summed exactly"):
+        many.update(moments_of(passes_of([1.0, 2.0])))
+    with pytest.raises(ValueError, match="no pass"):
+        Moments().merged()
+
+
+# -------------------------------------------------------------------------------------------------------------- a store
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneStore:
+    """Two views of one pass each, topped up by three passes."""
+    store = Store(tmp_path / "store", create=True)
+    request = Request(modifications=2)
+    scene = store.scene(store.plan(samples.small_spec(), request, shard_rows=4).scene_id)
+    scene.plan(TopUp.of("+24"))
+    return scene
+
+
+def reader_of(scene: SceneStore) -> SceneReader:
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    reader.refresh()
+    return reader
+
+
+def test_a_view_is_merged_from_all_of_its_complete_passes_and_from_no_other(scene: SceneStore) -> None:
+    samples.commit_all(scene)
+    reader = reader_of(scene)
+    for view_row in (0, 1):
+        rows = [s.row for job in range(scene.jobs()) for s in scene.job_rows(job).samples if s.view_row == view_row]
+        assert len(rows) == 4
+        expected = moments_of([samples.values(row, (2, 8, 8, 3)) for row in reversed(rows)]).merged()
+        assert_equal(merge_view(reader, view_row), expected)
+
+
+def test_passes_in_float16_and_in_float32_merge_alike(scene: SceneStore) -> None:
+    given_ = samples.outputs(scene, 0)
+    given_.radiance[1][0, 2, 3, 1] = 1e9
+    samples.commit(scene, 0, given_)
+    samples.commit_all(scene)
+    merged, row_values = merge_view(reader_of(scene), 1), given_.radiance[1]
+    others = [samples.values(int(row), (2, 8, 8, 3)) for row in reader_of(scene).rows_of_view(1) if row != 1]
+    assert_equal(merged, moments_of([row_values, *others]).merged())
+    assert merged.half_a[2, 3, 1] > 2e8
+
+
+def test_merging_goes_on_while_passes_arrive_and_by_several_readers(scene: SceneStore) -> None:
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    reader = reader_of(scene)
+    assert reader.rows_of_view(0).tolist() == [0]
+    first = merge_rows(reader, reader.rows_of_view(0))
+    samples.commit_all(scene)
+    reader.refresh()
+    first.update(merge_rows(reader_of(scene), reader.rows_of_view(0)[1:]))
+    assert_equal(first.merged(), merge_view(reader, 0))
+
+
+def test_a_view_without_a_complete_pass_is_an_error_that_says_so(scene: SceneStore) -> None:
+    with pytest.raises(StoreError, match="view row 1 has no complete pass"):
+        merge_view(reader_of(scene), 1)
+
+
+def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Path) -> None:
+    samples.commit_all(scene)
+    merged = merge_view(reader_of(scene), 0)
+    merged.write(tmp_path / "view.npz")
+    assert_equal(Merged.read(tmp_path / "view.npz"), merged)
+    with np.load(tmp_path / "view.npz") as stored:
+        np.testing.assert_array_equal(stored["standard_error"], merged.standard_error)
+    (tmp_path / "other.npz").write_bytes(b"nothing")
+    with pytest.raises(StoreError, match=r"other\.npz: is not a merged view"):
+        Merged.read(tmp_path / "other.npz")

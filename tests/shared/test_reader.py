@@ -1,0 +1,162 @@
+"""Batches in reused memory are the samples that were committed, from any number of threads and with few open files."""
+
+import importlib.util
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import arrays_of
+from photonfarm.shared.store import SceneReader, SceneStore, Store, reader
+from photonfarm.shared.store.batch import Batch
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+WIDE = (5, 6)  # rows with a value beyond float16
+BRIGHT = np.float32(1e9)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneStore:
+    """Eight samples in four jobs: two views of two modifications, two passes each."""
+    store = Store(tmp_path / "store", create=True)
+    request = Request(modifications=2, views_per_modification=2, passes=2)
+    scene = store.scene(store.plan(samples.small_spec(exposure=4.0), request, shard_rows=2).scene_id)
+    for job in scene.missing_jobs():
+        given = samples.outputs(scene, job)
+        for row in given.radiance.keys() & set(WIDE):
+            given.radiance[row][0, 0, 0, 0] = BRIGHT
+        samples.commit(scene, job, given)
+    return scene
+
+
+@pytest.fixture
+def source(scene: SceneStore) -> SceneReader:
+    source = SceneReader(scene.storage.where, scene.scene_id)
+    assert source.refresh().tolist() == list(range(8))
+    return source
+
+
+def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
+    """Against the samples read one by one."""
+    assert batch.rows.tolist() == rows
+    for place, row in enumerate(rows):
+        sample = source.read(row)
+        np.testing.assert_array_equal(batch.linear(place), sample.radiance)
+        for name, values in arrays_of(sample.buffers).items():
+            np.testing.assert_array_equal(batch.buffers[name][place], values)
+        assert batch.modification_rows[place] == source.modification_row(row)
+
+
+def test_batches_in_any_order_and_with_repeats_are_the_samples_read_one_by_one(source: SceneReader) -> None:
+    rng = np.random.default_rng(0)
+    memory = Batch.empty(source.spec, 6)
+    for _ in range(20):
+        rows = rng.integers(0, 8, rng.integers(1, 7)).tolist()
+        check(source.read_batch(rows, memory), source, rows)
+        check(source.read_batch(np.array(rows)), source, rows)
+
+
+def test_a_batch_is_in_the_memory_that_was_given_and_in_the_types_that_are_stored(source: SceneReader) -> None:
+    memory = Batch.empty(source.spec, 4)
+    batch = source.read_batch([3, 1], memory)
+    assert len(batch) == 2
+    assert np.shares_memory(batch.radiance, memory.radiance)
+    assert all(np.shares_memory(batch.buffers[name], memory.buffers[name]) for name in ("depth", "albedo", "normal"))
+    types = {name: values.dtype.name for name, values in batch.buffers.items()}
+    assert types == {"depth": "float32", "albedo": "float16", "normal": "float16"}
+    expected = source.read(3).radiance * 2.0**source.spec.radiance_exponent
+    assert batch.radiance.dtype == np.float16
+    np.testing.assert_array_equal(batch.radiance[0], expected)
+
+
+def test_a_sample_that_float16_cannot_hold_comes_in_float32_and_is_nan_for_whoever_forgets_it(
+    source: SceneReader,
+) -> None:
+    memory = Batch.empty(source.spec, 3)
+    batch = source.read_batch([0, 5, 6], memory)
+    assert set(batch.wide) == {1, 2}
+    assert np.isnan(batch.radiance[1:]).all()
+    assert batch.wide[1].dtype == np.float32
+    assert batch.linear(1)[0, 0, 0, 0] == BRIGHT
+    assert np.isfinite(batch.linear(1)).all()
+    assert not source.read_batch([1, 2], memory).wide  # nothing is left of the batch before
+
+
+def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: SceneReader) -> None:
+    for file in scene.folder.glob("plans/*/depth/c.*"):
+        file.unlink()
+    batch = source.read_batch([0, 1], Batch.empty(source.spec, 2, buffers=False))
+    assert batch.buffers == {}
+    with pytest.raises(CorruptError, match="depth"):
+        source.read_batch([0, 1], Batch.empty(source.spec, 2))
+
+
+@pytest.mark.parametrize("row", [-1, 8, 10**12])
+def test_rows_that_are_not_complete_are_refused_before_anything_is_read(source: SceneReader, row: int) -> None:
+    memory = Batch.empty(source.spec, 2)
+    memory.radiance[:] = 7
+    with pytest.raises(StoreError, match=f"row {row} of scene .* is not complete"):
+        source.read_batch([0, row], memory)
+    assert (memory.radiance == 7).all()
+
+
+def test_more_samples_than_there_is_memory_for_are_refused(source: SceneReader) -> None:
+    with pytest.raises(ValueError, match="3 samples do not fit a batch of 2"):
+        source.read_batch([0, 1, 2], Batch.empty(source.spec, 2))
+
+
+def test_no_samples_are_an_empty_batch(source: SceneReader) -> None:
+    assert len(source.read_batch([])) == 0
+
+
+def test_a_bit_that_flips_while_batches_are_read_is_found(scene: SceneStore, source: SceneReader) -> None:
+    memory = Batch.empty(source.spec, 8)
+    for _ in range(3):
+        source.read_batch(range(8), memory)
+    for name in ("radiance", "depth"):
+        path = scene.storage.local(f"{scene.name}/plans/000000/{name}/c.0{'.0' * (4 if name == 'radiance' else 2)}")
+        whole = path.read_bytes()
+        with path.open("r+b") as file:
+            file.seek(40)
+            file.write(bytes([whole[40] ^ 4]))
+        with pytest.raises(CorruptError, match=str(path)):
+            source.read_batch(range(8), memory)
+        path.write_bytes(whole)
+
+
+def test_no_more_files_stay_open_than_are_allowed(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two for each shard: its own, and that of its map."""
+    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+    descriptors = Path("/proc/self/fd")
+    before = len(list(descriptors.iterdir()))
+    memory = Batch.empty(source.spec, 8)
+    for _ in range(5):
+        source.read_batch(range(8), memory)
+        assert len(list(descriptors.iterdir())) <= before + 2 * 3
+    del source
+
+
+def test_threads_that_read_at_once_each_get_their_own_samples(
+    source: SceneReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few shards stay open, so that they are closed by one thread while another one reads."""
+    expected = source.read_batch(range(8))
+    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+
+    def read(seed: int) -> None:
+        rng, memory = np.random.default_rng(seed), Batch.empty(source.spec, 4)
+        for _ in range(60):
+            rows = rng.integers(0, 8, 4)
+            batch = source.read_batch(rows, memory)
+            np.testing.assert_array_equal(batch.radiance, expected.radiance[rows])
+            np.testing.assert_array_equal(batch.buffers["normal"], expected.buffers["normal"][rows])
+
+    with ThreadPoolExecutor(2 * (os.cpu_count() or 1)) as threads:
+        list(threads.map(read, range(6)))

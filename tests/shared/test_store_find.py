@@ -1,0 +1,210 @@
+"""`photonfarm store find` finds samples by what they are, and says where they lie."""
+
+import importlib.util
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from click.testing import CliRunner
+
+from photonfarm.shared import cli
+from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.plan import PlannedRows, Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.find import Matches, Query, find_samples, scene_named
+from photonfarm.shared.store.plans import StoredPlan
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store", create=True)
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """6 modifications with 2 views of 2 passes each: jobs 0 to 5 of plan 0 are pass 0, those of plan 1 pass 1."""
+    views = Request(modifications=6, views_per_modification=2)
+    scene = store.scene(store.plan(samples.small_spec(), views, shard_rows=4).scene_id)
+    scene.plan(views.model_copy(update={"passes": 2}))
+    for job in (0, 1, 3):
+        given = samples.outputs(scene, job)
+        if job == 1:
+            given.radiance[5][0, 0, 0, 0] = 1e9
+        samples.commit(scene, job, given)
+    return scene
+
+
+def find(store: Store, limit: int = 100, **query: Any) -> Matches:
+    return find_samples(store, store.scene_ids(), Query.of(**query), limit=limit)
+
+
+def rows(matches: Matches) -> list[int]:
+    return [sample.row for sample in matches.samples]
+
+
+def text(vector: np.ndarray) -> str:
+    return ", ".join(repr(float(value)) for value in vector.reshape(-1))
+
+
+def present(scene: SceneStore) -> int:
+    """A modification row whose object is there."""
+    vectors = scene.plans()[0].rows.modification
+    return int(np.flatnonzero(vectors[:, 0, 3] == 1)[-1])
+
+
+def test_without_a_condition_every_sample_is_found(store: Store, scene: SceneStore) -> None:
+    every = find(store)
+    assert every.count == 24
+    assert sorted(rows(every)) == [*range(24)]
+    assert (find(store, limit=5).count, len(find(store, limit=5).samples)) == (24, 5)
+
+
+def test_a_modification_is_found_by_its_vector_with_all_its_views_and_passes(store: Store, scene: SceneStore) -> None:
+    row = present(scene)
+    vector = scene.plans()[0].rows.modification[row]
+    matches = find(store, modification=text(vector), tolerance=0)
+    assert {s.modification_row for s in matches.samples} == {row}
+    assert sorted({(s.view_row, s.pass_) for s in matches.samples}) == sorted(
+        (view, pass_) for view in {s.view_row for s in matches.samples} for pass_ in (0, 1)
+    )
+    assert matches.count == 4
+    assert all(s.distance == 0 for s in matches.samples)
+
+
+def test_a_rounded_vector_finds_within_the_tolerance_and_the_nearest_comes_first(
+    store: Store, scene: SceneStore
+) -> None:
+    row = present(scene)
+    vector = scene.plans()[0].rows.modification[row].copy()
+    vector[0, 0] += np.float32(0.25)
+    assert find(store, modification=text(vector)).count == 0
+    assert find(store, modification=text(vector)).nearest <= 0.25 + 1e-6
+    matches = find(store, modification=text(vector), tolerance=10)
+    distances = [s.distance for s in matches.samples]
+    assert distances == sorted(distances)
+    assert matches.samples[0].distance == pytest.approx(matches.nearest)
+    assert row in {s.modification_row for s in matches.samples if s.distance <= 0.25 + 1e-6}
+
+
+def test_a_removed_object_is_never_near_one_that_is_there(store: Store, scene: SceneStore) -> None:
+    vector = scene.plans()[0].rows.modification[present(scene)].copy()
+    vector[0, 3] = 0
+    matches = find(store, modification=text(vector), tolerance=100)
+    assert all(s.modification[0][3] == 0 for s in matches.samples)
+
+
+def test_samples_are_found_by_each_of_their_keys(store: Store, scene: SceneStore) -> None:
+    reader = SceneReader(store.root, scene.scene_id)
+    for row in reader.refresh()[[1, 5, 9]].tolist():
+        (sample,) = find(store, row=row).samples
+        assert sample.modification_key == reader.modification_key(row).hex()
+        assert sample.view_key == reader.view_key(row).hex()
+        assert rows(find(store, sample=sample.key)) == [row]
+        assert row in rows(find(store, modification=sample.modification_key))
+        of_view = find(store, view=sample.view_key)
+        assert {(s.view_row, s.pass_) for s in of_view.samples} == {(sample.view_row, 0), (sample.view_row, 1)}
+    assert find(store, sample="0" * 32).count == 0
+
+
+def test_a_view_is_found_by_its_vector_and_conditions_narrow_each_other(store: Store, scene: SceneStore) -> None:
+    view = scene.plans()[0].rows.view[3]
+    matches = find(store, view=text(view), tolerance=0)
+    assert {s.view_row for s in matches.samples} == {3}
+    assert matches.count == 2
+    job = matches.samples[1].jobs[0]
+    assert find(store, view=text(view), job=job).count == 1
+    assert rows(find(store, job=2)) == [8, 9, 10, 11]
+
+
+def test_where_a_sample_lies_is_where_zarr_reads_it(store: Store, scene: SceneStore) -> None:
+    reader = SceneReader(store.root, scene.scene_id)
+    reader.refresh()
+    for row in (2, 5, 13):
+        (found,) = find(store, row=row).samples
+        places = {place.array: place for place in found.places}
+        sample = reader.read(row)
+        name = "radiance_wide" if row == 5 else "radiance"
+        assert ({"radiance", "radiance_wide"} & places.keys()) == {name}
+        for array, values in ((name, sample.radiance), ("depth", sample.buffers.depth)):
+            place = places[array]
+            stored = zarr.open_array(store.root / Path(place.file).parent, mode="r")
+            np.testing.assert_array_equal(stored[place.index].astype(np.float32), values)
+            assert place.there
+            assert place.chunk == place.index % 4
+
+
+def test_a_sample_is_complete_with_the_jobs_of_its_row_view_and_modification(store: Store, scene: SceneStore) -> None:
+    found = {s.row: s for s in find(store).samples}
+    assert found[0].complete
+    assert not found[8].complete  # job 2
+    assert found[12].jobs == (3, 0, 0)
+    assert found[12].complete
+    reader = SceneReader(store.root, scene.scene_id)
+    assert reader.refresh().tolist() == [row for row in sorted(found) if found[row].complete]
+
+
+def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene: SceneStore) -> None:
+    for name in (scene.scene_id, scene.scene_id[:6], "small"):
+        assert scene_named(store, name) == scene.scene_id
+    with pytest.raises(StoreError, match=f"no scene that 'other' stands for; it holds {scene.scene_id}"):
+        scene_named(store, "other")
+    other = store.add(samples.small_spec(exposure=2.0))
+    with pytest.raises(StoreError, match="2 scenes"):
+        scene_named(store, "small")
+    assert find(store).count == 24
+    assert find_samples(store, [other.scene_id], Query()).count == 0
+
+
+def test_a_vector_for_another_number_of_objects_fits_nothing(store: Store, scene: SceneStore) -> None:
+    assert find(store, modification="0 0 0 1 0 0 0 1", tolerance=100).count == 0
+
+
+@pytest.mark.parametrize(
+    "query",
+    [{"modification": "left"}, {"modification": "1 2 3"}, {"view": "1 2 3"}, {"sample": "12"}, {"view": "nan " * 6}],
+)
+def test_what_is_neither_key_nor_vector_is_refused(query: dict[str, str]) -> None:
+    with pytest.raises(SpecError, match=f"--{next(iter(query))}"):
+        Query.of(**query)
+
+
+def test_half_a_million_samples_are_searched_at_once(store: Store, scene: SceneStore) -> None:
+    """0.1 s here; one by one it would be 10."""
+    count, rng = 500_000, np.random.default_rng(0)
+    large = PlannedRows.empty(count, 1)
+    large.modification[:] = rng.random((count, 1, 4), np.float32)
+    large.modification[..., 3] = 1
+    large.view[:] = rng.random((count, 6), np.float32)
+    large.sample_modification[:] = large.sample_view[:] = np.arange(count)
+    large.sample_pass[:] = 0
+    large.sample_key[:] = rng.integers(0, 256, (count, 16), np.uint8)
+    scene._plans[:] = [StoredPlan(0, scene.plans()[0].folder, Request(), 0, count // 4, 4, large)]
+    scene.plans = lambda: scene._plans
+    began = time.process_time()
+    assert rows(find(store, modification=text(large.modification[123_456]), tolerance=0)) == [123_456]
+    assert rows(find(store, sample=large.sample_key[499_999].tobytes().hex())) == [499_999]
+    assert time.process_time() - began < 3
+
+
+def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: SceneStore) -> None:
+    def run(*arguments: str) -> Any:
+        words = ["store", "find", "--store", str(store.root), *arguments]
+        return CliRunner().invoke(cli.umbrella, words, prog_name="photonfarm")
+
+    told = run("--row", "8")
+    assert told.exit_code == 0
+    assert "row 8, pass 0: not complete" in told.stdout
+    assert f"photonfarm work --store {store.root} --scene {scene.scene_id} --job 2" in told.stdout
+    printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
+    assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
+    assert printed["samples"][0]["complete"]
+    assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
+    assert "the nearest is" in run("--modification", "9 9 9 1").stderr

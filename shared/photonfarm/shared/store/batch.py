@@ -21,9 +21,7 @@ class Batch:
     """Samples in the types that they are stored in; what `SceneReader.read_batch` fills."""
 
     radiance_exponent: int
-    radiance: NDArray[
-        np.float16
-    ]  # (B, 2, H, W, 3) linear × 2^radiance_exponent, halves A and B; NaN: see `wide`
+    radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 2^radiance_exponent, halves A and B; NaN: see `wide`
     buffers: dict[str, NDArray[Any]]  # depth (B, H, W) float32; albedo, normal (B, H, W, 3) float16; or none of them
     rows: NDArray[np.int64]  # (B,) row of each sample, of its view and of its modification
     view_rows: NDArray[np.int64]

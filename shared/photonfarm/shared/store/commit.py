@@ -233,4 +233,4 @@ def _stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
     if stored.kind != "f":
         return True
     end = {2: 65520.0, 4: 2.0**128 - 2.0**103}[stored.itemsize]
-    return bool(-end < values.min() and values.max() < end)
+    return -end < float(values.min()) and float(values.max()) < end

@@ -28,8 +28,8 @@ from photonfarm.shared.store.schema import ArraySchema
 _EMPTY = 2**64 - 1
 _CRC_BYTES = 4
 _BLOSC_HEADER_BYTES = 16
-_SYNC_BYTES = 16 << 20
-"""Written between two syncs: the last one, which a commit waits for, has little left to do."""
+_FLUSH_BYTES = 4 << 20
+"""Written before the disk is set to work on it: the sync, which a commit waits for, has little left to do."""
 
 _PIECE_BYTES = 256 << 10
 """Copied at once, then checked while a core's own cache still holds it."""
@@ -48,7 +48,7 @@ class ShardWriter:
         self._index = np.full((shard_rows, 2), _EMPTY, "<u8")
         self._checksums: dict[int, bytes] = {}
         self._file = part.open("xb", buffering=0)
-        self._size = self._synced = 0
+        self._size = self._flushed = 0
 
     def append(self, row: int, values: NDArray[Any]) -> None:
         """Write one row (the array's row shape and type); raises OSError."""
@@ -60,9 +60,10 @@ class ShardWriter:
         self._index[row] = self._size, len(content) + _CRC_BYTES
         self._write(content)
         self._write(self._checksums[row])
-        if self._size - self._synced > _SYNC_BYTES:
-            os.fdatasync(self._file.fileno())
-            self._synced = self._size
+        if (fresh := self._size - self._flushed) > _FLUSH_BYTES:
+            # begins to write, and does not wait; what is not yet written stays in the page cache
+            os.posix_fadvise(self._file.fileno(), self._flushed, fresh, os.POSIX_FADV_DONTNEED)
+            self._flushed = self._size
 
     def finish(self) -> dict[str, Any]:
         """Write the index; the file's size, and one checksum over those of its rows and of the index."""

@@ -96,7 +96,7 @@ class ShardRenderer:
         self._scenes: dict[str, tuple[SceneStore, SceneRenderer]] = {}  # last used last
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit one job; False if it was committed already.
+        """Render and commit one job; False if it was committed already, or by another worker meanwhile.
 
         Raises QueueError for a job that is not planned in this store, BackendError if the scene file here is not the
         planned one, IncompleteError if renders stay non-finite or buffers are.
@@ -119,7 +119,14 @@ class ShardRenderer:
                 worker=self._worker,
                 versions=versions(),
             )
-            return out.commit(figures)
+            committed = out.commit(figures)
+        if not committed:
+            log.warning(
+                "scene %s, job %d: was committed by another worker while it was rendered here; that one stays",
+                scene_id,
+                job,
+            )
+        return committed
 
     def _scene(self, scene_id: str) -> tuple[SceneStore, SceneRenderer]:
         if scene_id in self._scenes:

@@ -17,9 +17,6 @@ from photonfarm.shared import queue
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-STEADY_S = 30.0
-"""A child that lived this long was well: its successor starts at once again."""
-
 
 class Supervisor:
     """Starts the child again until it has nothing left to do."""
@@ -47,7 +44,7 @@ class Supervisor:
                 if code == RECYCLED:
                     failures = 0
                     continue
-                failures = 0 if time.monotonic() - started > STEADY_S else failures
+                failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
                 pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
                 failures += 1
                 self._say(f"worker {self._settings.name}: {_ending(code, message)}; starting again in {pause:g} s")

@@ -34,6 +34,7 @@ class WorkerSettings(Frozen):
     max_rss_bytes: Count = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more
     deadline_s: Positive = 1800.0  # jobs are meant to take 5 to 30 s; a hundred times that is a hang
     heartbeat_ttl_s: Positive = 90.0  # longer than native code holds Python's lock
+    steady_s: Positive = 30.0  # a child that lived this long was well: its successor starts at once
     idle_s: Count = 2  # between looks at the store, while the queue is empty
     report_s: Positive = 60.0  # between lines that say how it goes
     reserve_bytes: Annotated[int, Field(ge=0)] = 10**9  # a few jobs, and room for whatever else needs the disk

@@ -195,7 +195,7 @@ def top_up(
     as_json: bool,
     **options: bool,
 ) -> None:
-    r"""Plan more noisy passes of views of SPEC that are planned already, and queue them.
+    """Plan more noisy passes of views of SPEC that are planned already, and queue them.
 
     A pass has 2 × half_spp samples per pixel, so N is rounded up to whole passes. New passes are independent of
     the old ones and share the buffers and photons that are there. Repeating +N adds again; repeating N adds nothing.
@@ -208,7 +208,7 @@ def top_up(
       rows=A-B           views that the samples in rows A to B show; rows=A for one
       plan=P             views that plan P brought
       held-out[=SHARE]   views that training with this hold-out never sees (default 0.125)
-    """
+    """  # noqa: D301 - click wants the character
     from photonfarm.shared import show, submission
 
     result = submission.top_up(spec, store, None if no_queue else redis_url, spp, where=where, **options)

@@ -9,9 +9,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 from photonfarm.shared.errors import PhotonfarmError, QueueError, StoreError
-from photonfarm.shared.store.storage import store_errors
+from photonfarm.shared.store.storage import open_storage, store_errors
+
+if TYPE_CHECKING:
+    from photonfarm.shared.store.objects import ObjectStorage
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +82,8 @@ def _writes(store: str | Path) -> str:
 
 
 def _writes_to_bucket(url: str) -> str:
-    from photonfarm.shared.store.objects import ObjectStorage
-
     with store_errors("write", url):
-        ObjectStorage(url).check()
+        cast("ObjectStorage", open_storage(url)).check()
     return f"{url} can be written, and does not overwrite where it must not"
 
 

@@ -18,6 +18,7 @@ from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, 
 
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 
+
 class Supervisor:
     """Starts the child again until it has nothing left to do."""
 

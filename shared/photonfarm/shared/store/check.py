@@ -16,12 +16,11 @@ from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, Re
 from photonfarm.shared.store.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.job_check import Checked, marker_files
 from photonfarm.shared.store.job_pool import JobPool
-from photonfarm.shared.store.local import TMP
 from photonfarm.shared.store.plan_check import PlanCheck
 from photonfarm.shared.store.quarantine import Quarantine
 from photonfarm.shared.store.repeated_seeds import equal_samples
 from photonfarm.shared.store.scene_store import SCENES, read_spec
-from photonfarm.shared.store.storage import Storage, store_errors
+from photonfarm.shared.store.storage import TMP, Storage, store_errors
 from photonfarm.shared.store.store import Store
 from photonfarm.shared.store.strangers import strangers
 
@@ -84,7 +83,9 @@ def check_store(
         for each in ids:
             checking = _SceneChecking(storage, each, len(ids), tell or (lambda *_: None))
             reports.append(checking.run(quarantine if repair else None))
-        return StoreReport(tuple(reports), len(storage.names(TMP)), repair, quarantine.folder)
+        return StoreReport(
+            tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
+        )
 
 
 def said(halves: HalvesResult) -> str:

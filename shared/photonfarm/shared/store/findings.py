@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
-from itertools import chain
 
 NAMED = 5
 """Findings of one cause that a report names; the rest is counted."""
@@ -51,7 +50,6 @@ class Cause(Enum):
     BACK_FACING = "back-facing", "every first hit of the view is seen from behind", Remedy.LOOK
     NO_MARKER = "no-marker", "files without a marker: a worker is at it, or has died", Remedy.LOOK
     FOREIGN_FILE = "foreign-file", "a file that no store writes", Remedy.LOOK
-    PARTS = "parts", "unfinished files in tmp; workers sweep those of the dead", Remedy.LOOK
 
     def __init__(self, label: str, sentence: str, remedy: Remedy) -> None:
         self.label = label
@@ -103,20 +101,6 @@ class Findings:
     def groups(self) -> tuple[Group, ...]:
         """Everything found, by cause."""
         return tuple(Group(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause])
-
-
-def joined(groups: Iterable[tuple[Group, ...]]) -> tuple[Group, ...]:
-    """The groups of several scenes as those of one store."""
-    every = list(chain.from_iterable(groups))
-    return tuple(
-        Group(
-            cause,
-            sum(group.count for group in every if group.cause is cause),
-            tuple(chain.from_iterable(group.first for group in every if group.cause is cause))[:NAMED],
-        )
-        for cause in Cause
-        if any(group.cause is cause for group in every)
-    )
 
 
 def _keep(kept: list[Finding], finding: Finding, most: int) -> None:

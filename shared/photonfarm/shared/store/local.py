@@ -18,12 +18,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S
+from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
     from zarr.storage import LocalStore
-
-TMP = "tmp"
 
 _counter = itertools.count()
 

@@ -44,9 +44,8 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
 from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.store.local import TMP
 from photonfarm.shared.store.object_cache import ObjectCache
-from photonfarm.shared.store.storage import STRAY_AGE_S
+from photonfarm.shared.store.storage import STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion

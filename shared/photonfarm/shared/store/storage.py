@@ -18,6 +18,9 @@ from photonfarm.shared.errors import StoreError
 if TYPE_CHECKING:
     import zarr.abc.store
 
+TMP = "tmp"
+"""The folder of what is not adopted yet."""
+
 STRAY_AGE_S = 60.0
 """Parts of a dead process of this machine are swept at this age…"""
 
@@ -111,7 +114,7 @@ def is_vacant(root: str | Path) -> bool:
     """Whether nothing lies where a store could be, so that one may be made there; raises StoreError."""
     storage = open_storage(root)
     with store_errors("look into the store", storage.where):
-        return not storage.names("")
+        return set(storage.names("")) <= {TMP}
 
 
 def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:

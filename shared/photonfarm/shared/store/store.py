@@ -9,9 +9,8 @@ from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import SHARD_ROWS, Known, Request, expand
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations
-from photonfarm.shared.store.local import TMP
 from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore
-from photonfarm.shared.store.storage import STRAY_AGE_S, Storage, open_storage, put_json, store_errors
+from photonfarm.shared.store.storage import STRAY_AGE_S, TMP, Storage, open_storage, put_json, store_errors
 
 FORMAT_FILE = "photonfarm.json"
 

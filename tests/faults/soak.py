@@ -33,6 +33,7 @@ _spec.loader.exec_module(analytic)
 
 HEARTBEAT_TTL_S = 2.0
 STOPPED_S = (3.0, 5.0)  # longer than the heartbeat lasts, so that another worker takes the slot
+STEADY_S = 0.5  # a child that is killed is started again at once, however often that happens
 
 
 @dataclass
@@ -41,6 +42,7 @@ class Toll:
 
     kills: int = 0  # workers' children, by SIGKILL
     stops: int = 0  # workers' children, by SIGSTOP, until another one may have taken their job
+    races: int = 0  # jobs that a stopped worker went on with, and finished after another one had committed them
     redis_kills: int = 0  # by SIGKILL; back after up to 3 s, once after 40 s
     flushes: int = 0  # FLUSHALL
     submitters: int = 0  # pairs of submitters at once
@@ -58,7 +60,6 @@ class Outcome:
     toll: Toll
     jobs: int
     samples: int
-    races: int  # jobs that a stopped worker went on with after another one had committed them
     reads: int  # samples read and compared while it went on
     seconds: float
 
@@ -92,11 +93,14 @@ class Soak:
             for number in range(self._workers):
                 self._running.append(stack.enter_context(self._start(server, number)))
                 stack.callback(self._running[-1].kill)
+            analytic.wait_for(lambda: all(map(analytic.child_of, self._running)))  # they want a Redis to begin with
             while left := self.toll.left(wanted):
                 time.sleep(self._random.uniform(*pace_s))
                 getattr(self, f"_do_{self._random.choice(left)}")(server, long_outage_s)
                 self._keep_busy()
+                self.toll.races = self._races()
                 watcher.check()
+                assert [process.poll() for process in self._running] == [None] * self._workers
             for thread in self._stopped:
                 thread.join()
             analytic.wait_for(lambda: watcher.check() or not self.scene.missing_jobs(), 600)
@@ -107,12 +111,12 @@ class Soak:
         self._store.sweep(stray_age_s=0)
         reads = self._compare(watcher)
         samples = self.scene.progress().committed_samples
-        return Outcome(self.toll, self.scene.jobs(), samples, self._races(), reads, time.monotonic() - begun)
+        return Outcome(self.toll, self.scene.jobs(), samples, reads, time.monotonic() - begun)
 
     def _start(self, server: EmbeddedRedis, number: int) -> subprocess.Popen[bytes]:
         return analytic.start_worker(
             self._store.root, server.url, analytic.command(self._pause_s), name=f"worker-{number}",
-            heartbeat_ttl_s=HEARTBEAT_TTL_S, log=self._folder / f"worker-{number}.log",
+            heartbeat_ttl_s=HEARTBEAT_TTL_S, steady_s=STEADY_S, log=self._folder / f"worker-{number}.log",
         )  # fmt: skip
 
     def _keep_busy(self) -> None:
@@ -151,6 +155,9 @@ class Soak:
                 thread.start()
                 self._stopped.append(thread)
                 self.toll.stops += 1
+
+    def _do_races(self, *_: Any) -> None:
+        self._do_stops()
 
     def _do_redis_kills(self, server: EmbeddedRedis, long_outage_s: float) -> None:
         os.kill(server.pid, signal.SIGKILL)

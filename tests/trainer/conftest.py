@@ -178,6 +178,9 @@ class AnalyticSource:
         self._released = min(self._samples, before + self._per_look)
         return np.arange(before, self._released)
 
+    def taken_back(self) -> NDArray[np.int64]:
+        return np.zeros(0, np.int64)
+
     def modification(self, row: int) -> Modification:
         return sample_modification(self.spec, 0, row // self._views)
 

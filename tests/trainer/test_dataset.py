@@ -1,12 +1,22 @@
 """What is read, held out and kept in memory."""
 
+import time
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.check import check_store
 from photonfarm.shared.view import Camera
+from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import Compact, is_row_held_out
 from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.loop import train
+from photonfarm.trainer.store_source import StoreSource
 
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
@@ -105,3 +115,83 @@ def test_rows_are_told_as_they_arrive_and_when_all_have(make_source, tiny) -> No
             more, complete = feed.arrivals()
             rows += more
     assert [row for row, _ in rows] == list(range(10))
+
+
+@pytest.fixture
+def repaired(scene, commit):
+    """A scene of eight jobs of two samples, all committed; and what damages one and has it repaired."""
+    scene.plan(Request(modifications=4, views_per_modification=4), shard_rows=2)
+    for job in range(scene.jobs()):
+        commit(scene, job)
+
+    def repair(job: int) -> None:
+        path = next((scene.folder / "plans/000000/radiance").glob(f"c.{job}.*"))
+        path.write_bytes(path.read_bytes()[:-1])
+        check_store(Store(scene.storage.root), when="now", repair=True)
+        assert scene.missing_jobs() == [job]
+
+    return scene, repair
+
+
+def until(feed: Feed, rows: list[int], wanted: tuple[int, ...]) -> None:
+    """Ask until the feed has noticed what has become of the store."""
+    deadline = time.monotonic() + 20
+    while True:
+        feed.ask(rows)
+        if (found := feed.take().rows) == wanted:
+            return
+        assert time.monotonic() < deadline, found
+
+
+@pytest.mark.parametrize("cached", [0, 1 << 30])
+def test_rows_that_a_repair_takes_back_are_left_out_until_they_are_rendered_again(
+    repaired, commit, tiny, cached: int
+) -> None:
+    scene, repair = repaired
+    source = StoreSource(scene.storage.root, scene.scene_id)
+    with Feed(source, tiny(cache_bytes=cached)) as feed:
+        told = feed.arrivals()
+        until(feed, [0, 1, 4], (0, 1, 4))
+        repair(0)
+        until(feed, [0, 1, 4], (4,))
+        until(feed, [0, 1], ())
+        commit(scene, 0)
+        until(feed, [0, 1, 4], (0, 1, 4))
+        again, complete = feed.arrivals()
+    assert len(told[0]) == 16
+    assert [row for row, _ in again] == [0, 1, 2, 3][: len(again)]  # rows 2 and 3 show their modification
+    assert complete
+
+
+def test_a_row_taken_back_between_two_looks_at_the_store_is_left_out_as_well(repaired, tiny) -> None:
+    """The reader still believes that it is complete, and its file is gone."""
+    scene, repair = repaired
+    with Feed(StoreSource(scene.storage.root, scene.scene_id), tiny(poll_seconds=600)) as feed:
+        repair(7)
+        feed.ask([14, 0, 15])
+        assert feed.take().rows == (0,)
+
+
+def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothing(
+    repaired, commit, tiny, run: Path
+) -> None:
+    scene, repair = repaired
+    source = StoreSource(scene.storage.root, scene.scene_id)
+    settings = tiny(max_steps=60, cache_bytes=0, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
+    read = [0]
+    plain = source.read
+
+    def counted(row: int) -> Any:
+        read[0] += 1
+        if read[0] == 30:
+            repair(0)
+        if read[0] == 90:
+            commit(scene, 0)
+        return plain(row)
+
+    source.read = counted
+    assert train(source, settings, run).reason == "steps"
+    state = checkpoint.load(run / "checkpoint.pt")["following"]
+    visits = np.array(state["sampler"]["visits"])
+    assert sorted(state["arrived"]) == [*range(16)]
+    assert visits.max() - visits.min() <= 1 + 2

@@ -59,8 +59,11 @@ class SampleSource(Protocol):
     def refresh(self) -> NDArray[np.int64]:
         """The rows that became complete since the last call."""
 
+    def taken_back(self) -> NDArray[np.int64]:
+        """The rows that were complete before the last `refresh` and not after it; they become complete once more."""
+
     def read(self, row: int) -> Sample:
-        """A complete row's sample."""
+        """A complete row's sample; raises StoreError if it is not, or cannot be read."""
 
     def modification_key(self, row: int) -> Key:
         """The content key of a row's configuration."""
@@ -83,7 +86,7 @@ def is_row_held_out(source: SampleSource, row: int, share: float) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Samples as tensors; valid until the next one is taken."""
+    """Samples as tensors; valid until the next one is taken. Without those that were not complete; so it may be empty."""
 
     rows: tuple[int, ...]
     units: tuple[Key, ...]  # what each is held out by: equal for samples that are not independent

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
@@ -34,10 +35,11 @@ class HeldOut:
 
 
 def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
-    """The rows as batches, read through the feed, in their order."""
+    """The rows as batches, read through the feed, in their order; without those that are not complete any more."""
     for start in range(0, len(rows), size):
         feed.ask(rows[start : start + size])
-        yield feed.take()
+        if (batch := feed.take()).rows:
+            yield batch
 
 
 def network_predictor(network: Cnn) -> Predictor:
@@ -65,7 +67,10 @@ def constant_predictor(colour: F32) -> Predictor:
 
 
 def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
-    """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate]."""
+    """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
+
+    Raises IncompleteError if there is no sample.
+    """
     errors, floors = [], []
     units: list[Key] = []
     for batch in found:
@@ -73,6 +78,8 @@ def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
         for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
             errors.append(clean_error(image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
+    if not errors:
+        raise IncompleteError("none of the samples to measure on is complete at present; wait for the workers")
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
     return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
+from photonfarm.shared.errors import StoreError
 from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, is_row_held_out
 from photonfarm.trainer.settings import TrainSettings
@@ -17,7 +18,8 @@ from photonfarm.trainer.settings import TrainSettings
 class Feed:
     """Batches in the order they were asked for, and the rows as they arrive; a context manager.
 
-    Only its thread touches the source. Decoded samples are kept up to `cache_bytes`: the first ones stay, since every
+    Rows that are not complete when they are read, as a repair of the store may have taken them back, are left out of
+    their batch, until they have become complete again. Only its thread touches the source. Decoded samples are kept up to `cache_bytes`: the first ones stay, since every
     sample is drawn about equally often, which is where replacing the least recently used one never hits.
     """
 
@@ -34,6 +36,8 @@ class Feed:
         self._lock = threading.Lock()
         self._arrived: list[tuple[int, bool]] = []
         self._complete = False
+        self._here: set[int] = set()  # rows that are complete
+        self._gone: set[int] = set()  # rows that were
         self._error: BaseException | None = None
         points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
         pinned = settings.device.startswith("cuda")
@@ -76,7 +80,8 @@ class Feed:
     def arrivals(self) -> tuple[list[tuple[int, bool]], bool]:
         """The rows that became complete since the last call, each with whether it is held out; and whether all have.
 
-        The second is True once everything that is planned is complete. Raises what the reading raised.
+        The second is True once everything that is planned has been complete. A row that was taken back is told again
+        when it has become complete again. Raises what the reading raised.
         """
         self._raise()
         with self._lock:
@@ -98,10 +103,9 @@ class Feed:
 
     def _serve(self) -> None:
         due = self._clock()
-        seen = 0
         while True:
             if self._clock() >= due:
-                seen += self._poll(seen)
+                self._poll()
                 due = self._clock() + self._settings.poll_seconds
             try:
                 rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
@@ -110,23 +114,40 @@ class Feed:
             memory = self._free.get() if rows is not None else None
             if rows is None or memory is None:
                 return
-            samples = [self._sample(row) for row in rows]
-            for place, sample in enumerate(samples):
+            found = [(row, sample) for row in rows if (sample := self._sample(row)) is not None]
+            for place, (_, sample) in enumerate(found):
                 fill(memory, place, sample, self.spec, self.cloud)
-            self._ready.put((memory.filled(rows, tuple(sample.unit for sample in samples)), memory))
+            there, units = tuple(row for row, _ in found), tuple(sample.unit for _, sample in found)
+            self._ready.put((memory.filled(there, units), memory))
 
-    def _poll(self, seen: int) -> int:
-        rows = self._source.refresh()
-        found = [(int(row), is_row_held_out(self._source, int(row), self._settings.hold_out)) for row in rows]
+    def _poll(self) -> None:
+        rows = [int(row) for row in self._source.refresh()]
+        gone = [int(row) for row in self._source.taken_back()]
+        for row in gone:
+            if row in self._cache:
+                self._cached_bytes -= self._cache.pop(row).nbytes
+        self._here.difference_update(gone)
+        self._here.update(rows)
+        self._gone.update(gone)
+        self._gone.difference_update(rows)
+        found = [(row, is_row_held_out(self._source, row, self._settings.hold_out)) for row in rows]
         with self._lock:
             self._arrived.extend(found)
-            self._complete = 0 < self._source.planned() <= seen + len(rows)
+            self._complete = 0 < self._source.planned() <= len(self._here) + len(self._gone)
         self._polled.set()
-        return len(rows)
 
-    def _sample(self, row: int) -> Compact:
-        if row in self._cache:
-            return self._cache[row]
+    def _sample(self, row: int) -> Compact | None:
+        """The sample of a row; None while it is not complete."""
+        if row in self._here and row not in self._cache:
+            try:
+                return self._read(row)
+            except StoreError:
+                self._poll()  # a repair may have set it aside since the last time, and a worker have rendered it again
+                if row in self._here:
+                    return self._read(row)
+        return self._cache.get(row)
+
+    def _read(self, row: int) -> Compact:
         sample = Compact.of(self._source.read(row), self.spec)
         if self._cached_bytes + sample.nbytes <= self._settings.cache_bytes:
             self._cache[row] = sample

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -101,10 +101,18 @@ class Following:
             self.drawn += 1
         return bool(self._asked)
 
-    def take(self) -> Batch:
-        """The next batch drawn, read."""
+    def take(self) -> Batch | None:
+        """The next batch drawn, read; draws of rows that are not complete any more do not count.
+
+        None if there is no row left in it: it is asked for once more, as the last one.
+        """
         batch = self._feed.take()
-        self._asked.popleft()
+        rows = self._asked.popleft()
+        if not batch.rows:
+            self._asked.append(rows)
+            self._feed.ask(rows)
+            return None
+        self._sampler.put_back((Counter(rows) - Counter(batch.rows)).elements())
         return batch
 
     def drop(self) -> None:

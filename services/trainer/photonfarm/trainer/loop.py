@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import SampleSource
+from photonfarm.trainer.dataset import Batch, SampleSource
 from photonfarm.trainer.evaluation import batches, measure, network_predictor
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.following import Following, Growth
@@ -27,6 +27,8 @@ from photonfarm.trainer.metrics_log import MetricsLog
 from photonfarm.trainer.model import SceneFrame, build, usable_device
 from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import TrainSettings
+
+T = TypeVar("T")
 
 CHECKPOINT = "checkpoint.pt"
 INITIAL = "initial.pt"
@@ -126,8 +128,8 @@ class Session:
         while (reason := self._ended()) is None:
             if self._step % self._settings.validate_every == 0 and self._wait(self._can_validate):
                 self._validate()
-            if self._wait(lambda: self._following.draw_ahead(self._settings.max_steps)):
-                self._train_step()
+            if (batch := self._wait(self._next_batch)) is not None:
+                self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
         if reason != "stopped" and self._following.held_out:
@@ -195,14 +197,20 @@ class Session:
         finally:
             self._seconds[what] += self._clock() - began
 
-    def _wait(self, ready: Callable[[], bool]) -> bool:
-        """Wait for data until `ready`, or until training has ended; whether it is ready."""
-        while not ready():
+    def _wait(self, look: Callable[[], T | None]) -> T | None:
+        """Wait for data until `look` finds something, and return it; None once training has ended."""
+        while not (found := look()):
             if self._ended() is not None:
-                return False
+                return None
             with self._timed("wait_data"):
                 self._stop.wait(NAP_SECONDS)
-        return True
+        return found
+
+    def _next_batch(self) -> Batch | None:
+        if not self._following.draw_ahead(self._settings.max_steps):
+            return None
+        with self._timed("wait_read"):
+            return self._following.take()
 
     def _can_validate(self) -> bool:
         self._following.look()
@@ -224,8 +232,13 @@ class Session:
         rows = self._following.held_out[: self._settings.validation_samples]
         with self._timed("validate"):
             self._following.drop()
-            held_out = measure(network_predictor(self._network), batches(self._feed, rows, self._settings.batch))
-            self._following.ask_again()
+            found = batches(self._feed, rows, self._settings.batch)
+            try:
+                held_out = measure(network_predictor(self._network), found)
+            except IncompleteError:  # a repair has taken all of them back, for now
+                return
+            finally:
+                self._following.ask_again()
         self._last_error = held_out.error.mean
         self._log.write(
             "validation",
@@ -233,7 +246,7 @@ class Session:
             error=held_out.error.mean,
             standard_error=held_out.error.standard_error,
             noise_floor=held_out.floor,
-            held_out=len(rows),
+            held_out=len(held_out.per_sample),
             **self._counts(),
         )
 
@@ -242,10 +255,8 @@ class Session:
         samples = len(self._following.growth.rows)
         return {"draws": draws, "samples": samples, "seconds": {k: round(v, 3) for k, v in self._seconds.items()}}
 
-    def _train_step(self) -> None:
-        """One step of Adam on the next batch [supplement 3.1]."""
-        with self._timed("wait_read"):
-            batch = self._following.take()
+    def _train_step(self, batch: Batch) -> None:
+        """One step of Adam [supplement 3.1]."""
         with self._timed("train"):
             rate = self._rate()
             for group in self._optimiser.param_groups:

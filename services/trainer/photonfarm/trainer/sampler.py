@@ -60,6 +60,11 @@ class RoundSampler:
         self._deck.extendleft(reversed(passed))
         return tuple(self.rows[place] for place in chosen)
 
+    def put_back(self, rows: Iterable[int]) -> None:
+        """Draws that came to nothing: these rows are behind by as much."""
+        for row in rows:
+            self._visits[self.rows.index(row)] -= 1
+
     def state(self) -> dict[str, Any]:
         """All that draws depend on besides the seed; plain lists and numbers."""
         return {

@@ -36,6 +36,10 @@ class StoreSource:
         """The rows that became complete since the last call."""
         return self._reader.refresh()
 
+    def taken_back(self) -> NDArray[np.int64]:
+        """The rows that were complete before the last `refresh` and not after it: a repair has set their jobs aside."""
+        return self._reader.taken_back
+
     def read(self, row: int) -> Sample:
         """A complete row's sample; raises CorruptError if its bytes are not what was committed."""
         return self._reader.read(row)

@@ -11,6 +11,7 @@ import queue
 import threading
 from collections.abc import Mapping, Set
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 
 WAITING_ROWS = 8
 """Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
+
+
+ATTEMPTS = 3
+"""At a commit among others that change the job's files; a second one takes two of them at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,32 +150,91 @@ class JobWriter:
         """Make the rows part of the store, all or nothing; False if another worker's commit came first.
 
         Files that another writer left are kept where every row of the job can be read from them and ours, and are
-        replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given.
+        replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError
+        if others go on changing the files meanwhile.
+
+        Who meets files of others may meet those at work too: a repair, which has taken the marker back, and goes on to
+        move the files, and a writer that replaces what it cannot read. Each acts first and looks then, so that one of
+        two sees the other: a repair looks for a new marker once it has moved the files, and we compare marker and files
+        once the marker is placed.
         """
         self._check_complete()
         self._join()
         self._raise_error()
         with self._errors():
-            files = {name: shard.finish() for name, shard in self._shards.items()}
-            if self._scene.is_committed(self._rows.job):
-                return False
-            kept = [name for name in files if not self._adopt(name)]
-            if kept and not self._is_readable():
-                # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
+            ours = {name: shard.finish() for name, shard in self._shards.items()}
+            for _ in range(ATTEMPTS):
                 if self._scene.is_committed(self._rows.job):
                     return False
-                for name in kept:
-                    self._adopt(name, replace=True)
-                self._check_readable()
-                kept = []
-            others = [name for name in self._arrays if name not in files and self._storage.exists(self._file(name))]
-            files |= {name: self._shard(name).summary() for name in [*kept, *others]}
-            described = {self._file(name): about for name, about in files.items()}
-            self._storage.settle(described)
-            return markers.place(self._storage, self._scene.name, self._rows.job, described, asdict(figures))
+                alone = self._adopt_all()
+                if alone is None:
+                    return False
+                described = ours if alone else self._summaries()
+                self._storage.settle([self._file(name) for name in described])
+                if not alone and not (self._is_readable() and self._summaries() == described):
+                    continue
+                placed = self._place(described, figures)
+                if alone or self._is_marker_right():
+                    return placed
+            raise CorruptError(
+                f"{self._storage.where}/{self._scene.name}: the files of job {self._rows.job} change while it is "
+                "committed, by a repair or another worker; it is not committed"
+            )
+
+    def _adopt_all(self) -> bool | None:
+        """Have every row of the job lie under its names; whether all files are ours. None if the job is committed."""
+        left = [name for name, shard in self._shards.items() if shard.part.exists()]
+        kept = [name for name in left if not self._adopt(name)]
+        others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
+        if not kept and not others and len(left) == len(self._shards):
+            return True
+        if not self._is_readable():
+            # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
+            if self._scene.is_committed(self._rows.job):
+                return None
+            for name in kept:
+                self._adopt(name, replace=True)
+            self._check_readable()
+        return False
 
     def _adopt(self, name: str, *, replace: bool = False) -> bool:
         return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
+
+    def _summaries(self) -> dict[str, dict[str, Any]]:
+        """Size and checksum of the files that are there, by array; none of those that cannot be read."""
+        found = {}
+        for name in self._arrays:
+            if self._storage.exists(self._file(name)):
+                with contextlib.suppress(CorruptError):  # moved in the meantime
+                    found[name] = self._shard(name).summary()
+        return found
+
+    def _place(self, described: Mapping[str, Mapping[str, Any]], figures: Figures) -> bool:
+        files = {self._file(name): about for name, about in described.items()}
+        return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
+
+    def _is_marker_right(self) -> bool:
+        """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside."""
+        name = markers.name_of(self._scene.name, self._rows.job)
+        try:
+            marker = self._storage.read(name)
+        except FileNotFoundError:  # a repair has seen it first
+            return False
+        told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
+        there = self._summaries()
+        if all(_is_told(told.get(self._plan_file(name)), there.get(name)) for name in self._arrays):
+            return True
+        from photonfarm.shared.store.findings import Cause, Finding
+        from photonfarm.shared.store.quarantine import Quarantine
+
+        detail = "files were moved or replaced while the job was committed; those that are there stay"
+        why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
+        when = datetime.now(UTC).isoformat(timespec="seconds")
+        Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
+        return False
+
+    def _plan_file(self, name: str) -> str:
+        return self._file(name).removeprefix(f"{self._scene.name}/")
 
     def _check_complete(self) -> None:
         expected = {
@@ -215,6 +279,11 @@ class JobWriter:
         if missing and not may_be_missing:
             raise CorruptError(f"{shard.path}: row {min(missing)} is missing")
         return missing
+
+
+def _is_told(told: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
+    """Whether a marker says of a file what it is: size and checksum, or that there is none."""
+    return told == there if told is None or there is None else all(told[key] == there[key] for key in there)
 
 
 def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:

@@ -76,10 +76,11 @@ class JobCheck:
             yield self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
             return
         try:
-            files = marker_files(marker, scene.name, job)
+            named = marker_files(marker, scene.name, job)
         except CorruptError as error:
             yield self._finding(Cause.MARKER, job, _said(error), name)
             return
+        files = {file: about for file, about in named.items() if _array_of(file) in self._arrays}  # others may be added
         self._tally.jobs += 1
         shards: dict[str, Shard] = {}
         for file, about in files.items():
@@ -94,10 +95,7 @@ class JobCheck:
 
     def _open(self, job: int, file: str, about: dict[str, Any], shards: dict[str, Shard]) -> Iterator[Finding]:
         """Open a file that the marker names, by its array, and compare it with what the marker tells."""
-        array = self._arrays.get(_array_of(file))
-        if array is None:
-            yield self._finding(Cause.MARKER, job, "the marker names it, and the scene has no such array", file)
-            return
+        array = self._arrays[_array_of(file)]
         try:
             size = self._scene.storage.size(file)
         except FileNotFoundError:

@@ -86,10 +86,9 @@ class PlanCheck:
             array = group[name]
             if rows is not None and array.shape[0] != rows:
                 return f"has {array.shape[0]} rows; the plan has {rows}"
-            held = set(self._storage.names(f"{folder}/{name}"))
-            if missing := [key for key in _chunk_names(array) if key not in held]:
-                return f"chunk {missing[0]} is missing"
-            values = np.asarray(array[...])
+            values = schema.read_input(self._storage, f"{folder}/{name}", array)
+        except CorruptError as error:
+            return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
         except _UNREADABLE as error:
             return f"cannot be read: {error}"
         return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
@@ -162,14 +161,6 @@ class PlanCheck:
         yield from found
         if not found and (detail := _base_references(*read_base(self._storage, self._scene), len(self._spec.groups))):
             yield Finding(Cause.BASE, detail, self._id, file=folder)
-
-
-def _chunk_names(array: Any) -> Iterator[str]:
-    """The file names of all chunks of an array of one file each."""
-    if array.size:
-        grid = [-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True)]
-        for index in np.ndindex(*grid):
-            yield ".".join(["c", *map(str, index)])
 
 
 def _declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:

@@ -134,17 +134,14 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     name = folder(scene, number)
     try:
         group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-        rows = PlannedRows(**{field.name: _whole(group, field.name) for field in fields(PlannedRows)})
+        names = [field.name for field in fields(PlannedRows)]
+        rows = PlannedRows(**{each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in names})
         about: dict[str, Any] = dict(group.attrs)
         request = _REQUEST.validate_python(about["request"], extra="ignore")  # of a later program
         first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
     except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}") from error
     return StoredPlan(number, name, request, first_job, jobs, shard_rows, rows)
-
-
-def _whole(group: Any, name: str) -> Any:
-    return np.asarray(group[name][...])
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

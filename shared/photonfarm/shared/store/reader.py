@@ -62,6 +62,7 @@ class SceneReader:
         self._plans: list[StoredPlan] = []
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
+        self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found complete no longer: a repair
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards = _OpenShards()
 
@@ -94,6 +95,7 @@ class SceneReader:
 
         Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
         """
+        self.taken_back = np.zeros(0, np.int64)
         if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
             if self._storage.exists(FORMAT_FILE):
                 check_format(self._storage)
@@ -109,6 +111,7 @@ class SceneReader:
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
+        self.taken_back = np.flatnonzero(before & ~complete)
         return np.flatnonzero(complete & ~before)
 
     def _load_plans(self) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.shared.errors import CorruptError, SpecError, StoreError
@@ -204,8 +205,12 @@ def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
         raise StoreError(f"{storage.where}/{scene}: its base is not there yet; the first job of the scene writes it")
     try:
         root: Any = zarr.open_group(storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
-        geometry = Geometry(**{f.name: np.asarray(root["geometry"][f.name][...]) for f in fields(Geometry)})
-        cloud = BasePointCloud(**{f.name: np.asarray(root["cloud"][f.name][...]) for f in fields(BasePointCloud)})
+
+        def whole(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
+            names = [field.name for field in fields(record)]
+            return {name: schema.read_input(storage, f"{folder}/{part}/{name}", root[part][name]) for name in names}
+
+        geometry, cloud = Geometry(**whole("geometry", Geometry)), BasePointCloud(**whole("cloud", BasePointCloud))
     except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
         raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {error}") from error
     return geometry, cloud

@@ -9,18 +9,21 @@ in every chain, since Blosc alone lets flipped bits through.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store.declarations import OUTPUTS, Declared
 
 if TYPE_CHECKING:
     import zarr
+
+    from photonfarm.shared.store.storage import Storage
 
 Kind = Literal["sample", "view", "modification"]
 
@@ -108,6 +111,26 @@ def create_input(group: zarr.Group, declared: Declared, data: NDArray[Any]) -> N
     )
     if data.size:
         array[...] = little
+
+
+def chunk_names(array: Any) -> Iterator[str]:
+    """The file names of all chunks of an array of inputs or of the base, in the array's folder."""
+    if array.size:
+        grid = [-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True)]
+        for index in np.ndindex(*grid):
+            yield ".".join(["c", *map(str, index)])
+
+
+def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
+    """One whole array of inputs or of the base, which lies in a folder.
+
+    Raises CorruptError for a chunk that is missing, which zarr reads as fill values, and what zarr raises for others.
+    """
+    held = set(storage.names(folder))
+    for name in chunk_names(array):
+        if name not in held:
+            raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
+    return np.asarray(array[...])
 
 
 _FLAT: Any = {"name": "default", "configuration": {"separator": "."}}  # c.0.0 in one folder, which is synced once

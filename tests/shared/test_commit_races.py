@@ -1,0 +1,126 @@
+"""A commit among others that change the job's files meanwhile: what is announced is what is there."""
+
+import importlib.util
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
+from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.local import LocalStorage
+from photonfarm.shared.store.quarantine import Quarantine
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneStore:
+    """A committed job of 4 samples, and the base."""
+    store = Store(tmp_path / "store", create=True)
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=4), shard_rows=4).scene_id)
+    samples.commit_all(scene)
+    scene.write_base(*samples.base())
+    return scene
+
+
+def whole(scene: SceneStore) -> None:
+    """The job is committed, and its marker tells what is there."""
+    assert scene.missing_jobs() == []
+    root = scene.storage.root
+    (report,) = check_store(Store(root), when="now").scenes
+    assert [g for g in report.groups if g.cause.remedy.name != "LOOK" and g.cause.label != "equal-samples"] == []
+
+
+class SlowRepair:
+    """A repair of job 0 in a thread, which waits once it has moved the marker."""
+
+    def __init__(self, scene: SceneStore) -> None:
+        self._moved, self._go_on = threading.Event(), threading.Event()
+        storage = LocalStorage(scene.storage.root)
+        move = storage.move
+
+        def slow(name: str, new_name: str) -> None:
+            if "/plans/" in name:
+                self._moved.set()
+                assert self._go_on.wait(20)
+            move(name, new_name)
+
+        storage.move = slow
+        files = [f"{scene.name}/{name}" for name in scene.marker(0)["files"]]
+        content = storage.read(markers.name_of(scene.name, 0))
+        work = lambda: Quarantine(storage, "now").job(scene.name, 0, content, files, [])  # noqa: E731
+        self._thread = threading.Thread(target=work)
+        self._thread.start()
+        assert self._moved.wait(20)
+
+    def end(self) -> None:
+        self._go_on.set()
+        self._thread.join()
+
+
+def before(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, work: Callable[[], None]) -> None:
+    """Do some work before the first call of a function."""
+    plain, left = getattr(owner, name), iter([work])
+
+    def changed(*args: Any, **kwargs: Any) -> Any:
+        for each in left:
+            each()
+        return plain(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, changed)
+
+
+@pytest.mark.parametrize("when", ["settle", "place"])
+def test_a_commit_that_kept_files_which_a_repair_then_moves_places_its_own(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """Before the writer has looked again, and after that, just before its marker is placed."""
+    repair = SlowRepair(scene)
+    before(monkeypatch, *((scene.storage, "settle") if when == "settle" else (markers, "place")), repair.end)
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    whole(scene)
+
+
+@pytest.mark.parametrize("theirs", ["before", "after"])
+def test_two_writers_of_which_one_replaces_what_the_other_kept_announce_what_is_there(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch, theirs: str
+) -> None:
+    """One finds a file damaged, and the other commits, with other values, before that is replaced, or after."""
+    (scene.storage.root / markers.name_of(scene.name, 0)).unlink()
+    damaged = next((scene.folder / "plans/000000/radiance").glob("c.0.*"))
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    ours = samples.outputs(scene, 0)
+    other = replace(ours, radiance={row: values + 1 for row, values in ours.radiance.items()})
+    another = Store(scene.storage.root).scene(scene.scene_id)
+    adopt, left = scene.storage.adopt, iter([None])
+
+    def meanwhile(part: Path, name: str, *, replace: bool = False) -> bool:
+        for _ in left if replace and theirs == "before" else ():
+            assert samples.commit(another, 0, other)
+        return adopt(part, name, replace=replace)
+
+    monkeypatch.setattr(scene.storage, "adopt", meanwhile)
+    if theirs == "after":
+        before(monkeypatch, markers, "place", lambda: samples.commit(another, 0, other))
+    samples.commit(scene, 0, ours)
+    whole(scene)
+    reader = SceneReader(scene.storage.root, scene.scene_id)
+    for row in reader.refresh().tolist():
+        np.testing.assert_array_equal(reader.read(row).radiance, ours.radiance[row])
+
+
+def test_a_commit_that_meets_nobody_reads_nothing_back(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene.plan(Request(modifications=8))
+    local = scene.storage.local
+    read: list[str] = []
+    monkeypatch.setattr(scene.storage, "local", lambda name: read.append(name) or local(name))
+    assert samples.commit(scene, 1, samples.outputs(scene, 1))
+    assert read == []

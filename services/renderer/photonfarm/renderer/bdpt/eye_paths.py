@@ -65,7 +65,7 @@ def trace_eye_paths(
     """(radiance: Spectrum, whether the first ray hit anything: Bool) of the eye paths that begin with ``start``."""
     n = dr.width(start.ray)
     active = dr.full(mi.Bool, options.max_depth > 0, n)
-    # Neighbouring lanes are samples of one pixel, so that Embree may trace them as a bundle
+    # Neighbouring lanes are neighbouring pixels, so that Embree may trace them as a bundle
     arrival = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     reached = arrival.is_valid()
     state = EyeState(
@@ -219,7 +219,7 @@ def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own:
 
     The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
     Where there are more light paths than eye paths, the eye paths are joined to ones spread over all of them, since
-    neighbouring light paths start alike.
+    neighbouring light paths start alike; the shift is uniform over all, so that any spread is right.
     """
     spread = mi.UInt32(mi.Float64(connectable.lane) * dr.maximum(mi.Float64(options.light_ratio), 1))
     later = (options.connections + 1) // 2

@@ -103,7 +103,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def render_seeds(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Any:
         """Independent images of one view (TensorXf [K, H, W, 3]), one for each seed; small ones in one launch.
 
-        Each is the image that ``render`` gives for its seed, bit by bit on one thread. Raises as ``render`` does.
+        Each is the image that ``render`` gives for its seed: bit by bit on one thread where an image's samples and its
+        light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
+        ``render`` does.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
@@ -131,7 +133,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
-        clipping = (sensor.near_clip(), sensor.far_clip()) if options.traces_light else ()
+        clipping = (sensor.near_clip(), sensor.far_clip())
         kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping)
         return self._recorder(kind, scene, sensor, lights, options, lanes)
 

@@ -170,9 +170,8 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
     start = primary_rays(sensor, rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
-        connectable = Connectable(
-            vertices, seen, lanes.counts[2], image, sample * lanes.counts[0] + pixel, lanes.shifts
-        )
+        first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
+        connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     images = Images.black(lanes.images * lanes.pixels)
@@ -183,6 +182,15 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
     images.radiance += splats
     dr.eval(images)
     return images
+
+
+def spread(lane: Any, light_ratio: Any) -> Any:
+    """The light path (UInt32) that an image's eye path of a number is joined to, but for the shift.
+
+    That number, but where there are more light paths than eye paths: there the eye paths take ones from all over, since
+    neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.
+    """
+    return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
 
 def connection_count(connections: int, max_depth: int) -> float:

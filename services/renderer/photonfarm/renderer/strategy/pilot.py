@@ -297,6 +297,8 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
     else:
         share = plus_minus(chosen.relative_cost, chosen.spread)
         reasons.append(f"{best} is best: it reaches the error of {PLAIN} in {share} of the time")
+    if alike := [str(row.candidate) for row in rows if row is not chosen and _is_alike(row, chosen)]:
+        reasons.append(f"not to be told from it, within two standard errors: {', '.join(alike)}")
     reasons += [
         f"{row.candidate} misses light that others find: {row.missed / row.error:.0%} of its error is inferred from "
         "that, and the true one may be larger"
@@ -309,6 +311,16 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
             f"about {shared:.2g} to the relMSE of an image, which is {chosen.error:.2g} without them"
         )
     return tuple(reasons)
+
+
+def _is_alike(row: Measured, chosen: Measured) -> bool:
+    """Whether the costs of two candidates differ by less than twice the standard error of their difference.
+
+    Those of both are taken as independent, which overstates it.
+    """
+    if row.spread is None or chosen.spread is None:
+        return False
+    return row.relative_cost - chosen.relative_cost < 2 * math.hypot(row.spread, chosen.spread)
 
 
 def plus_minus(value: float, spread: float | None) -> str:

@@ -22,7 +22,7 @@ need() {
   fi
 }
 
-has_library() { ldconfig -p | grep -q "$1"; }
+has_library() { PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep "$1" >/dev/null; }  # -q would end ldconfig by SIGPIPE
 has_llvm() { [ -e "${DRJIT_LIBLLVM_PATH:-/nonexistent}" ] || has_library 'libLLVM[.-]\(so\.\)\?\(19\|22\)'; }
 
 command -v "$python" >/dev/null || need python3 false

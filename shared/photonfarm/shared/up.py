@@ -64,6 +64,8 @@ def run_farm(
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        rows = Store(store).scene(planned.scene_id).plans()[0].shard_rows
+        console.print(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}

@@ -255,3 +255,16 @@ def test_what_cannot_be_recorded_is_rendered_all_the_same() -> None:
     for seed in range(3):
         images = [np.array(it.render(scene, sensor=0, seed=seed, spp=2)) for it in (recorded, traced)]
         np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize(("connections", "ratio"), [(0, 0.0), (1, 1.0)])
+def test_a_recording_does_not_outlive_the_clipping_planes_that_it_was_made_with(connections: int, ratio: float) -> None:
+    scene = mi.load_dict(HARD_SCENES["cornell"](16), optimize=False)
+    settings = {"type": "bdpt", "max_depth": 4, "connections": connections, "light_ratio": ratio}
+    recorded, traced = (mi.load_dict({**settings, "record": record}) for record in (True, False))
+    edited = mi.traverse(scene)
+    for far in (100.0, 100.0, 4.0, 4.0):
+        edited["sensor.far_clip"] = far
+        edited.update()
+        images = [np.array(it.render(scene, sensor=0, seed=3, spp=2)) for it in (recorded, traced)]
+        np.testing.assert_array_equal(*images)

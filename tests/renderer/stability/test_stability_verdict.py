@@ -11,7 +11,7 @@ import pytest
 from photonfarm.renderer.stability import runner
 from photonfarm.renderer.stability.case import FIRST, QUICK, Settings
 from photonfarm.renderer.stability.rows import SCENES
-from photonfarm.renderer.stability.runner import Outcome, compare, run
+from photonfarm.renderer.stability.runner import Outcome, compare, run, seen_bias
 from photonfarm.renderer.stability.truths import rendered
 
 
@@ -39,6 +39,18 @@ def test_a_dark_block_is_found_between_renders() -> None:
     assert compare(a, b, 4).passed
     a[:, :4, :4] *= 0.9
     assert not compare(a, b, 4).passed
+
+
+def test_what_would_be_seen_is_what_fails() -> None:
+    truth = np.ones((1, 16, 16, 3))
+    images = noisy(1.0, 0.5, 1)
+    seen = seen_bias(images, truth, 1)
+    offset = images.mean() - 1
+    assert 0.01 < seen < 0.2
+    assert compare(images - offset + 0.7 * seen, truth, 1).passed
+    assert not compare(images - offset + 3 * seen, truth, 1).passed  # few seeds: Student's t is wider than the normal
+    truth[:, :4, :4] = 0
+    assert np.isfinite(seen_bias(images, truth, 4)), "black blocks are left out"
 
 
 def test_differences_of_rounding_pass() -> None:

@@ -109,6 +109,45 @@ def test_light_that_a_candidate_is_too_unlikely_to_find_counts_against_it(seed: 
     assert plain.missed < 1 / odds[PLAIN] * 64 / 1024
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cheap_candidate_that_misses_light_is_watched_until_the_time_is_up(seed: int) -> None:
+    """Of 16 pixels' light that only light paths find, a few images of plain path tracing tell little."""
+    clock = Clock()
+
+    def view(number: int) -> Render:
+        def render(candidate: Candidate, seed: int, spp: int) -> Any:
+            clock.now += 0.01 if candidate == PLAIN else 0.03
+            rng = np.random.default_rng([seed, number, CANDIDATES.index(candidate)])
+            image = rng.gamma(4, 0.25, SHAPE[:2])
+            if candidate != PLAIN:
+                image += np.kron(rng.normal(0, 0.15 / 4, (4, 4)), np.ones((8, 8)))
+                image[8:12, 8:12] += rng.gamma(1, 1, (4, 4))
+            return np.repeat(image[..., None], 3, -1).astype(np.float32)
+
+        return render
+
+    choice = choose(
+        list(map(view, range(8))), CANDIDATES, seconds=60, spp=1, seed=1000 * seed, keep=[LIGHT], clock=clock
+    )
+    assert choice.candidate != PLAIN
+
+
+def test_the_spread_holds_how_much_the_views_differ() -> None:
+    """Where light paths are twice as good in half of the views and half as good in the others, 8 views tell little."""
+    clock, ratios, spreads = Clock(), [], []
+    good = {PLAIN: 0.5, LIGHT: 0.05, JOINED: 0.5}
+    bad = {PLAIN: 0.5, LIGHT: 0.5, JOINED: 0.5}
+    rng = np.random.default_rng(0)
+    for seed in range(40):
+        views = [
+            gamma_noise(good if rng.random() < 0.5 else bad, dict.fromkeys(CANDIDATES, 0.01), clock) for _ in range(8)
+        ]
+        row = choose(views, CANDIDATES, seconds=clock.now + 8, spp=4, seed=1000 * seed, clock=clock).row(LIGHT)
+        ratios.append(row.relative_cost)
+        spreads.append(row.spread or 0)
+    assert 0.6 < np.mean(spreads) / np.std(ratios) < 1.6
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_among_equal_candidates_nobody_is_charged(seed: int) -> None:
     clock = Clock()

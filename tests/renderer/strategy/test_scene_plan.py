@@ -13,7 +13,7 @@ backend.load(threads=1)
 from photonfarm.renderer.strategy import cache  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.measurement import GRID, Measurement, Row  # noqa: E402
 from photonfarm.renderer.strategy.pilot import PLAIN, Candidate, plus_minus  # noqa: E402
-from photonfarm.renderer.strategy.plan import plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.printed import lines  # noqa: E402
 from photonfarm.shared.cli import main  # noqa: E402
 from photonfarm.shared.scene import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
@@ -82,6 +82,11 @@ def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() 
     richer = spec_with(half_spp=3, connections=0, light_ratio=0.0)
     plan = plan_of(richer, measurement(Candidate(0, 1.0)), cached=False)
     assert (plan.candidate, plan.half_spp) == (Candidate(0, 1.0), 1)
+
+
+@pytest.mark.parametrize(("half_spp", "known"), [(1, True), (2, True), (8, True), (9, False), (256, False)])
+def test_a_measurement_holds_for_about_the_samples_that_it_was_made_for(half_spp: int, known: bool) -> None:
+    assert _knows(measurement(PLAIN), spec_with(half_spp=half_spp)) == known
 
 
 def test_savings_are_ratios_of_time_to_equal_error() -> None:

@@ -97,7 +97,12 @@ def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
 
 @click.command()
 @click.argument("spec")
-@click.option("--seconds", type=click.IntRange(1, 86400), show_default="60, or what is kept", help="CPU time.")
+@click.option(
+    "--seconds",
+    type=click.IntRange(1, 86400),
+    show_default="60",
+    help="CPU time of the measurement, loading and compiling apart; one that is kept counts if not shorter.",
+)
 @click.option("--write", is_flag=True, help="Put the settings into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option

@@ -49,7 +49,7 @@ class Connectable:
     seen: Any  # UInt32: number each was drawn from
     paths: Any  # UInt32, 1: how many there are for each image
     image: Any  # UInt32: image of the launch that a lane belongs to
-    lane: Any  # UInt32: lane's number within its image
+    first: Any  # UInt32: the light path of its image that a lane is joined to, but for the shift
     shifts: Any  # UInt32: see randomness.shifts
 
 
@@ -65,7 +65,7 @@ def trace_eye_paths(
     """(radiance: Spectrum, whether the first ray hit anything: Bool) of the eye paths that begin with ``start``."""
     n = dr.width(start.ray)
     active = dr.full(mi.Bool, options.max_depth > 0, n)
-    # Neighbouring lanes are samples of one pixel, so that Embree may trace them as a bundle
+    # Neighbouring lanes are neighbouring pixels, so that Embree may trace them as a bundle
     arrival = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     reached = arrival.is_valid()
     state = EyeState(
@@ -218,10 +218,7 @@ def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own:
     """Mean over connections to kept vertices of other light paths, as radiance (Spectrum).
 
     The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
-    Where there are more light paths than eye paths, the eye paths are joined to ones spread over all of them, since
-    neighbouring light paths start alike.
     """
-    spread = mi.UInt32(mi.Float64(connectable.lane) * dr.maximum(mi.Float64(options.light_ratio), 1))
     later = (options.connections + 1) // 2
     near = own.depth <= _NEAR_VERTICES
     total = mi.Spectrum(0)
@@ -229,7 +226,7 @@ def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own:
         row = connectable.image * SHIFTS + own.depth % SHIFTS
         active = own.active if k < later else own.active & near
         shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
-        path = connectable.image * connectable.paths + (spread + shift) % connectable.paths
+        path = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
         total += _connect(scene, options, connectable, replace(own, active=active), path)
     return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
 

@@ -103,7 +103,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def render_seeds(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Any:
         """Independent images of one view (TensorXf [K, H, W, 3]), one for each seed; small ones in one launch.
 
-        Each is the image that ``render`` gives for its seed, bit by bit on one thread. Raises as ``render`` does.
+        Each is the image that ``render`` gives for its seed: bit by bit on one thread where an image's samples and its
+        light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
+        ``render`` does.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
@@ -131,7 +133,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
-        clipping = (sensor.near_clip(), sensor.far_clip()) if options.traces_light else ()
+        clipping = (sensor.near_clip(), sensor.far_clip())
         kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping)
         return self._recorder(kind, scene, sensor, lights, options, lanes)
 
@@ -168,9 +170,8 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
     start = primary_rays(sensor, rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
-        connectable = Connectable(
-            vertices, seen, lanes.counts[2], image, sample * lanes.counts[0] + pixel, lanes.shifts
-        )
+        first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
+        connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     images = Images.black(lanes.images * lanes.pixels)
@@ -181,6 +182,15 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
     images.radiance += splats
     dr.eval(images)
     return images
+
+
+def spread(lane: Any, light_ratio: Any) -> Any:
+    """The light path (UInt32) that an image's eye path of a number is joined to, but for the shift.
+
+    That number, but where there are more light paths than eye paths: there the eye paths take ones from all over, since
+    neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.
+    """
+    return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
 
 def connection_count(connections: int, max_depth: int) -> float:

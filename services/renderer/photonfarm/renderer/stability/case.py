@@ -31,7 +31,7 @@ class Settings:
 
 FIRST = Settings(1, 1.0)
 """What the quick version tries."""
-ALL = (FIRST, Settings(0, 0.0), Settings(0, 1.0), Settings(4, 0.25))
+ALL = (FIRST, Settings(0, 0.0), Settings(0, 1.0), Settings(4, 0.25), Settings(1, 1.5))
 """What the long version tries; each is complete where paths from the eye find everything."""
 EYE_ALONE = (Settings(0, 0.0),)
 """A path tracer: what is left where nothing can be done from the light side."""

@@ -113,8 +113,9 @@ def as_json(report: Report, command: str) -> str:
 # ------------------------------------------------ Markdown ------------------------------------------------
 
 _HEAD = (
-    "| row | scene | truth | settings | z max (limit) | mean ratio | max/mean (truth) | NaN, inf | CPU s | verdict |\n"
-    "|---|---|---|---|---|---|---|---|---|---|"
+    "| row | scene | truth | settings | z max (limit) | mean ratio | would see | max/mean (truth) | NaN, inf | CPU s "
+    "| verdict |\n"
+    "|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -144,8 +145,10 @@ _RULE = (
     "farthest from 1 in standard errors, the brightest pixel of any render over the mean. A scene passes if no value "
     "is NaN or infinite, no |z| exceeds its limit (Šidák over the blocks; a right scene fails by chance with "
     f"probability {SIGNIFICANCE:g} per settings), and the ratio's standard error is small enough for the test to mean "
-    f"something (the bound is in brackets). In z, a standard error below {ROUNDING:.2%} of the mean counts as "
-    f"{ROUNDING:.2%}, since Mitsuba's ray offsets and float32 sums are no more exact (in row 1 `path` itself is off by "
+    "something (the bound is in brackets). **Would see**: the bias, as part of the mean, from which on the image "
+    "fails, and that of its worst block, which is large where little light, or light seldom, comes to a block. In z, a "
+    f"standard error below {ROUNDING:.2%} of the mean counts as {ROUNDING:.2%}, since Mitsuba's ray offsets and "
+    "float32 sums are no more exact (in row 1 `path` itself is off by "
     f"0.07%): no difference below {two_sided_limit(SIGNIFICANCE) * ROUNDING:.3%} fails, however little noise there is. "
     "Each settings by itself: stability.json."
 )
@@ -170,7 +173,7 @@ def _line(results: list[Result]) -> str:
     first = results[0]
     if first.z_limit is None:
         said = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
-        return f"{said} | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
+        return f"{said} | – | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
     z = max((r.z_max or 0.0) for r in results)
     furthest = max(results, key=_deviation)
     brightest = max((r.max_over_mean or 0.0) for r in results)
@@ -178,9 +181,15 @@ def _line(results: list[Result]) -> str:
     return (
         f"| {first.row} | {first.name} | {first.truth} | {' · '.join(r.settings for r in results)} "
         f"| {z:.2f} ({first.z_limit or 0:.2f}) | {_ratio(furthest)} "
+        f"| {_seen([r.seen_bias for r in results])}, {_seen([r.seen_block_bias for r in results])} "
         f"| {brightest:.3g} ({first.truth_max_over_mean or 0:.3g}) | {sum(r.nan for r in results)}, "
         f"{sum(r.inf for r in results)} | {sum(r.cpu_s for r in results):.1f} | {verdict} |"
     )
+
+
+def _seen(biases: Sequence[float | None]) -> str:
+    """The worst of some biases that would be seen."""
+    return "unknown" if None in biases else f"{max(bias for bias in biases if bias is not None):.2g}"
 
 
 def _deviation(result: Result) -> float:

@@ -48,6 +48,8 @@ class Result:
     mean_ratio: float | None  # bdpt over truth, whole images
     mean_ratio_standard_error: float | None
     resolution: float | None  # the largest standard error allowed
+    seen_bias: float | None  # part of the mean by which the image must be off to fail, if the noise does not help it
+    seen_block_bias: float | None  # the same of its worst block, as part of the block's mean
     max_over_mean: float | None  # brightest pixel of any render over the mean
     truth_max_over_mean: float | None
     nan: int
@@ -126,7 +128,8 @@ def _judged(
     result = Result(
         item.row, item.name, item.hard, item.truth.said, str(settings), effort.size, effort.seeds, effort.spp,
         effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
-        _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(brightest), _finite(truth_brightest),
+        _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
+        _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
         int(np.isnan(bdpt).sum()), int(np.isinf(bdpt).sum()), time.process_time() - start, faults, command,
     )  # fmt: skip
     return Outcome(result, Renders(bdpt, truth, blocks.z))
@@ -164,6 +167,19 @@ def compare(images: Images, truth: Images, blocks: int) -> BlockTest:
     limit = two_sided_limit(1 - (1 - SIGNIFICANCE) ** (1 / z.size))
     ratio_error = float(each.std(ddof=1) / np.sqrt(len(each)))
     return BlockTest(z, float(np.abs(z).max()), limit, float(each.mean()), ratio_error, bool(np.isfinite(images).all()))
+
+
+def seen_bias(images: Images, truth: Images, blocks: int) -> float:
+    """The bias that just fails, as part of a block's mean and of the block where it is largest; black ones apart."""
+    with np.errstate(all="ignore"):
+        means, expected = block_means(images, blocks), block_means(truth, blocks)
+        variance = means.var(axis=0, ddof=1) / len(means)
+        if len(truth) > 1:
+            variance = variance + expected.var(axis=0, ddof=1) / len(truth)
+        level = expected.mean(axis=0)
+        error = np.maximum(np.sqrt(variance), ROUNDING * level)
+        limit = two_sided_limit(1 - (1 - SIGNIFICANCE) ** (1 / level.size))
+        return float(np.max(limit * (error / level)[level > 0], initial=0.0))
 
 
 def plus_minus(value: float, standard_error: float) -> str:
@@ -207,7 +223,7 @@ def _refused(refusal: Refusal, quick: bool) -> Outcome:
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
     result = Result(
         refusal.row, refusal.name, said, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
-        None, None, 0, 0, time.process_time() - start, tuple(faults),
+        None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
         f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
     return Outcome(result)

@@ -50,7 +50,10 @@ def _processor() -> str:
 
 
 def _revision() -> bytes:
-    """A digest of the renderer's source: a checkout has one version for many renderers."""
+    """A digest of the renderer's source: a checkout has one version for many renderers.
+
+    How configurations and views are drawn is not in it; it stays as it is, since the keys of stored samples rest on it.
+    """
     hashed = hashlib.sha256()
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
         hashed.update(file.read_bytes())

@@ -21,7 +21,11 @@ GRID = tuple(
     Candidate(c, r)
     for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25), (1, 1.0), (2, 1.0), (4, 1.0), (8, 1.0))
 )
-"""The candidates of every pilot; those that a scene's content makes pointless are left out."""
+"""The candidates of every pilot; those that a scene's content makes pointless are left out.
+
+More light paths than eye paths are for light that only they find, in splats: connections use as many of them as there
+are eye vertices, so that a ratio above 1 would buy connections nothing.
+"""
 
 FIRST_ROUND = 0.4
 """Share of the pilot's time for its first round, at most: what follows decides between the best."""
@@ -124,7 +128,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     depth = spec.transport.max_depth
     candidates, left_out = content.restrict(found, depth, reach.hit, dict.fromkeys([*GRID, present(spec)]))
     costs = {candidate: ImageCost.of(stage.renders(1)[0], candidate, stage.clock) for candidate in candidates}
-    film, spp, views = _affordable(spec, list(costs.values()), seconds)
+    film, spp, views = _pilot_film(spec, list(costs.values()), seconds)
     if film != spec.film:
         stage = Stage(spec.model_copy(update={"film": film}), beside)
     talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
@@ -167,7 +171,7 @@ def present(spec: SceneSpec) -> Candidate:
     return Candidate(spec.transport.connections, spec.transport.light_ratio)
 
 
-def _affordable(spec: SceneSpec, costs: Sequence[ImageCost], seconds: float) -> tuple[Film, int, int]:
+def _pilot_film(spec: SceneSpec, costs: Sequence[ImageCost], seconds: float) -> tuple[Film, int, int]:
     """Film, samples per pixel and number of views whose first round takes no more than its share of the time.
 
     Wanted are those of the spec, and as many views as there is time for. Samples are given up first; then the film is

@@ -26,6 +26,9 @@ LEAST_PAIRS = 4
 SCOUTS = 8
 """Images of each view at least that only serve to weight the others."""
 
+SUSPICIOUS = 0.05
+"""Part of a candidate's error that is inferred from light it misses, beyond which that is looked into and told."""
+
 MOST_PAIRS = 32
 """Pairs of images of one view: more would refine what depends on the views drawn anyway."""
 
@@ -99,7 +102,8 @@ def choose(
 ) -> Choice:
     """The candidate of least error × time over some views, each given by a function that renders it.
 
-    `seconds` of `clock` (CPU time) bound the pilot; its first round is run whatever it takes. `keep` names candidates
+    `seconds` of `clock` (CPU time) bound the pilot; its first round is run whatever it takes. It ends before that once
+    one candidate is left which seems to miss nothing. `keep` names candidates
     that are measured to the end for comparison, as plain path tracing always is, being added if it is missing. Images
     are compared at `spp`, and their time includes what an image costs whatever its samples are, so `spp` should be that
     of later use; or `later` says for each candidate how many times longer its images take in later use. Raises
@@ -118,6 +122,8 @@ def choose(
     while pilot.weights and len(active) > 1:
         ranked = sorted(active, key=pilot.cost)
         best = ranked[: (len(ranked) + 1) // 2]
+        if pilot.is_suspect(best[0]):  # what it misses only shows with more images: keep one that finds it
+            best += [c for c in ranked if not pilot.is_suspect(c)][:1]
         active = [c for c in every if c in best]
         pairs = pilot.affordable([*active, *(kept - set(active))], 2 * pairs, seconds)
         if not pairs:
@@ -236,6 +242,11 @@ class _Pilot:
     def _not_counted(self) -> float:
         return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
 
+    def is_suspect(self, candidate: Candidate) -> bool:
+        """Whether it seems to miss light that others find; how much of it grows with the images it is judged by."""
+        inferred = self._missed(candidate)
+        return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
+
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
         return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
@@ -243,15 +254,17 @@ class _Pilot:
     def _measured(self, candidate: Candidate) -> Measured:
         """Error × time against plain path tracing, over the images that both rendered with equal seeds.
 
-        The spread is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over pairs of images in all views:
-        so it holds what the noise and what the choice of views contribute; that of the times is next to nothing.
+        The spread is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over views, each the mean of its
+        pairs of images: so it holds what the noise and what the choice of views contribute; that of the times is next
+        to nothing. Of a single view it is that over pairs.
         """
         own, plain = self._seen(candidate), self._seen(PLAIN)[: len(self._seen(candidate))]
         inferred, inferred_plain = self._missed(candidate), self._missed(PLAIN)
         error = max(float(own.mean()) + inferred, 1e-30)
         error_plain = max(float(plain.mean()) + inferred_plain, 1e-30)
         ratio = error / error_plain * self._time_later(candidate) / self._time_later(PLAIN)
-        residual = ((own + inferred) / error - (plain + inferred_plain) / error_plain).ravel()
+        residual = (own + inferred) / error - (plain + inferred_plain) / error_plain
+        residual = residual.mean(axis=0) if residual.shape[1] > 1 else residual[:, 0]
         relative = np.sqrt(np.sum(residual**2) / (len(residual) * (len(residual) - 1))) if len(residual) > 1 else None
         return Measured(
             candidate=candidate,
@@ -284,11 +297,13 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
     else:
         share = plus_minus(chosen.relative_cost, chosen.spread)
         reasons.append(f"{best} is best: it reaches the error of {PLAIN} in {share} of the time")
+    if alike := [str(row.candidate) for row in rows if row is not chosen and _is_alike(row, chosen)]:
+        reasons.append(f"not to be told from it, within two standard errors: {', '.join(alike)}")
     reasons += [
         f"{row.candidate} misses light that others find: {row.missed / row.error:.0%} of its error is inferred from "
         "that, and the true one may be larger"
         for row in rows
-        if row.missed > 0.5 * row.error
+        if row.missed > (SUSPICIOUS if row is chosen else 0.5) * row.error
     ]
     if shared > 0.5 * chosen.error:
         reasons.append(
@@ -296,6 +311,16 @@ def _reasons(best: Candidate, rows: Sequence[Measured], shared: float) -> tuple[
             f"about {shared:.2g} to the relMSE of an image, which is {chosen.error:.2g} without them"
         )
     return tuple(reasons)
+
+
+def _is_alike(row: Measured, chosen: Measured) -> bool:
+    """Whether the costs of two candidates differ by less than twice the standard error of their difference.
+
+    Those of both are taken as independent, which overstates it.
+    """
+    if row.spread is None or chosen.spread is None:
+        return False
+    return row.relative_cost - chosen.relative_cost < 2 * math.hypot(row.spread, chosen.spread)
 
 
 def plus_minus(value: float, spread: float | None) -> str:

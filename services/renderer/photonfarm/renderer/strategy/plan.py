@@ -18,6 +18,10 @@ LEAST_SAMPLES = 0.7
 """Samples per pixel that the present cost must pay for: rounded up to 1, they cost at most 1.4 times as much."""
 
 
+ALIKE = 4.0
+"""Times as many samples per pixel, or as few, to which a measurement is taken to apply: what an image costs whatever
+its samples are weighs on the choice where they are few."""
+
 SECONDS = 60.0
 """CPU time of a pilot, unless another is asked for."""
 
@@ -87,14 +91,16 @@ def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float | None, ag
 
 
 def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
-    """Whether the settings of the spec were measured, unless there was a reason not to."""
+    """Whether the settings of the spec were measured, unless there was a reason not to, and about its samples."""
+    if not 1 / ALIKE <= spec.transport.half_spp / measurement.half_spp <= ALIKE:
+        return False
     return measurement.row(present(spec)) is not None or bool(measurement.left_out) or not measurement.rows
 
 
 def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Plan:
     """What follows from a measurement for a spec as it is now."""
     photons, reason = light_reach.recommend(spec.photons, measurement.near, measurement.power, spec.transport.max_depth)
-    chosen, half_spp = _affordable(spec, measurement)
+    chosen, half_spp = _best_at_cost(spec, measurement)
     if chosen is None:
         return Plan(spec, measurement, cached, PLAIN, half_spp, photons, reason, (), 0.0)
     others = dict.fromkeys(c for c in (PLAIN, DEFAULT, present(spec)) if c != chosen.candidate)
@@ -111,7 +117,7 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Plan:
     )
 
 
-def _affordable(spec: SceneSpec, measurement: Measurement) -> tuple[Row | None, int]:
+def _best_at_cost(spec: SceneSpec, measurement: Measurement) -> tuple[Row | None, int]:
     """The best candidate that has a sample at least for what a half costs now, and the samples per pixel it has then.
 
     They are those of the spec where its present settings were not measured, or no candidate was.

@@ -102,7 +102,7 @@ def _legend(plan: Plan) -> list[str]:
     m, film = plan.measurement, plan.spec.film
     return [
         "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "
-        "tracing: 0 and 0",
+        "tracing: 0 and 0; images: rendered to measure it, over all views",
         f"relMSE: relative mean squared error of an image of {m.spp} spp; ms: CPU milliseconds of one half-estimate, "
         f"{film.width} × {film.height} pixels of {m.half_spp} spp",
         "error × time: relMSE × ms, relative to plain path tracing, ± one standard error: the time to the same error",

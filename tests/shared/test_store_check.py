@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.shared import cli
+from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -404,6 +406,24 @@ def test_a_damaged_spec_is_set_aside_and_the_next_submission_writes_it(store: St
     Store(store.root).plan(samples.small_spec(), Request(modifications=5, views_per_modification=2))
     assert file.read_bytes() == whole
     assert (found(checked(store)), data(scene)) == ({}, clean)
+
+
+def test_a_marker_may_name_arrays_of_a_later_program(store: Store, scene: SceneStore) -> None:
+    about = json.loads(marker(scene, 0).read_text())
+    about["files"]["plans/000000/motion/c.0.0"] = {"size": 1, "crc32c": "00000000"}
+    marker(scene, 0).write_text(json.dumps(about))
+    assert found(checked(store)) == {}
+
+
+@pytest.mark.parametrize(
+    "chunk",
+    ["plans/000000/sample_pass/c.0", "plans/000000/view/c.0.0", "base/cloud/face/c.0", "base/geometry/faces/c.0.0"],
+)
+def test_a_missing_chunk_is_never_read_as_fill_values(store: Store, scene: SceneStore, chunk: str) -> None:
+    (scene.folder / chunk).unlink()
+    reader = SceneReader(store.root, scene.scene_id)
+    with pytest.raises(CorruptError, match=re.escape(f"{chunk}: is missing")):
+        reader.base() if chunk.startswith("base") else reader.refresh()
 
 
 # ------------------------------------------------------------------------------------------------------------ repair

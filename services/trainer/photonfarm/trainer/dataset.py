@@ -86,7 +86,7 @@ def is_row_held_out(source: SampleSource, row: int, share: float) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Samples as tensors; valid until the next one is taken. Without those that were not complete; so it may be empty."""
+    """Samples as tensors; valid until the next one is taken. Those that were not complete are left out, maybe all."""
 
     rows: tuple[int, ...]
     units: tuple[Key, ...]  # what each is held out by: equal for samples that are not independent

@@ -19,8 +19,9 @@ class Feed:
     """Batches in the order they were asked for, and the rows as they arrive; a context manager.
 
     Rows that are not complete when they are read, as a repair of the store may have taken them back, are left out of
-    their batch, until they have become complete again. Only its thread touches the source. Decoded samples are kept up to `cache_bytes`: the first ones stay, since every
-    sample is drawn about equally often, which is where replacing the least recently used one never hits.
+    their batch, until they have become complete again. Only its thread touches the source. Decoded samples are kept up
+    to `cache_bytes`: the first ones stay, since every sample is drawn about equally often, which is where replacing the
+    least recently used one never hits.
     """
 
     def __init__(

@@ -104,16 +104,17 @@ class Following:
     def take(self) -> Batch | None:
         """The next batch drawn, read; draws of rows that are not complete any more do not count.
 
-        None if there is no row left in it: it is asked for once more, as the last one.
+        None if there is no row left in it: another one is drawn in its place, as the last one.
         """
         batch = self._feed.take()
         rows = self._asked.popleft()
-        if not batch.rows:
-            self._asked.append(rows)
-            self._feed.ask(rows)
-            return None
         self._sampler.put_back((Counter(rows) - Counter(batch.rows)).elements())
-        return batch
+        if batch.rows:
+            return batch
+        rows = self._sampler.draw(self._settings.batch)
+        self._asked.append(rows)
+        self._feed.ask(rows)
+        return None
 
     def drop(self) -> None:
         """Let go of the batches that were read ahead, so that something else can be read."""

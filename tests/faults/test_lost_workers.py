@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer.worker import GRACE_S
+from photonfarm.renderer.worker_settings import GRACE_S
 from photonfarm.shared.queue import STARTS, connect, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store

@@ -1,4 +1,4 @@
-"""The worker: a supervisor and the child that it keeps alive.
+"""The worker: what starts it, and the child that its supervisor keeps alive.
 
 The child is an RQ worker that renders in its own process, so that scenes and kernels stay warm. What RQ leaves out is
 here: a heartbeat while a job runs, a deadline that also ends native code, recycling, and filling the queue when idle.
@@ -14,25 +14,23 @@ import logging
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Any
+from typing import Any
 
 import redis
-from pydantic import Field
 from redis import Redis
 from rq import SimpleWorker
 from rq.exceptions import DequeueTimeout, InvalidJobOperation, NoSuchJobError
 from rq.serializers import JSONSerializer
-from rq.utils import as_text
 from rq.worker.base import StopRequested
 
 from photonfarm.renderer import jobs
+from photonfarm.renderer.supervisor import Supervisor
+from photonfarm.renderer.worker_settings import GRACE_S, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import (
     BackendError,
@@ -43,21 +41,14 @@ from photonfarm.shared.errors import (
     StoreError,
 )
 from photonfarm.shared.queue import STARTS, RenderJob
-from photonfarm.shared.scene import Frozen
 from photonfarm.shared.store import Store
 
 CHILD = (sys.executable, "-m", "photonfarm.renderer.worker")
-RECYCLED = 75
-"""Exit code of a child that wants a successor."""
 
 STARTS_ALLOWED = 5
 """Starts of one job without an end, after which it counts as failed: it kills its workers."""
 
 STARTS_TTL_S = 6 * 3600
-
-GRACE_S = 5.0
-"""What a job in hand gets to end in once its worker is to stop: one that is nearly done is kept, and the worker is gone
-within the 10 s that Docker gives. A longer job is killed, and as it has no marker it is rendered again."""
 
 _QUEUE_TROUBLE = (QueueError, redis.RedisError, InvalidJobOperation, NoSuchJobError)
 """Faults of the queue, not of the job: a Redis that lost its memory no longer knows the job in hand."""
@@ -65,31 +56,9 @@ _QUEUE_TROUBLE = (QueueError, redis.RedisError, InvalidJobOperation, NoSuchJobEr
 RQ_WORKER_TTL_S = 120
 """After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
 
-BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-STEADY_S = 30.0
-"""A child that lived this long was well: its successor starts at once again."""
-
 log = logging.getLogger(__name__)
 
-Positive = Annotated[float, Field(gt=0)]
-
-
-class WorkerSettings(Frozen):
-    """What a worker is told; each default with its reason."""
-
-    store: str
-    redis_url: str
-    name: Annotated[str, Field(min_length=1, max_length=128)]
-    until_complete: bool = False
-    scene_id: str | None = None  # fill the queue with, and wait for, this scene alone; None: all of the store
-    max_jobs: Annotated[int, Field(ge=1)] = 500  # then a fresh child: bounds what leaks, at < 1 % of the time
-    max_rss_bytes: Annotated[int, Field(ge=1)] = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more
-    deadline_s: Positive = 1800.0  # jobs are meant to take 5 to 30 s; a hundred times that is a hang
-    heartbeat_ttl_s: Positive = 90.0  # longer than native code holds Python's lock
-    idle_s: Annotated[int, Field(ge=1)] = 2  # between looks at the store, while the queue is empty
-
-
-# --------------------------------------------------------------------------------------------------------- supervisor
+# ------------------------------------------------------------------------------------------------------------ starting
 
 
 def run_worker(
@@ -110,7 +79,7 @@ def run_worker(
     Store(store, create=True)
     queue.connect(redis_url).close()
     told = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
-    _Supervisor(told, tuple(child), say or log.warning).run()
+    Supervisor(told, tuple(child), say or log.warning).run()
 
 
 def _default_name() -> str:
@@ -121,105 +90,6 @@ def check(redis_url: str) -> None:
     """Return if a worker of this machine is alive; raises IncompleteError if none is, QueueError without a Redis."""
     if socket.gethostname() not in queue.hosts(queue.connect(redis_url)):
         raise IncompleteError(f"no worker of {socket.gethostname()} is alive")
-
-
-class _Supervisor:
-    """Starts the child again until it has nothing left to do."""
-
-    def __init__(self, settings: WorkerSettings, command: tuple[str, ...], say: Callable[[str], None]) -> None:
-        self._settings = settings
-        self._command = command
-        self._say = say
-        self._stop = threading.Event()
-        self._child: subprocess.Popen[bytes] | None = None
-
-    def run(self) -> None:
-        """Supervise; raises what the child cannot go on with."""
-        with self._signals():
-            failures = 0
-            while not self._stop.is_set():
-                started = time.monotonic()
-                code, message = self._run_child()
-                if code < 0 and self._stop.is_set():
-                    _free_job(self._settings)
-                if code == 0 or self._stop.is_set():
-                    return
-                _raise_final(code, message)
-                if code == RECYCLED:
-                    failures = 0
-                    continue
-                failures = 0 if time.monotonic() - started > STEADY_S else failures
-                pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
-                failures += 1
-                self._say(f"worker {self._settings.name}: {_ending(code, message)}; starting again in {pause:g} s")
-                self._stop.wait(pause)
-
-    def _run_child(self) -> tuple[int, str]:
-        """Exit code of one child, and its last words."""
-        with subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
-        ) as self._child:
-            if self._child.stdin is None or self._child.stdout is None:
-                raise BackendError("the worker's child was started without pipes")
-            if self._stop.is_set():  # asked to while it was being started
-                self._child.terminate()
-            with contextlib.suppress(BrokenPipeError):
-                self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
-                self._child.stdin.flush()  # and left open: its end tells the child that we are gone
-            words = self._child.stdout.read().decode(errors="replace").strip()
-            return self._child.wait(), words.splitlines()[-1] if words else ""
-
-    @contextlib.contextmanager
-    def _signals(self) -> Iterator[None]:
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, self._on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        again = self._stop.is_set()
-        self._stop.set()
-        if self._child is not None:
-            self._child.send_signal(signal.SIGKILL if again else signal.SIGTERM)
-        if not again:
-            threading.Thread(target=self._see_off, daemon=True).start()
-
-    def _see_off(self) -> None:
-        """End the child after the grace: its own handler waits for native code to return, which may take minutes."""
-        self._say(
-            f"worker {self._settings.name}: stopping; a job in hand that takes longer than {GRACE_S:g} s "
-            "will be rendered again"
-        )
-        time.sleep(GRACE_S)
-        if self._child is not None:
-            self._child.kill()
-
-
-def _free_job(settings: WorkerSettings) -> None:
-    """Let others have the job that a child was killed with at once, and do not count this start of it."""
-    with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
-        told = connection.get(queue.WORKER + settings.name)
-        queue.bury(connection, settings.name)
-        if told is not None:
-            connection.delete(STARTS + as_text(told).split()[-1])
-
-
-def _raise_final(code: int, message: str) -> None:
-    """Raise what starting again does not help against."""
-    for kind in (StoreError, BackendError, IncompleteError):
-        if code == kind.exit_code:
-            raise kind(message)
-
-
-def _ending(code: int, message: str) -> str:
-    if code < 0:
-        return f"its child was ended by {signal.Signals(-code).name}"
-    return message or f"its child ended with exit code {code}"
 
 
 # -------------------------------------------------------------------------------------------------------------- child

@@ -26,7 +26,7 @@ from redis import Redis
 from rq import SimpleWorker
 from rq.exceptions import DequeueTimeout, InvalidJobOperation, NoSuchJobError
 from rq.serializers import JSONSerializer
-from rq.worker.base import StopRequested
+from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer import jobs
 from photonfarm.renderer.supervisor import Supervisor
@@ -209,6 +209,7 @@ class RenderWorker(SimpleWorker):
 
     def execute_job(self, job: RenderJob, queue: Any) -> None:
         """Run one job under a heartbeat and a deadline."""
+        self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
         with self._heart.working(job.id):
             starts = int(self.connection.incr(STARTS + job.id))
             self.connection.expire(STARTS + job.id, STARTS_TTL_S)

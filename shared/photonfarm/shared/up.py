@@ -23,7 +23,7 @@ from photonfarm.shared.hold_out import check_hold_out
 from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import SCENES_VARIABLE, find_spec, load_spec
-from photonfarm.shared.store import Store, store_errors
+from photonfarm.shared.store import SceneStore, Store, store_errors
 from photonfarm.shared.submission import request_of, submit
 
 POLL_S = 0.5
@@ -64,7 +64,8 @@ def run_farm(
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
-        rows = Store(store).scene(planned.scene_id).plans()[0].shard_rows
+        scene = Store(store).scene(planned.scene_id)
+        rows = scene.plans()[0].shard_rows
         console.print(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
@@ -74,7 +75,7 @@ def run_farm(
         running = stack.enter_context(_processes(verbs, environment, run, console))
         preview = ["preview", spec, "--out", str(out / "preview.html")]
         try:
-            _watch(running, _Farm(Store(store), planned.scene_id, run, train_steps), redis, console)
+            _watch(running, _Farm(scene, run, train_steps), redis, console)
             if train_steps:
                 _call(["report", "--run", str(run), "--out", str(out)], environment)
         except IncompleteError:
@@ -170,8 +171,8 @@ def _ask(processes: list[Process], seconds: float) -> None:
 class _Farm:
     """Where rendering and training are, as their files say."""
 
-    def __init__(self, store: Store, scene_id: str, run: Path, steps: int) -> None:
-        self.scene = store.scene(scene_id)
+    def __init__(self, scene: SceneStore, run: Path, steps: int) -> None:
+        self.scene = scene
         self.run = run
         self.steps = steps
         self.step = 0

@@ -20,7 +20,7 @@ import redis
 from redis import Redis
 from rq import SimpleWorker
 from rq.serializers import JSONSerializer
-from rq.worker.base import StopRequested
+from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer import jobs
 from photonfarm.renderer.backpressure import DiskReserve, TrainerPace, is_full
@@ -196,6 +196,7 @@ class RenderWorker(SimpleWorker):
 
     def execute_job(self, job: RenderJob, queue: Any) -> None:
         """Run one job under a heartbeat and a deadline."""
+        self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
         self._failed = False
         with self._heart.working(job.id), self._talk.timing(job.id):
             starts = int(self.connection.incr(STARTS + job.id))

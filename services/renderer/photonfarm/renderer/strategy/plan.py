@@ -18,7 +18,7 @@ LEAST_SAMPLES = 0.7
 """Samples per pixel that the present cost must pay for: rounded up to 1, they cost at most 1.4 times as much."""
 
 
-ALIKE = 4.0
+SIMILAR_SPP = 4.0
 """Times as many samples per pixel, or as few, to which a measurement is taken to apply: what an image costs whatever
 its samples are weighs on the choice where they are few."""
 
@@ -92,7 +92,7 @@ def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float | None, ag
 
 def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
     """Whether the settings of the spec were measured, unless there was a reason not to, and about its samples."""
-    if not 1 / ALIKE <= spec.transport.half_spp / measurement.half_spp <= ALIKE:
+    if not 1 / SIMILAR_SPP <= spec.transport.half_spp / measurement.half_spp <= SIMILAR_SPP:
         return False
     return measurement.row(present(spec)) is not None or bool(measurement.left_out) or not measurement.rows
 

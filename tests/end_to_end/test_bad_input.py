@@ -120,6 +120,21 @@ def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anyt
     assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
 
 
+def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(
+    photonfarm, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
+    (tmp_path / "mine/ball.toml").write_text(
+        'name = "ball"\nscene.file = "ball.xml"\n'
+        "[view]\norigin = { min = [0, 0, 3], max = [1, 1, 4] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"
+    )
+    found = {"PHOTONFARM_SCENES": str(tmp_path / "mine")}
+    told = photonfarm("submit", "mine/ball.toml", "--no-queue", PHOTONFARM_SCENES="")
+    assert told.stderr == f"workers find its scene file with PHOTONFARM_SCENES={found['PHOTONFARM_SCENES']}\n"
+    assert photonfarm("submit", "mine/ball.toml", "--no-queue", **found).stderr == ""
+
+
 def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(photonfarm, tmp_path: Path) -> None:
     """With 64 configurations planned before, some of them held out, one more may be of either side."""
     assert photonfarm("submit", "room", "--modifications", "64", "--no-queue").returncode == 0

@@ -105,7 +105,7 @@ def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[by
 
 def wait_for_native_code(folder: Path) -> None:
     """The base is written right before the first sample is rendered."""
-    wait_until(lambda: list(folder.glob("store/scenes/*/base.json")))
+    wait_until(lambda: list(folder.glob("store/scenes/*/base/zarr.json")))
     time.sleep(3)
 
 

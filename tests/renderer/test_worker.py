@@ -18,6 +18,7 @@ from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, 
 from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import connect, job_name, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.scene import Source
 from photonfarm.shared.store import SceneStore, Store, store_status
 
 
@@ -147,6 +148,25 @@ def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1]
     assert list(queue_status(connect(server.url)).failed) == [f"{other.scene_id}-0"]
+
+
+def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_else_from_being_rendered(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    store, connection = Store(tmp_path / "store"), connect(server.url)
+    elsewhere = analytic.small_spec().model_copy(update={"scene": Source(file="gone.xml")})
+    other = store.scene(store.plan(elsewhere, Request(modifications=9), shard_rows=3).scene_id)
+    for told in (other, scene):
+        queue.reconcile(store, connection, scene_id=told.scene_id)
+    with pytest.raises(BackendError, match=r"this machine cannot render .*'gone.xml' is not there"):
+        run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
+    assert scene.missing_jobs() == []
+    assert other.missing_jobs() == [0, 1, 2]
+    status = queue_status(connection)
+    assert (status.queued, status.failed) == (3, {}), "for workers that have the files"
+    said = capfd.readouterr().err
+    assert said.count("leaves scene") == 1
+    assert "Traceback" not in said
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:

@@ -169,6 +169,17 @@ def test_what_is_not_named_as_a_job_is_thrown_away_and_what_comes_after_it_taken
         RenderArguments.of(name)
 
 
+def test_jobs_of_scenes_to_leave_stay_in_their_order(connection: redis.Redis) -> None:
+    left, listed = [f"{'ab' * 16}-{number}" for number in (7, 8)], open_queue(connection)
+    pushed(connection, left[0], "nonsense", left[1], NAME)
+    job, strangers = queue.take(listed, leave=["ab" * 16])
+    assert_is_ours(job)
+    assert strangers == 1
+    assert queue.take(listed, leave=["ab" * 16]) == (None, 0)
+    assert connection.lrange(listed.key, 0, -1) == [name.encode() for name in left]
+    assert connection.lrange(listed.intermediate_queue_key, 0, -1) == [NAME.encode()]
+
+
 def test_a_job_named_in_a_dead_encoding_is_thrown_away(connection: redis.Redis) -> None:
     pushed(connection, b"\xff\xfe-7", pickle.dumps(NAME))
     assert queue.take(open_queue(connection)) == (None, 2)

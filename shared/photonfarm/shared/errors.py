@@ -48,6 +48,10 @@ class BackendError(PhotonfarmError, RuntimeError):
     exit_code = 6
 
 
+class SceneNotHereError(BackendError):
+    """The files of a scene are missing on this machine, or are others than were planned."""
+
+
 class IncompleteError(PhotonfarmError):
     """Work ended before it was done; what is stored stays."""
 

@@ -122,6 +122,10 @@ def submission(result: Submission, as_json: bool) -> None:
     click.echo(
         f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
     )
+    if result.scenes:
+        from photonfarm.shared.scene import SCENES_VARIABLE
+
+        click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
 # --------------------------------------------------------------------------------------------------------------- status

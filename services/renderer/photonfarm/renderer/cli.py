@@ -53,6 +53,10 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
     "--ahead", type=click.FloatRange(0, min_open=True), metavar="RATIO",
     help="Take no job while more samples are committed than RATIO × those that the trainer has used.",
 )  # fmt: skip
+@click.option(
+    "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
+    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is tried five times.",
+)  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
 def work(

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, SpecError
+from photonfarm.shared.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
 from photonfarm.shared.keys import Key, seed_of
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
@@ -98,8 +98,8 @@ class ShardRenderer:
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit one job; False if it was committed already, or by another worker meanwhile.
 
-        Raises QueueError for a job that is not planned in this store, BackendError if the scene file here is not the
-        planned one, IncompleteError if renders stay non-finite or buffers are.
+        Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
+        the planned one, IncompleteError if renders stay non-finite or buffers are.
         """
         if scene_id not in self._store.scene_ids() or job >= self._store.scene(scene_id).jobs():
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
@@ -143,14 +143,14 @@ class ShardRenderer:
 def located(spec: SceneSpec) -> SceneSpec:
     """The spec, once its scene file has been found on this machine and is the one that was planned.
 
-    Raises BackendError otherwise: that is the machine's fault and not the job's, which others may do.
+    Raises SceneNotHereError otherwise: that is the machine's fault and not the job's, which others may do.
     """
     try:
         here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
     except SpecError as error:
-        raise BackendError(f"this machine cannot render {error}") from error
+        raise SceneNotHereError(f"this machine cannot render {error}") from error
     if here.scene_id != spec.scene_id:
-        raise BackendError(
+        raise SceneNotHereError(
             f"scene {spec.scene_id} ({spec.name}): the scene file here is another one than was planned (its files' "
             f"digest is {here.content[:12]}…, planned was {spec.content[:12]}…); give every worker the same files"
         )

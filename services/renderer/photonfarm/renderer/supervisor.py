@@ -115,4 +115,4 @@ def _raise_final(code: int, message: str) -> None:
 def _ending(code: int, message: str) -> str:
     if code < 0:
         return f"its child was ended by {signal.Signals(-code).name}"
-    return message or f"its child ended with exit code {code}"
+    return message or f"its child ended with exit code {code}, for the reason above"

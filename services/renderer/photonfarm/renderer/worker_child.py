@@ -34,6 +34,7 @@ from photonfarm.shared.errors import (
     IncompleteError,
     PhotonfarmError,
     QueueError,
+    SceneNotHereError,
     StoreError,
 )
 from photonfarm.shared.queue import STARTS, RenderArguments, RenderJob
@@ -99,7 +100,6 @@ class RenderWorker(SimpleWorker):
             connection=connection,
             job_class=RenderJob,
             serializer=JSONSerializer,
-            exception_handlers=[self._on_failure],
             log_job_description=False,
             worker_ttl=RQ_WORKER_TTL_S,
         )
@@ -108,6 +108,7 @@ class RenderWorker(SimpleWorker):
         self._fatal: PhotonfarmError | None = None
         self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
         self._failed = False  # the job in hand
+        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others
         self._heart = Heart(settings)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
@@ -164,7 +165,7 @@ class RenderWorker(SimpleWorker):
         self._talk.pausing(held_back)
         until = time.monotonic() + self._settings.idle_s
         while True:
-            job, strangers = (None, 0) if held_back else queue.take(self._queue)
+            job, strangers = (None, 0) if held_back else queue.take(self._queue, leave=self._not_here)
             if strangers:
                 log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
             if job is not None or time.monotonic() >= until:
@@ -179,13 +180,16 @@ class RenderWorker(SimpleWorker):
         if not self._settings.until_complete:
             return False
         missing = {
-            queue.job_name(scene.scene_id, job)
+            queue.job_name(scene.scene_id, job): scene.scene_id
             for scene in self._store.scenes(self._settings.scene_id)
             for job in scene.missing_jobs()
         }
         failed = queue.queue_status(self.connection).failed
-        if missing and missing <= failed.keys():
-            first = sorted(missing)[0]
+        not_failed = missing.keys() - failed.keys()
+        if not_failed and all(missing[name] in self._not_here for name in not_failed):
+            raise self._not_here[missing[min(not_failed)]]
+        if missing and not not_failed:
+            first = min(missing)
             raise IncompleteError(
                 f"{len(missing)} jobs have failed; {first}: {failed[first].reason}. `photonfarm status` has the "
                 "causes, and commands that repeat them"
@@ -213,23 +217,26 @@ class RenderWorker(SimpleWorker):
         else:
             queue.forget_failures_of(self.connection, name)
 
-    def _on_failure(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> bool:  # noqa: ARG002
+    def handle_exception(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> None:  # noqa: ARG002
         """Decide what a failed job means: for the job, for this worker, or nothing."""
         if self._is_committed(job.id):
             log.warning("job %s is committed; what Redis keeps of it was not: %s", job.id, error)
-            return False
+            return
         self._failed = True
-        log.warning("job %s failed: %s", job.id, error)
-        ours = self._settings.scene_id in (None, job.id.rpartition("-")[0])
+        log.warning("job %s failed: %s", job.id, error, exc_info=None if isinstance(error, PhotonfarmError) else error)
+        scene_id = job.id.rpartition("-")[0]
+        ours = self._settings.scene_id in (None, scene_id)
         if is_full(error):
             self._disk.refused()
+        elif isinstance(error, SceneNotHereError) and self._settings.scene_id != scene_id:
+            self._not_here[scene_id] = error
+            log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
         elif ours and isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
             self._fatal = error  # the next job would fail as well
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)
             with contextlib.suppress(redis.RedisError):
                 self._record(job.id, f"{type(error).__name__}: {error}")
-        return False
 
     def _is_committed(self, name: str) -> bool:
         with contextlib.suppress(PhotonfarmError, OSError):

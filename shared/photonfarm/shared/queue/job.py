@@ -8,6 +8,7 @@ be as large as it likes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
@@ -44,15 +45,24 @@ return names
 """
 
 _TAKE = f"""
-for dropped = 0, 999 do
-  local name = redis.call('LINDEX', KEYS[1], 0)
-  if not name then return {{'', dropped}} end
-  if #name <= {MAX_NAME} and string.match(name, '^%x+%-%d+$') then
-    return {{redis.call('LMOVE', KEYS[1], KEYS[2], 'LEFT', 'RIGHT'), dropped}}
+local left, passed, dropped = {{}}, 0, 0
+for _, scene in ipairs(ARGV) do left[scene] = true end
+while dropped < 1000 do
+  local name = redis.call('LINDEX', KEYS[1], passed)
+  if not name then break end
+  local scene = #name <= {MAX_NAME} and string.match(name, '^(%x+)%-%d+$')
+  if scene and left[scene] then
+    passed = passed + 1
+  else
+    redis.call('LREM', KEYS[1], 1, name)
+    if scene then
+      redis.call('RPUSH', KEYS[2], name)
+      return {{name, dropped}}
+    end
+    dropped = dropped + 1
   end
-  redis.call('LTRIM', KEYS[1], 1, -1)
 end
-return {{'', 1000}}
+return {{'', dropped}}
 """
 
 
@@ -128,13 +138,14 @@ def open_queue(connection: Redis) -> RenderQueue:
     return RenderQueue(QUEUE, connection=connection, job_class=RenderJob, serializer=JSONSerializer)
 
 
-def take(queue: RenderQueue) -> tuple[RenderJob | None, int]:
+def take(queue: RenderQueue, *, leave: Iterable[str] = ()) -> tuple[RenderJob | None, int]:
     """The next job, taken as RQ takes it, or None; and how many entries that were no jobs were thrown away.
 
-    Whoever wants to wait asks again: blocking, RQ fetches whatever stands in the list, of whatever size.
+    Jobs of the scenes to `leave` stay where they are, for other workers. Whoever wants to wait asks again: blocking, RQ
+    fetches whatever stands in the list, of whatever size.
     """
     keys = [queue.key, queue.intermediate_queue_key]
-    name, dropped = queue.connection.register_script(_TAKE)(keys=keys)
+    name, dropped = queue.connection.register_script(_TAKE)(keys=keys, args=[*leave])
     if not name:
         return None, dropped
     try:

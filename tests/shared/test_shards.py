@@ -16,7 +16,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.store import schema, shards
 from photonfarm.shared.store.schema import ArraySchema
-from photonfarm.shared.store.shards import Shard, ShardWriter
+from photonfarm.shared.store.shards import Shard, ShardWriter, encode
 
 SHARD_ROWS = 4
 any_case = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
@@ -41,7 +41,7 @@ def write(path: Path, array: ArraySchema, rows: dict[int, Any], shard_rows: int 
     path.unlink(missing_ok=True)
     writer = ShardWriter(path, array, shard_rows)
     for row, values in rows.items():
-        writer.append(row, values)
+        writer.append(row, encode(array, values))
     return writer.finish()
 
 

@@ -43,6 +43,8 @@ class Batch:
 
     def first(self, count: int) -> Batch:
         """The first samples of the same memory."""
+        if count == len(self):
+            return self
         rows = {name: getattr(self, name)[:count] for name in ("rows", "view_rows", "modification_rows")}
         buffers = {name: values[:count] for name, values in self.buffers.items()}
         return replace(self, radiance=self.radiance[:count], buffers=buffers, **rows)

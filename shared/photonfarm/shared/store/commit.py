@@ -1,7 +1,7 @@
 """One job's outputs on their way into the store: row by row while it is rendered, and then all at once.
 
-Rows are encoded and written by a thread of their own, to parts that nobody sees; the commit names them, makes them
-durable, and announces them by the job's marker.
+Rows are written by a thread of their own, so that rendering does not wait for the disk, to parts that nobody sees; the
+commit names them, makes them durable, and announces them by the job's marker.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from photonfarm.shared.errors import CorruptError, IncompleteError
 from photonfarm.shared.records import F32, Photons, ViewBuffers, arrays_of
 from photonfarm.shared.store import markers, schema
 from photonfarm.shared.store.plans import JobRows, StoredPlan
-from photonfarm.shared.store.shards import Shard, ShardWriter
+from photonfarm.shared.store.shards import Shard, ShardWriter, encode
 from photonfarm.shared.store.storage import store_errors
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class JobWriter:
         self._arrays = schema.output_arrays(scene.spec)
         self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
         self._shards: dict[str, ShardWriter] = {}
-        self._waiting: queue.Queue[tuple[str, int, NDArray[Any]] | None] = queue.Queue(WAITING_ROWS)
+        self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
         self._thread.start()
@@ -115,7 +115,7 @@ class JobWriter:
             raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
         if not _stays_finite(values, array.dtype):
             raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
-        self._waiting.put((name, row % self._plan.shard_rows, values))
+        self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
         self._raise_error()
 
     def _write(self) -> None:
@@ -123,11 +123,11 @@ class JobWriter:
         while (taken := self._waiting.get()) is not None:
             if self._error is not None:
                 continue
-            name, row, values = taken
+            name, row, content = taken
             try:
                 if name not in self._shards:
                     self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
-                self._shards[name].append(row, values)
+                self._shards[name].append(row, content)
             except Exception as error:
                 self._error = error
 

@@ -205,6 +205,8 @@ class SceneReader:
     # ----------------------------------------------------------------------------------------------------------- arrays
 
     def _check_complete(self, rows: NDArray[np.int64]) -> None:
+        if len(rows) and rows.min() >= 0 and rows.max() < len(self._complete) and self._complete[rows].all():
+            return
         there = (rows >= 0) & (rows < len(self._complete))
         there[there] = self._complete[rows[there]]
         if not there.all():

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 Kind = Literal["sample", "view", "modification"]
 
 INPUT_ROWS_PER_CHUNK = 65536
-BLOSC = {"cname": "lz4", "clevel": 5, "shuffle": "shuffle"}  # byte shuffle: floats compress by their exponents
+BLOSC: dict[str, Any] = {
+    "cname": "lz4",
+    "clevel": 1,
+    "shuffle": "shuffle",
+}  # byte shuffle: floats compress by their exponents
 
 
 @dataclass(frozen=True, slots=True)

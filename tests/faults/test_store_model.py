@@ -1,0 +1,616 @@
+"""A store under random use by several processes is what a dictionary would be: sample key → what was committed of it.
+
+A machine of hypothesis plans, renders, dies, damages, repairs and reads at random, and compares the store with its
+model after each step. It takes the same steps each time; for others, and as many as wanted:
+
+    PHOTONFARM_MODEL_EXAMPLES=500 PHOTONFARM_MODEL_STEPS=60 pytest -q tests/faults/test_store_model.py --timeout=0
+
+A step that fails is printed with those before it, shrunk to a few, as a program that can be pasted.
+"""
+
+import hashlib
+import importlib.util
+import itertools
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+
+from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
+from photonfarm.shared.modification import Modification
+from photonfarm.shared.plan import UNUSED, Known, Request, expand, sample_key
+from photonfarm.shared.records import BasePointCloud, Geometry, ViewBuffers, arrays_of
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store
+from photonfarm.shared.store.check import check_store
+from photonfarm.shared.top_up import TopUp, spp_per_pass
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).parents[1] / "shared/store_samples.py")
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
+STEPS = int(os.environ.get("PHOTONFARM_MODEL_STEPS", "30"))
+
+SPECS = (
+    samples.small_spec(),
+    samples.small_spec(name="static", objects=[], photons={"paths": 0, "depth": 2}),  # other arrays, one modification
+)
+SHARD_ROWS = (3, 2)
+PLANNED_AT_MOST = 40  # samples of a scene
+PROCESSES = 3
+
+any_index = st.integers(0, 10_000)
+scene_numbers = st.integers(0, len(SPECS) - 1)
+processes = st.integers(0, PROCESSES - 1)
+counts = st.integers(1, 3)
+
+
+# ------------------------------------------------------------------------------- what is rendered: a function of content
+
+
+def radiance_of(spec: SceneSpec, key: bytes) -> np.ndarray:
+    """A sample's halves; every fourth has a value that float16 cannot hold."""
+    halves = samples.values(_seed(key), (2, spec.film.height, spec.film.width, 3))
+    if key[0] % 4 == 0:
+        halves[:, 0, 0, 0] = 70000
+    return halves
+
+
+def buffers_of(spec: SceneSpec, modification: bytes, view: bytes) -> ViewBuffers:
+    size = (spec.film.height, spec.film.width)
+    seed = _seed(modification + view)
+    return ViewBuffers(*(samples.values(seed + i, shape) for i, shape in enumerate([size, (*size, 3), (*size, 3)])))
+
+
+def photons_of(spec: SceneSpec, modification: bytes) -> Any:
+    return samples.photons(spec, _seed(modification))
+
+
+def base_of(spec: SceneSpec) -> tuple[Geometry, BasePointCloud]:
+    geometry, cloud = samples.base()
+    return geometry, cloud if spec.groups else replace(cloud, group=np.full_like(cloud.group, -1))
+
+
+def _seed(content: bytes) -> int:
+    return int.from_bytes(hashlib.blake2b(content, digest_size=7).digest(), "little")
+
+
+# ------------------------------------------------------------------------------------------------------------ the model
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A sample of the model."""
+
+    modification: bytes  # vectors
+    view: bytes
+    pass_: int
+    row: int
+    view_row: int
+    modification_row: int
+
+
+@dataclass
+class Model:
+    """A scene: what is planned, and which jobs are committed."""
+
+    spec: SceneSpec
+    shard_rows: int
+    planned: dict[bytes, Planned] = field(default_factory=dict)  # by sample key
+    plans: int = 0
+    jobs: int = 0
+    committed: set[int] = field(default_factory=set)
+
+    def jobs_of(self, sample: Planned) -> set[int]:
+        """The jobs that must be committed for a sample to be complete."""
+        return {row // self.shard_rows for row in (sample.row, sample.view_row, sample.modification_row)}
+
+    def complete(self) -> dict[int, bytes]:
+        """The keys of the complete samples, by row."""
+        return {s.row: key for key, s in self.planned.items() if self.jobs_of(s) <= self.committed}
+
+    def views(self) -> dict[tuple[bytes, bytes], list[Planned]]:
+        """The passes of each view, by modification and view, in the order of the views' rows."""
+        found: dict[tuple[bytes, bytes], list[Planned]] = {}
+        for sample in sorted(self.planned.values(), key=lambda s: s.view_row):
+            found.setdefault((sample.modification, sample.view), []).append(sample)
+        return found
+
+    def key(self, modification: bytes, view: bytes, pass_: int) -> bytes:
+        vector = np.frombuffer(modification, np.float32).reshape(-1, 4)
+        return sample_key(self.spec.scene_id, Modification.from_vector(vector), np.frombuffer(view, np.float32), pass_)
+
+    def named(self, request: Request) -> set[bytes]:
+        """The keys that a request names, whatever is planned."""
+        rows = expand(self.spec, request, Known(), first_job=0, shard_rows=self.shard_rows).rows
+        return {key.tobytes() for key in rows.sample_key[rows.sample_modification != UNUSED]}
+
+
+class Writer:
+    """A JobWriter, and the rows that it still wants."""
+
+    def __init__(self, number: int, scene: SceneStore, job: int) -> None:
+        self.number, self.job, self.spec = number, job, scene.spec
+        self.out: JobWriter = scene.job_writer(job)
+        rows = scene.job_rows(job)
+        vectors = {row: modification.vector.tobytes() for row, modification in rows.modifications.items()}
+        views = {s.view_row: (vectors[s.modification_row], rows.views[s.view_row].vector.tobytes()) for s in rows.samples}
+        self.left: list[tuple[Callable[..., None], int, Callable[[], Any]]] = []
+        for row in sorted(rows.new_modifications if scene.spec.photons.paths else ()):
+            self.left.append((self.out.photons, row, lambda row=row: photons_of(self.spec, vectors[row])))
+        for row in sorted(rows.new_views):
+            self.left.append((self.out.buffers, row, lambda row=row: buffers_of(self.spec, *views[row])))
+        for s in rows.samples:
+            self.left.append((self.out.radiance, s.row, lambda key=s.key: radiance_of(self.spec, key)))
+
+    def give(self, count: int, choose: int = 0) -> None:
+        """Hand over so many of the rows, in some order."""
+        for _ in range(min(count, len(self.left))):
+            take, row, values = self.left.pop(choose % len(self.left))
+            take(row, values())
+
+
+@dataclass
+class Reader:
+    """A SceneReader, and what it has been shown."""
+
+    number: int
+    reader: SceneReader
+    seen: set[int] = field(default_factory=set)
+    disturbed: set[int] = field(default_factory=set)  # jobs damaged or taken back since it refreshed
+
+
+# ---------------------------------------------------------------------------------------------------------- the machine
+
+
+class StoreMachine(RuleBasedStateMachine):
+    """Several processes at one store."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__()
+        self.root = root
+        self.stores = [Store(root, create=True) for _ in range(PROCESSES)]
+        self.models = [Model(spec, rows) for spec, rows in zip(SPECS, SHARD_ROWS, strict=True)]
+        for spec in SPECS:
+            self.stores[0].add(spec).write_base(*base_of(spec))
+        self.writers: list[Writer] = []
+        self.readers: list[Reader] = []
+        self.watchers = [SceneReader(root, spec.scene_id) for spec in SPECS]
+        self.quarantined: dict[str, bytes] = {}
+        self.dead: list[int] = []  # numbers of processes
+        self.steps = 0
+
+    def scene(self, number: int, process: int) -> SceneStore:
+        return self.stores[process].scene(SPECS[number].scene_id)
+
+    # ------------------------------------------------------------------------------------------------------------ plans
+
+    @rule(number=scene_numbers, process=processes, sizes=st.tuples(counts, counts, counts), seed=st.integers(0, 1))
+    def plan(self, number: int, process: int, sizes: tuple[int, int, int], seed: int) -> None:
+        """Sizes of the same seed overlap."""
+        model = self.models[number]
+        request = Request(modifications=sizes[0], views_per_modification=sizes[1], passes=sizes[2], seed=seed)
+        named = model.named(request)
+        if len(model.planned.keys() | named) > PLANNED_AT_MOST:
+            return
+        result = self.stores[process].plan(model.spec, request, shard_rows=model.shard_rows)
+        new = named - model.planned.keys()
+        assert (result.new, result.known) == (len(new), len(named) - len(new))
+        self._take_plan(number, new, result)
+
+    @precondition(lambda self: any(model.planned for model in self.models))
+    @rule(number=scene_numbers, process=processes, passes=counts, adds=st.booleans(), first=st.integers(0, 4))
+    def top_up(self, number: int, process: int, passes: int, adds: bool, first: int) -> None:
+        model = self.models[number]
+        chosen = list(model.views().items())[: first or None]
+        new, known = set(), 0
+        for (modification, view), shown in chosen:
+            have = 0 if adds else min(len(shown), passes)
+            after = max(s.pass_ for s in shown) + 1
+            new |= {model.key(modification, view, after + i) for i in range(passes - have)}
+            known += have
+        if not chosen or len(model.planned) + len(new) > PLANNED_AT_MOST:
+            return
+        spp = f"{'+' if adds else ''}{passes * spp_per_pass(model.spec)}"
+        request = TopUp.of(spp, [f"views=first:{first}"] if first else [])
+        result = self.scene(number, process).plan(request)
+        assert (result.new, result.known) == (len(new), known)
+        self._take_plan(number, new, result)
+
+    def _take_plan(self, number: int, new: set[bytes], result: Any) -> None:
+        """Take over a plan that must hold these keys, each once, and begin where the one before ended."""
+        model = self.models[number]
+        plans = Store(self.root).scene(model.spec.scene_id).plans()
+        assert len(plans) == model.plans + bool(new)
+        assert result.plan == (model.plans if new else None)
+        if not new:
+            return
+        plan = plans[-1]
+        assert plan.first_job == model.jobs
+        model.plans, model.jobs = len(plans), plan.end_job
+        rows = plan.rows
+        found = {}
+        for i in np.flatnonzero(rows.sample_modification != UNUSED).tolist():
+            view_row, modification_row = int(rows.sample_view[i]), int(rows.sample_modification[i])
+            of_view, of_modification = (self._plan_of(plans, row) for row in (view_row, modification_row))
+            sample = Planned(
+                of_modification.rows.modification[modification_row - of_modification.first_row].tobytes(),
+                of_view.rows.view[view_row - of_view.first_row].tobytes(),
+                int(rows.sample_pass[i]),
+                plan.first_row + i,
+                view_row,
+                modification_row,
+            )
+            key = rows.sample_key[i].tobytes()
+            assert key == model.key(sample.modification, sample.view, sample.pass_), "a row says what its key is of"
+            assert key not in found, "a key is planned once"
+            assert key not in model.planned, "a key is planned once"
+            found[key] = sample
+        assert found.keys() == new
+        model.planned |= found
+
+    @staticmethod
+    def _plan_of(plans: list[Any], row: int) -> Any:
+        return next(plan for plan in plans if plan.first_row <= row < plan.end_row)
+
+    # ---------------------------------------------------------------------------------------------------------- writing
+
+    def _some_job(self, number: int, which: int) -> int | None:
+        """A missing job; now and then any job."""
+        model = self.models[number]
+        missing = sorted(set(range(model.jobs)) - model.committed)
+        jobs = missing if missing and which % 8 else list(range(model.jobs))
+        return jobs[which // 8 % len(jobs)] if jobs else None
+
+    @precondition(lambda self: any(model.jobs for model in self.models) and len(self.writers) < 4)
+    @rule(number=scene_numbers, process=processes, which=any_index, count=st.integers(0, 12))
+    def open_writer(self, number: int, process: int, which: int, count: int) -> None:
+        """Also one for a job that another writer is at, or that is committed."""
+        if (job := self._some_job(number, which)) is not None:
+            writer = Writer(number, self.scene(number, process), job)
+            self.writers.append(writer)
+            writer.give(count, which)
+
+    @precondition(lambda self: self.writers)
+    @rule(which=any_index, count=counts)
+    def give_rows(self, which: int, count: int) -> None:
+        self.writers[which % len(self.writers)].give(count, which)
+
+    @precondition(lambda self: self.writers)
+    @rule(which=any_index)
+    def commit(self, which: int) -> None:
+        writer = self.writers.pop(which % len(self.writers))
+        committed = self.models[writer.number].committed
+        with writer.out:
+            writer.give(len(writer.left))
+            assert writer.out.commit(samples.FIGURES) is (writer.job not in committed)
+        committed.add(writer.job)
+
+    @precondition(lambda self: any(writer.left for writer in self.writers))
+    @rule(which=any_index)
+    def commit_too_early(self, which: int) -> None:
+        begun = [writer for writer in self.writers if writer.left]
+        with pytest.raises(IncompleteError, match="is missing"):
+            begun[which % len(begun)].out.commit(samples.FIGURES)
+
+    @precondition(lambda self: self.writers)
+    @rule(which=any_index)
+    def give_up(self, which: int) -> None:
+        with self.writers.pop(which % len(self.writers)).out:
+            pass
+
+    @precondition(lambda self: any(len(model.committed) < model.jobs for model in self.models))
+    @rule(number=scene_numbers, process=processes, which=any_index)
+    def render(self, number: int, process: int, which: int) -> None:
+        """A job from beginning to end."""
+        if (job := self._some_job(number, which)) is not None:
+            self.writers.append(Writer(number, self.scene(number, process), job))
+            self.commit(len(self.writers) - 1)
+
+    @precondition(lambda self: any(len(model.committed) < model.jobs for model in self.models))
+    @rule(
+        number=scene_numbers, process=processes, which=any_index,
+        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 11), after=st.booleans(),
+    )  # fmt: skip
+    def die(self, number: int, process: int, which: int, given: int, links: int, after: bool) -> None:
+        """A process of its own, which is killed: in the middle of its rows, or before or after a link of its commit."""
+        if (job := self._some_job(number, which)) is None:
+            return
+        scene = self.scene(number, process)
+        scene.job_rows(job)  # the plans are loaded here: a fork shall not have to
+        told, tell = os.pipe()
+        if (pid := os.fork()) == 0:
+            try:
+                os.close(told)
+                _doomed(scene, job, given, links, after, tell)
+            finally:
+                os.kill(os.getpid(), signal.SIGKILL)
+        os.close(tell)
+        assert os.WTERMSIG(os.waitpid(pid, 0)[1]) == signal.SIGKILL
+        with os.fdopen(told, "rb") as told_of:
+            said = told_of.read()
+        assert said in (b"", b"marker"), said.decode()
+        if said == b"marker":
+            self.models[number].committed.add(job)
+        self.dead.append(pid)
+
+    # ---------------------------------------------------------------------------------------------- processes and sweeps
+
+    @rule(process=processes)
+    def open_again(self, process: int) -> None:
+        """As another process does, which has seen nothing yet."""
+        self.stores[process] = Store(self.root)
+
+    @rule(process=processes, at_once=st.booleans())
+    def sweep(self, process: int, at_once: bool) -> None:
+        parts = self._parts()
+        of_the_dead = {name for name in parts if any(f"-{pid}-" in name for pid in self.dead)}
+        swept = self.stores[process].sweep(**({"stray_age_s": -1} if at_once else {}))
+        assert swept == (len(of_the_dead) if at_once else 0)  # nothing here is old enough otherwise
+        assert self._parts() == parts - (of_the_dead if at_once else set())
+
+    def _parts(self) -> set[str]:
+        return set(self.stores[0].storage.names("tmp"))
+
+    # ---------------------------------------------------------------------------------------------------------- reading
+
+    @precondition(lambda self: len(self.readers) < 3)
+    @rule(number=scene_numbers)
+    def open_reader(self, number: int) -> None:
+        self.readers.append(Reader(number, SceneReader(self.root, SPECS[number].scene_id)))
+
+    @precondition(lambda self: self.readers)
+    @rule(which=any_index)
+    def refresh(self, which: int) -> None:
+        following = self.readers[which % len(self.readers)]
+        complete = set(self.models[following.number].complete())
+        new = set(following.reader.refresh().tolist())
+        assert new == complete - following.seen
+        assert set(following.reader.taken_back.tolist()) == following.seen - complete
+        assert set(following.reader.rows.tolist()) == complete
+        following.seen, following.disturbed = complete, set()
+
+    @precondition(lambda self: any(reader.seen for reader in self.readers))
+    @rule(which=any_index, row=any_index)
+    def read(self, which: int, row: int) -> None:
+        """Also samples that have been taken back, of which this reader has not heard yet."""
+        readers = [reader for reader in self.readers if reader.seen]
+        following = readers[which % len(readers)]
+        rows = sorted(following.seen)
+        self._read(following, rows[row % len(rows)])
+
+    @precondition(lambda self: self.readers)
+    @rule(which=any_index, row=any_index)
+    def read_what_is_not_complete(self, which: int, row: int) -> None:
+        following = self.readers[which % len(self.readers)]
+        model = self.models[following.number]
+        others = sorted(set(range(model.jobs * model.shard_rows + 2)) - following.seen)
+        with pytest.raises(StoreError, match="is not complete"):
+            following.reader.read(others[row % len(others)])
+
+    def _read(self, following: Reader, row: int) -> None:
+        model = self.models[following.number]
+        sample = next(s for s in model.planned.values() if s.row == row)
+        try:
+            _compare(following.reader, row, model)
+        except CorruptError:
+            assert model.jobs_of(sample) & following.disturbed, "what nobody has touched reads whole"
+
+    # --------------------------------------------------------------------------------------------------------- damage
+
+    @precondition(lambda self: any(model.committed for model in self.models))
+    @rule(
+        number=scene_numbers, process=processes, which=any_index, file=any_index, at=st.floats(0, 1),
+        harm=st.sampled_from(["flip", "flip", "cut", "cut", "delete", "cut marker", "delete marker"]),
+    )  # fmt: skip
+    def damage_and_repair(self, number: int, process: int, which: int, file: int, at: float, harm: str) -> None:
+        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left."""
+        model = self.models[number]
+        if not model.committed:
+            return
+        scene = self.scene(number, process)
+        job = sorted(model.committed)[which % len(model.committed)]
+        marker = f"{scene.name}/committed/{job:012d}.json"
+        files = sorted(f"{scene.name}/{name}" for name in scene.marker(job)["files"])
+        _harm(self.root / (marker if "marker" in harm else files[file % len(files)]), harm.split()[0], at)
+        self._disturb(number, job)
+        fresh = Reader(number, SceneReader(self.root, SPECS[number].scene_id), disturbed={job})
+        for row in fresh.reader.refresh().tolist():
+            self._read(fresh, row)
+
+        left = {name: (self.root / name).read_bytes() for name in [marker, *files] if (self.root / name).exists()}
+        report = check_store(self.stores[process], when="now", repair=True)
+        model.committed.discard(job)
+        aside = {each.scene_id: each.set_aside for each in report.scenes}
+        without_marker = harm == "delete marker"  # nobody knows that it was there
+        assert aside.pop(model.spec.scene_id) == (() if without_marker else (f"job {job}",))
+        assert set(aside.values()) <= {()}
+        assert report.exit_code == (0 if without_marker else 7)
+        moved = {name: content for name, content in left.items() if not (self.root / name).exists()}
+        assert moved == ({} if without_marker else left)
+        for name, content in moved.items():
+            place = f"{report.quarantine}/{name}"
+            assert place not in self.quarantined
+            assert (self.root / place).read_bytes() == content, "what is quarantined is what was there"
+        for path in (p for p in (self.root / "quarantine").rglob("*") if p.is_file()):
+            self.quarantined.setdefault(str(path), path.read_bytes())
+
+    @precondition(lambda self: self.dead)
+    @rule(number=scene_numbers, which=any_index, at=st.floats(0, 1), harm=st.sampled_from(["flip", "cut", "delete"]))
+    def damage_what_a_dead_writer_left(self, number: int, which: int, at: float, harm: str) -> None:
+        """Under its final name, without a marker: whoever commits the job next must not announce it."""
+        model = self.models[number]
+        scene = Store(self.root).scene(model.spec.scene_id)
+        left = [
+            path
+            for plan in scene.plans()
+            for path in sorted((self.root / plan.folder).glob("*/c.*"))
+            if path.parent.name in WRITTEN and plan.first_job + int(path.name.split(".")[1]) not in model.committed
+        ]
+        if left:
+            path = left[which % len(left)]
+            _harm(path, harm, at)
+
+    def _disturb(self, number: int, job: int) -> None:
+        for following in self.readers:
+            if following.number == number:
+                following.disturbed.add(job)
+
+    # -------------------------------------------------------------------------------------------------- what must hold
+
+    @invariant()
+    def what_is_committed_is_what_the_model_says(self) -> None:
+        for model in self.models:
+            scene = Store(self.root).scene(model.spec.scene_id)
+            assert scene.committed_jobs() == model.committed
+
+    @invariant()
+    def who_looks_after_each_step_sees_every_complete_sample_bit_for_bit(self) -> None:
+        self.steps += 1
+        for watcher, model in zip(self.watchers, self.models, strict=True):
+            complete = model.complete()
+            watcher.refresh()
+            assert watcher.rows.tolist() == sorted(complete)
+            assert watcher.planned == len(model.planned)
+            for i in range(min(2, len(complete))):
+                _compare(watcher, sorted(complete)[(self.steps * 2 + i) % len(complete)], model)
+
+    @invariant()
+    def what_is_quarantined_stays(self) -> None:
+        for path, content in self.quarantined.items():
+            assert Path(path).read_bytes() == content
+
+    @invariant()
+    def the_parts_of_living_writers_stay(self) -> None:
+        for writer in self.writers:
+            assert all(shard.part.exists() for shard in list(writer.out._shards.values()))
+
+    def teardown(self) -> None:
+        """Render what is missing; then everything is there, once, and nothing is wrong."""
+        try:
+            while self.writers:
+                self.give_up(0)
+            for number, model in enumerate(self.models):
+                for job in sorted(set(range(model.jobs)) - model.committed):
+                    self.writers.append(Writer(number, self.scene(number, 0), job))
+                    self.commit(0)
+                reader = SceneReader(self.root, model.spec.scene_id)
+                assert len(reader.refresh()) == len(model.planned)
+                assert {_compare(reader, row, model) for row in reader.rows.tolist()} == model.planned.keys()
+            for following in self.readers:
+                self.refresh(self.readers.index(following))
+                for row in sorted(following.seen):
+                    self._read(following, row)
+            report = check_store(Store(self.root), when="now")
+            assert report.exit_code == 0
+            assert self.stores[0].sweep(stray_age_s=-1) <= 12 * len(self.dead)
+            assert self._parts() == set()
+        finally:
+            for writer in self.writers:
+                with writer.out:
+                    pass
+
+
+WRITTEN = {"radiance", "radiance_wide", "depth", "albedo", "normal"} | {
+    f"photon_{name}" for name in ("position", "direction", "normal", "power", "bounce")
+}
+
+
+def _compare(reader: SceneReader, row: int, model: Model) -> bytes:
+    """Read a row, and compare it bit for bit with what the model has under its key; the key."""
+    sample = reader.read(row)
+    modification, view = sample.modification.vector.tobytes(), sample.view.vector.tobytes()
+    key = model.key(modification, view, sample.pass_)
+    assert model.complete().get(row, key) == key
+    assert model.planned[key].row == row
+    np.testing.assert_array_equal(sample.radiance, radiance_of(model.spec, key))
+    for name, values in arrays_of(buffers_of(model.spec, modification, view)).items():
+        np.testing.assert_array_equal(getattr(sample.buffers, name), values, name)
+    if model.spec.photons.paths:
+        stored = arrays_of(reader.read_photons(row))
+        for name, values in arrays_of(photons_of(model.spec, modification)).items():
+            np.testing.assert_array_equal(stored[name], values, name)
+    return key
+
+
+def _harm(path: Path, harm: str, at: float) -> None:
+    """Flip a bit somewhere, cut the file there, or remove it."""
+    content = path.read_bytes()
+    place = min(int(at * len(content)), len(content) - 2)
+    if harm == "delete":
+        path.unlink()
+    elif harm == "cut":
+        os.truncate(path, place)
+    else:
+        with path.open("r+b") as file:
+            file.seek(place)
+            file.write(bytes([content[place] ^ 1 << place % 8]))
+
+
+def _doomed(scene: SceneStore, job: int, given: int, links: int, after: bool, tell: int) -> None:
+    """In a process of its own: write, and be killed; says whether the marker was placed before that."""
+    try:
+        plain, left = os.link, itertools.count(1)
+
+        def dying(source: Any, target: Any) -> None:
+            last = next(left) == links
+            if last and not after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            plain(source, target)
+            if "committed" in str(target):
+                os.write(tell, b"marker")
+            if last:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+        writer = Writer(0, scene, job)
+        writer.give(given)
+        if not writer.left:
+            os.link = dying
+            writer.out.commit(samples.FIGURES)
+    except BaseException as error:
+        os.write(tell, repr(error).encode())
+
+
+def test_a_reader_that_did_not_look_while_a_job_was_repaired_and_rendered_again_reads_what_is_there_now(
+    tmp_path: Path,
+) -> None:
+    """The committed jobs are the same as before, and the shard that it has kept open is the damaged one."""
+    machine = StoreMachine(tmp_path / "store")
+    machine.plan(number=0, process=0, sizes=(2, 1, 1), seed=0)
+    machine.render(number=0, process=0, which=1)
+    machine.open_reader(number=0)
+    machine.refresh(which=0)
+    rows = len(machine.readers[0].seen)
+    for row in range(rows):
+        machine.read(which=0, row=row)
+    for file in range(len(machine.scene(0, 0).marker(0)["files"])):
+        machine.damage_and_repair(number=0, process=0, which=0, file=file, at=0.3, harm="flip")
+        machine.render(number=0, process=0, which=1)
+        machine.refresh(which=0)
+        for row in range(rows):
+            machine.read(which=0, row=row)
+    machine.teardown()
+
+
+def test_a_store_under_random_use_is_what_a_dictionary_would_be(tmp_path: Path) -> None:
+    number = itertools.count()
+    run_state_machine_as_test(
+        lambda: StoreMachine(tmp_path / str(next(number))),
+        settings=settings(
+            max_examples=EXAMPLES or 25,
+            stateful_step_count=STEPS,
+            derandomize=not EXAMPLES,
+            database=None,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

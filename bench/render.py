@@ -1,6 +1,8 @@
 #!/usr/bin/env python3
 """Compares `bdpt` with its peers at equal time: Mitsuba's `path` and `ptracer`, and pyluxcore's BIDIRCPU.
 
+`path` is measured with Mitsuba's independent sampler and with its best stratified one.
+
     python bench/render.py [--scene cornell cove] [--methods path bdpt] [--seconds 1] [--seeds 8] [--quick]
 
 Each scene's result is kept as JSON in OUT/render/ and not measured again with equal settings and an equal integrator;
@@ -24,6 +26,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import results
 from render_peers import chosen, page, plot
 from render_peers.measure import Settings, measure, say
 from render_peers.plans import METHODS, PLANS, estimated_seconds
@@ -70,8 +73,8 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     key = {**asdict(settings), "methods": list(settings.methods), "versions": versions(), "code": code()}
     pending = [name for name in arguments.scene if kept(folder, name, key) is None]
-    s, pilot = settings, "chosen" in settings.methods and not settings.chosen
-    seconds = estimated_seconds(len(pending), len(s.methods), s.seeds, s.seconds, s.reference, pilot=pilot)
+    s, pilot_s = settings, settings.pilot_seconds if "chosen" in settings.methods and not settings.chosen else 0.0
+    seconds = estimated_seconds(len(pending), len(s.methods), s.seeds, s.seconds, s.reference, pilot_s)
     say(f"{len(pending)} of {len(arguments.scene)} scenes to measure: about {seconds / 60:.0f} minutes")
     try:
         left_out = run(pending, settings, folder, key)
@@ -87,6 +90,7 @@ def run(pending: list[str], settings: Settings, folder: Path, key: dict[str, Any
     left_out: dict[str, str] = {}
     if not pending:
         return left_out
+    commit = results.commit()  # before measuring: others may commit meanwhile
     with tempfile.TemporaryDirectory(prefix="kernels-", ignore_cleanup_errors=True) as cache:
         os.environ["DRJIT_CACHE_DIR"] = cache  # an empty cache: compile times are those of a first use
         from photonfarm.renderer import backend
@@ -101,7 +105,7 @@ def run(pending: list[str], settings: Settings, folder: Path, key: dict[str, Any
                 left_out[name] = str(error)
                 continue
             result = measure(name, PLANS[name], settings, scene)
-            result |= {"settings": key, "machine": machine(), "took_s": time.perf_counter() - start}
+            result |= {"settings": key, "machine": machine(), "commit": commit, "took_s": time.perf_counter() - start}
             store(folder / f"{name}.json", result)
             say(f"  took {result['took_s']:.0f} s")
             del scene

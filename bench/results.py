@@ -1,4 +1,4 @@
-"""Where the benchmarks put their tables: docs/results/NAME.md and NAME.json, with the command that made them."""
+"""Where the benchmarks put their tables: docs/results/NAME.md and NAME.json, with command and commit."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import platform
 import shlex
 import statistics
+import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
@@ -22,12 +23,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the Markdown and JSON (docs/results)")
 
 
-def write(name: str, text: str, values: dict[str, Any], out: Path) -> None:
-    """Write NAME.md and NAME.json into `out`, and print the Markdown."""
+def write(name: str, text: str, values: dict[str, Any], out: Path, page: str = "") -> None:
+    """Write the tables of bench/NAME.py into `out` as Markdown and JSON, named NAME or `page`; print the Markdown."""
+    stem = page or name
     out.mkdir(parents=True, exist_ok=True)
-    document = {"command": command(name), "machine": machine(), **values}
-    (out / f"{name}.md").write_text(text + "\n", encoding="utf-8")
-    (out / f"{name}.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    document = {"command": command(name), "commit": commit(), "machine": machine(), **values}
+    (out / f"{stem}.md").write_text(text + "\n", encoding="utf-8")
+    (out / f"{stem}.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     print(text)
 
 
@@ -45,10 +47,29 @@ def machine() -> dict[str, Any]:
     return {"cores": os.cpu_count(), "architecture": platform.machine(), "load_average": load, **packages}
 
 
+def commit() -> str:
+    """The commit of this checkout, abbreviated, and whether more is changed than results; 'unknown' without git.
+
+    The results' own folder does not count: a benchmark writes there while it runs.
+    """
+    try:
+        head = _git("rev-parse", "--short", "HEAD")
+        changed = _git("status", "--porcelain", "--", ".", ":(exclude)docs/results")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + (" with uncommitted changes" if changed else "")
+
+
+def _git(*arguments: str) -> str:
+    """What git says about this checkout."""
+    root = FOLDER.parents[1]
+    return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def footer(name: str) -> str:
-    """Command and machine, as the last line of a page."""
+    """Command, commit and machine, as the last line of a page."""
     made_on = ", ".join(f"{key} {value}" for key, value in machine().items())
-    return f"Made by `{command(name)}` ({made_on})."
+    return f"Made by `{command(name)}` at commit {commit()} ({made_on})."
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -70,6 +70,10 @@ class LuxCoreMethod:
         cost = json.loads(self._answer())
         return Shot(np.load(path), cost["wall_s"], cost["cpu_s"])
 
+    def possible(self, spp: float) -> int:
+        """As `Method`."""
+        return max(1, round(spp))
+
     def _answer(self) -> str:
         assert self._child.stdout is not None
         with selectors.DefaultSelector() as selector:

@@ -12,7 +12,7 @@ import numpy as np
 
 from . import chosen, luxcore, luxcore_scene, scoring
 from .errors import Reference, reference_of
-from .methods import Calibration, Method, MitsubaMethod, Shot, calibrate, integrator
+from .methods import Calibration, Method, MitsubaMethod, Shot, calibrate, integrator, multijittered
 from .plans import BUDGETS, ScenePlan
 
 REFERENCE_IMAGES = 8
@@ -57,7 +57,8 @@ class Line:
 
     def method(self, name: str, chosen: dict[str, Any] | None = None) -> MitsubaMethod:
         """One of Mitsuba's methods on this scene; `chosen` holds the parameters of the method 'chosen'."""
-        return MitsubaMethod(self.scene, integrator(name, self.plan.max_depth, chosen or {}))
+        camera = multijittered(self.scene) if name == "path-multijitter" else None
+        return MitsubaMethod(self.scene, integrator(name, self.plan.max_depth, chosen or {}), camera)
 
 
 def measure(name: str, plan: ScenePlan, settings: Settings, scene: Any) -> dict[str, Any]:
@@ -82,7 +83,8 @@ def measure(name: str, plan: ScenePlan, settings: Settings, scene: Any) -> dict[
             **settled.parameters(), "pilot_wall_s": settled.pilot_wall_s, "why": settled.why
         },
         "absent": absent, "differences": sorted(differences),
-        "rows": rows, "curves": scoring.curves(measured, references, settings.clock),
+        "rows": rows, "gains": scoring.gains("chosen", measured, references, settings.clock),
+        "curves": scoring.curves(measured, references, settings.clock),
     }  # fmt: skip
 
 

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
-from .plans import BASELINE
-
-Z_LIMIT = 3.5
-SAME_SCENE = 0.05
-LABELS = {
-    "path": "`path`",
-    "ptracer": "`ptracer`",
-    "bdpt": "`bdpt` (1, 1)",
-    "chosen": "`bdpt`, chosen",
-    "pyluxcore": "pyluxcore BIDIR",
-}
+from .plans import BASELINE, PLAN_SECONDS
+from .verdict import verdict
+from .wording import LABELS, SAME_SCENE, Z_LIMIT, figure, mark, table_line, table_rule
 
 EXPLANATION = """\
 One image of each method at the same {clock} time, {seconds:g} s on {threads}, at {size}² pixels; samples per
@@ -23,15 +14,24 @@ pixel follow from that. {seeds} independent images of each, the methods in turn.
 user has it, with tracing, launch and download; **compile** is what the first call took longer than a later one, apart.
 
 - **relMSE**: mean of (f − r)²/(r² + 0.01·mean(r)²) over images, pixels and channels, against a reference r that shares
-  no sample with the images; the reference's own variance is subtracted. Bias counts in full.
+  no sample with the images. Bias counts in full. The reference is noisy itself: its variance is subtracted from the
+  numerator, and what is left is its noise in the denominator, by which dark pixels count somewhat too much, for every
+  method alike.
 - **trimmed**: the same without the worst 1 % of the pixels, ranked by their error averaged over the images. Every
   method loses its own worst pixels, by the same rule: this forgives rare outliers and flatters methods that have them,
   and in the glass caustic it takes away most of the caustic, which is hardly more than 1 % of the image.
 - **mean**: of the images over that of the common reference.
 - **efficiency**: (relMSE × time) of `path` over that of the method, above 1 is better; ± is one standard error, by the
   delete-one jackknife over rounds. Rare light that none of the images met is in none of these errors.
-- `bdpt` (1, 1): one connection, one light path per eye path. **chosen**: by the pilot of `photonfarm scene plan`; its
-  time stands apart, in the table of scenes.
+- `path`, `ptracer`: Mitsuba's, with its `independent` sampler.
+- `path`, multijitter: `path` with the best of Mitsuba's stratified samplers, `multijitter`, in powers of four of
+  samples per pixel: other counts cost up to 40 % more per sample. So its images take half to twice the time; efficiency
+  counts it. (In Cornell's box `stratified` and `orthogonal` gain less, `ldsampler`'s mean is off by 0.4 %, and
+  `ptracer` gains nothing by any of them.)
+- `bdpt` (connections, light paths per eye path): with Owen-scrambled Sobol' points for eye and light paths. (0, 0) is a
+  path tracer with these points: what (1, 1) gains over it is due to light paths, not to the points.
+- `bdpt`, **chosen**: by the pilot of `photonfarm scene plan`, {pilot};
+  its time stands apart, in the table of scenes.
 - pyluxcore {luxcore}: BIDIRCPU in a process of its own, RGB, Sobol' sampler, no Russian roulette; its
   acceleration structure is built before the clock starts, as Mitsuba's is on loading. It bounds its eye path and its
   light path, not their sum, so that its images hold some longer paths and are brighter by them; its errors are taken
@@ -47,13 +47,19 @@ In the plots (linked) filled markers are images rendered at that time, hollow on
 def page(results: list[dict[str, Any]], settings: dict[str, Any], machine: str) -> str:
     """The whole page."""
     head = "# `bdpt` against its peers, at equal time\n\n    make bench-render\n\n"
+    pilot = f"given {settings['pilot_seconds']:g} s of CPU time here and {PLAN_SECONDS:g} s there by default"
+    if settings["chosen"]:
+        pilot = f"but given here: {settings['chosen']}"
     text = EXPLANATION.format(
+        pilot=pilot,
         clock=settings["clock"], seconds=settings["seconds"], threads=plural(settings["threads"], "thread"),
         size=settings["size"],
         seeds=settings["seeds"], luxcore=settings["versions"].get("pyluxcore", "(absent)"), z=Z_LIMIT, same=SAME_SCENE,
     )  # fmt: skip
     versions = ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
-    parts = [head + text, f"Measured on {machine}; {versions}.\n", *summary(results), *scenes(results)]
+    commits = ", ".join(sorted({result["commit"] for result in results}))
+    measured = f"Measured on {machine}; {versions}; made at commit {commits}.\n"
+    parts = [head + text, measured, *summary(results), *verdict(results), *scenes(results)]
     return "\n".join(parts + [line for result in results for line in details(result)])
 
 
@@ -65,11 +71,11 @@ def plural(count: int, noun: str) -> str:
 def summary(results: list[dict[str, Any]]) -> list[str]:
     """Efficiencies of all scenes, full / trimmed."""
     methods = [m for m in LABELS if m != "path" and any(m in r["rows"] for r in results)]
-    lines = ["## Efficiency relative to `path`: full / trimmed\n", _row("scene", *(LABELS[m] for m in methods))]
-    lines.append(_rule(1 + len(methods)))
+    lines = ["## Efficiency relative to `path`: full / trimmed\n", table_line("scene", *(LABELS[m] for m in methods))]
+    lines.append(table_rule(1 + len(methods)))
     for result in results:
         cells = [efficiencies(result, method) for method in methods]
-        lines.append(_row(f"[{result['line']}](render/{result['line']}.png)", *cells))
+        lines.append(table_line(f"[{result['line']}](render/{result['line']}.png)", *cells))
     return [*lines, ""]
 
 
@@ -83,7 +89,11 @@ def efficiencies(result: dict[str, Any], method: str) -> str:
 
 def scenes(results: list[dict[str, Any]]) -> list[str]:
     """What was rendered, and against what."""
-    lines = ["## Scenes\n", _row("line", "scene", "max_depth", "reference", "chosen", "pyluxcore", "note"), _rule(7)]
+    lines = [
+        "## Scenes\n",
+        table_line("line", "scene", "max_depth", "reference", "chosen", "pyluxcore", "note"),
+        table_rule(7),
+    ]
     for r in results:
         picked = r["chosen"]
         chosen = (
@@ -93,7 +103,7 @@ def scenes(results: list[dict[str, Any]]) -> list[str]:
         )
         lux = r["absent"].get("pyluxcore") or "; ".join(r["differences"]) or "the same"
         lux = lux if "pyluxcore" in r["absent"] or "pyluxcore" in r["rows"] else "–"
-        lines.append(_row(r["line"], r["scene"], r["max_depth"], r["reference"], chosen, lux, r["note"]))
+        lines.append(table_line(r["line"], r["scene"], r["max_depth"], r["reference"], chosen, lux, r["note"]))
     return [*lines, ""]
 
 
@@ -101,7 +111,7 @@ def details(result: dict[str, Any]) -> list[str]:
     """One scene's table."""
     columns = ("method", "spp", "wall s", "CPU s", "compile s", "mean", "relMSE", "trimmed", "efficiency", "trimmed")
     lines = [f"## {result['line']}\n", f"![relMSE against time](render/{result['line']}.png)\n"]
-    lines += [_row(*columns), _rule(len(columns))]
+    lines += [table_line(*columns), table_rule(len(columns))]
     for method in (m for m in LABELS if m in result["rows"]):
         row = result["rows"][method]
         mean = f"{row['mean_ratio']['value']:.4f} ± {row['mean_ratio']['standard_error']:.4f}{mark(method, row)}"
@@ -110,44 +120,10 @@ def details(result: dict[str, Any]) -> list[str]:
         compiled = "in the pilot" if method == "chosen" and was_piloted(result) else f"{row['compile_s']:.1f}"
         costs = [f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", compiled]
         errors = [figure(row["full"]), figure(row["trimmed"])]
-        lines.append(_row(LABELS[method], row["spp"], *costs, mean, *errors, *efficiency))
+        lines.append(table_line(LABELS[method], row["spp"], *costs, mean, *errors, *efficiency))
     return [*lines, ""]
 
 
 def was_piloted(result: dict[str, Any]) -> bool:
     """Whether a pilot chose, which has compiled what it chose."""
     return bool(result["chosen"] and result["chosen"]["pilot_wall_s"] > 0)
-
-
-def mark(method: str, row: dict[str, Any]) -> str:
-    """' ‡' where the mean is off beyond chance, ' §' where pyluxcore renders another scene, else nothing."""
-    off, z = abs(row["mean_ratio"]["value"] - 1), abs(row["mean_ratio"]["z"])
-    if not row["finite"]:
-        return " (not finite)"
-    if method == "pyluxcore":
-        return " §" if z > Z_LIMIT and off > SAME_SCENE else ""
-    return " ‡" if z > Z_LIMIT and off > 1e-3 else ""
-
-
-def figure(estimate: dict[str, float]) -> str:
-    """'1.23 ± 0.04', or a dash where there is none: the reference's noise hides the error."""
-    value, error = estimate["value"], estimate["standard_error"]
-    if not math.isfinite(value):
-        return "–"
-    return number(value, 3) + (f" ± {number(error, 1)}" if math.isfinite(error) else "")
-
-
-def number(value: float, digits: int) -> str:
-    """Significant digits without exponents from 0.001 on."""
-    if value == 0 or abs(value) < 1e-3:
-        return f"{value:.{digits}g}"
-    decimals = digits - 1 - math.floor(math.log10(abs(value)))
-    return f"{round(value, decimals):.{max(0, decimals)}f}"
-
-
-def _row(*cells: Any) -> str:
-    return "| " + " | ".join(str(cell) for cell in cells) + " |"
-
-
-def _rule(columns: int) -> str:
-    return "|" + "---|" * columns

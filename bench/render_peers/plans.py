@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-METHODS = ("path", "ptracer", "bdpt", "chosen", "pyluxcore")
+METHODS = ("path", "path-multijitter", "ptracer", "bdpt-eye", "bdpt", "chosen", "pyluxcore")
+PEERS = ("path", "path-multijitter", "ptracer", "pyluxcore")
+FIXED = ("bdpt-eye", "bdpt")
+"""Settings of `bdpt` that no pilot chose."""
+PLAN_SECONDS = 60.0
+"""CPU time of the pilot in `photonfarm scene plan` by default."""
 BASELINE = "path"
 BUDGETS = (1 / 16, 1 / 4, 1.0)
 """Shares of the time budget that images are rendered at; longer times are averages of the last."""
@@ -41,11 +46,11 @@ PLANS: dict[str, ScenePlan] = {
 """Every line by its name. `path` is left out of references where its noise is far above that of `bdpt`."""
 
 
-def estimated_seconds(lines: int, methods: int, seeds: int, seconds: float, reference: float, *, pilot: bool) -> float:
+def estimated_seconds(lines: int, methods: int, seeds: int, seconds: float, reference: float, pilot_s: float) -> float:
     """Expected duration of a run, rather too long: every method counts for every scene, also pyluxcore.
 
     Per method: `seeds` images at each budget, about four for calibration; two long references per scene; half a
-    minute per scene to load and to compile, and 45 s for a pilot (a quarter of that in small scenes, twice in large).
+    minute per scene to load and to compile, and a quarter more than its time for a pilot (twice that in large scenes).
     """
     per_method = (seeds * sum(BUDGETS) + 4) * seconds
-    return lines * (methods * per_method + 2 * reference * seconds + 30 + 45 * pilot)
+    return lines * (methods * per_method + 2 * reference * seconds + 30 + 1.25 * pilot_s)

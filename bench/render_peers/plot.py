@@ -7,7 +7,9 @@ from typing import Any
 
 STYLES = {
     "path": ("tab:gray", "o", "path"),
+    "path-multijitter": ("black", "P", "path, multijitter"),
     "ptracer": ("tab:orange", "s", "ptracer"),
+    "bdpt-eye": ("tab:cyan", "<", "bdpt (0, 0)"),
     "bdpt": ("tab:blue", "^", "bdpt (1, 1)"),
     "chosen": ("tab:red", "D", "bdpt, chosen"),
     "pyluxcore": ("tab:green", "v", "pyluxcore BIDIR"),

@@ -52,6 +52,25 @@ def rows(measured: Mapping[str, Measured], references: Mapping[str, Reference], 
     return result
 
 
+def gains(
+    of: str, measured: Mapping[str, Measured], references: Mapping[str, Reference], clock: str
+) -> dict[str, dict[str, Any]]:
+    """(relMSE × time) of each other method over that of the method `of`: 'full' and 'trimmed', above 1 `of` is better.
+
+    Round by round, as drift of the machine meets the methods of one round alike. Empty where `of` is not measured.
+    """
+    if of not in measured:
+        return {}
+    common = references["common"]
+    scored = {name: _scored(m.shots[-1], references[name], common, clock) for name, m in measured.items()}
+    own, own_seconds = scored.pop(of)
+    kinds = (("full", full_error), ("trimmed", trimmed_error))
+    return {
+        name: {kind: asdict(efficiency(own, own_seconds, *other, measure)) for kind, measure in kinds}
+        for name, other in scored.items()
+    }
+
+
 def curves(
     measured: Mapping[str, Measured], references: Mapping[str, Reference], clock: str
 ) -> dict[str, list[dict[str, Any]]]:

@@ -8,23 +8,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import render
-from render_peers import page, scoring
+from photonfarm.renderer.cli import scene_plan
+from render_peers import page, scoring, verdict, wording
 from render_peers.chosen import given
 from render_peers.errors import reference_of
 from render_peers.measure import Measured
 from render_peers.methods import Shot, calibrate
-from render_peers.plans import BUDGETS, PLANS, estimated_seconds
+from render_peers.plans import BUDGETS, METHODS, PLAN_SECONDS, PLANS, estimated_seconds
 
 TRUTH = np.ones((16, 16, 3))
 
 
 class Clockwork:
-    """A method whose images cost 10 ms and 1 ms a sample, and whose variance is 1/spp."""
+    """A method whose images cost 10 ms and 1 ms a sample, and whose variance is 1/spp; spp in multiples of `grid`."""
 
-    def __init__(self, noise: float = 1.0, fixed_s: float = 0.01, sample_s: float = 0.001) -> None:
-        self.noise, self.fixed_s, self.sample_s, self.calls = noise, fixed_s, sample_s, 0
+    def __init__(self, noise: float = 1.0, fixed_s: float = 0.01, sample_s: float = 0.001, grid: int = 1) -> None:
+        self.noise, self.fixed_s, self.sample_s, self.grid, self.calls = noise, fixed_s, sample_s, grid, 0
 
     def render(self, seed: int, spp: int) -> Shot:
         self.calls += 1
@@ -33,8 +35,17 @@ class Clockwork:
         seconds = self.fixed_s + spp * self.sample_s
         return Shot((TRUTH + noise).astype(np.float32), seconds + compiling, seconds)
 
+    def possible(self, spp: float) -> int:
+        return max(self.grid, round(spp / self.grid) * self.grid)
+
     def close(self) -> None:
         pass
+
+
+KEY = {
+    "clock": "wall", "seconds": 0.5, "threads": 1, "size": 16, "seeds": 8, "versions": {"mitsuba": "3.9.1"},
+    "pilot_seconds": 20.0, "chosen": "",
+}  # fmt: skip
 
 
 def measured(method: Clockwork, base: int, seeds: int = 8) -> Measured:
@@ -43,14 +54,17 @@ def measured(method: Clockwork, base: int, seeds: int = 8) -> Measured:
     return Measured(calibration, shots)
 
 
-def result_of(name: str = "cornell") -> dict[str, Any]:
-    sets = {"path": measured(Clockwork(), 1000), "bdpt": measured(Clockwork(noise=0.5), 2000)}
+def result_of(name: str = "cornell", chosen_noise: float = 0.5) -> dict[str, Any]:
+    noises = {"path": 1.0, "path-multijitter": 0.8, "ptracer": 0.7, "bdpt": 0.5, "chosen": chosen_noise}
+    sets = {method: measured(Clockwork(noise), 1000 * k) for k, (method, noise) in enumerate(noises.items(), 1)}
     reference = reference_of([np.stack([Clockwork().render(k, 100_000).image for k in range(8)])])
     references = dict.fromkeys([*sets, "common"], reference)
     return {
-        "line": name, "scene": name, "max_depth": 8, "note": "", "reference": "test", "chosen": None,
+        "line": name, "scene": name, "max_depth": 8, "note": "", "reference": "test",
+        "chosen": {"connections": 4, "light_ratio": 0.25, "pilot_wall_s": 20.0, "why": ""}, "commit": "0123abc",
         "absent": {"pyluxcore": "not expressible: a test"}, "differences": [],
-        "rows": scoring.rows(sets, references, "wall"), "curves": scoring.curves(sets, references, "wall"),
+        "rows": scoring.rows(sets, references, "wall"),
+        "gains": scoring.gains("chosen", sets, references, "wall"), "curves": scoring.curves(sets, references, "wall"),
     }  # fmt: skip
 
 
@@ -59,6 +73,11 @@ def test_calibration_meets_the_time_budget_and_tells_compilation_apart() -> None
     assert found.spp[1] == pytest.approx(490, rel=0.15)
     assert found.spp[0] == pytest.approx(115, rel=0.05)
     assert found.compile_s == pytest.approx(1.5)
+
+
+# Grids of 300 samples: 0.5 s would take 490, the nearest is 600, which takes 0.61 s.
+def test_a_method_that_takes_few_numbers_of_samples_gets_the_nearest() -> None:
+    assert calibrate(Clockwork(grid=300), (0.125, 0.5), "wall").spp == (300, 600)
 
 
 def test_a_method_too_slow_for_the_budget_gets_one_sample() -> None:
@@ -82,13 +101,54 @@ def test_the_curve_ends_with_averages_of_two_and_four_images() -> None:
 
 
 def test_the_page_names_every_scene_method_and_reason() -> None:
-    key = {"clock": "wall", "seconds": 0.5, "threads": 1, "size": 16, "seeds": 8, "versions": {"mitsuba": "3.9.1"}}
-    text = page.page([result_of()], key, "a machine")
+    text = page.page([result_of()], KEY, "a machine")
     assert "make bench-render" in text
     assert "not expressible: a test" in text
     assert "![relMSE against time](render/cornell.png)" in text
     assert "| `bdpt` (1, 1) |" in text
     assert not [line for line in text.splitlines() if "nan" in line]
+
+
+def test_the_page_says_commit_samplers_and_seconds_of_the_pilot() -> None:
+    text = page.page([result_of()], KEY, "a machine")
+    assert "made at commit 0123abc." in text
+    assert "Owen-scrambled Sobol' points" in text
+    assert "given 20 s of CPU time here and 60 s there by default" in text
+    assert "but given here: 4,1" in page.page([result_of()], {**KEY, "chosen": "4,1"}, "a machine")
+
+
+def test_scene_plan_s_default_is_the_one_the_page_names() -> None:
+    help_text = CliRunner().invoke(scene_plan, ["--help"]).output
+    assert f"default: {PLAN_SECONDS:g}" in help_text
+
+
+# ptracer's noise is 0.7, so its efficiency is above that of multijitter, 0.8; a mean that is off takes it out.
+def test_the_best_peer_is_the_best_whose_mean_is_not_off() -> None:
+    result = result_of()
+    assert verdict.best_peer(result, "full") == "ptracer"
+    result["rows"]["ptracer"]["mean_ratio"] = {"value": 0.8, "standard_error": 0.01, "z": -9.0}
+    assert verdict.best_peer(result, "full") == "path-multijitter"
+    assert "(`path`, multijitter) |" in page.page([result], KEY, "a machine")
+
+
+# Variances 0.5² and 0.8² at one cost: 2.56. 8 × 768 values each: 2.6 % standard error, 15 % is beyond 5.
+def test_gains_are_the_ratio_of_error_times_time() -> None:
+    gains = result_of()["gains"]
+    assert gains["path-multijitter"]["full"]["value"] == pytest.approx(2.56, rel=0.15)
+    assert "chosen" not in gains
+
+
+def test_a_choice_that_loses_to_fixed_settings_is_told() -> None:
+    told = "In cornell *chosen*, (4, 0.25), is worse than `bdpt` (1, 1)"
+    assert told in page.page([result_of(chosen_noise=0.6)], KEY, "a machine")
+    better = page.page([result_of(chosen_noise=0.4)], KEY, "a machine")
+    assert told not in better
+    assert "No fixed setting of `bdpt` beats *chosen*" in better
+
+
+def test_without_the_method_chosen_there_is_no_verdict() -> None:
+    result = {**result_of(), "gains": {}, "chosen": None}
+    assert "best unbiased peer" not in page.page([result], KEY, "a machine")
 
 
 @pytest.mark.parametrize(
@@ -98,7 +158,7 @@ def test_the_page_names_every_scene_method_and_reason() -> None:
 )  # fmt: skip
 def test_a_doubtful_mean_is_marked(method: str, ratio: float, z: float, expected: str) -> None:
     row = {"finite": True, "mean_ratio": {"value": ratio, "standard_error": 0.01, "z": z}}
-    assert page.mark(method, row) == expected
+    assert wording.mark(method, row) == expected
 
 
 @pytest.mark.parametrize(
@@ -106,7 +166,7 @@ def test_a_doubtful_mean_is_marked(method: str, ratio: float, z: float, expected
     [(123.456, 3, "123"), (1234.0, 1, "1000"), (0.01234, 3, "0.0123"), (1.0, 3, "1.00"), (0.000012345, 3, "1.23e-05")],
 )
 def test_numbers_have_significant_digits(value: float, digits: int, text: str) -> None:
-    assert page.number(value, digits) == text
+    assert wording.number(value, digits) == text
 
 
 def test_a_plot_is_written_for_a_scene(tmp_path: Path) -> None:
@@ -128,7 +188,7 @@ def test_a_result_counts_only_for_equal_settings(tmp_path: Path) -> None:
 
 
 def test_the_default_run_is_planned_for_less_than_forty_minutes() -> None:
-    assert estimated_seconds(len(PLANS), 5, 8, 1.0, 16, pilot=True) < 40 * 60
+    assert estimated_seconds(len(PLANS), len(METHODS), 8, 1.0, 16, pilot_s=20) < 40 * 60
 
 
 def test_given_settings_are_checked() -> None:

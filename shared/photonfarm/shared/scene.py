@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -252,18 +252,26 @@ def _validate(described: dict[str, Any], where: str) -> SceneSpec:
     try:
         return SceneSpec.model_validate(described)
     except ValidationError as error:
-        raise SpecError(f"{where}: {'; '.join(sentences(error))}") from error
+        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec)))}") from error
 
 
-def sentences(error: ValidationError) -> Iterator[str]:
-    """One sentence for each fault that a model found: its key, the value and the rule."""
+def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str]:
+    """One sentence for each fault that a model found: its key, the value and the rule; `known` are keys it may have."""
     for fault in error.errors():
         key = ".".join(map(str, fault["loc"])) or "the spec"
         rule = fault["msg"].removeprefix("Value error, ")
         if fault["type"] in ("value_error", "missing"):
             yield f"{key}: {rule}"
+        elif fault["type"] == "extra_forbidden":
+            yield f"{key}: unknown key; nearest: {scene_files.nearest(str(fault['loc'][-1]), known)}"
         else:
             yield f"{key} = {fault['input']!r}: {rule}"
+
+
+def _keys(model: type[BaseModel]) -> set[str]:
+    """The keys of a model and of those in it."""
+    schema = model.model_json_schema()
+    return {key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", ())}
 
 
 def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:

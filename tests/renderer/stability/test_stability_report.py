@@ -13,7 +13,7 @@ from photonfarm.renderer.cli import report_stability
 from photonfarm.renderer.stability import report, rows
 from photonfarm.renderer.stability.case import Settings
 from photonfarm.renderer.stability.pictures import FULL_Z, SIDE, of_z, sheet
-from photonfarm.renderer.stability.runner import plus_minus, run
+from photonfarm.renderer.stability.runner import Result, plus_minus, run
 from photonfarm.renderer.stability.truths import known
 
 
@@ -51,6 +51,53 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     assert np.load(kept / "bdpt.npy").shape == (12, 16, 16, 3)
     assert (kept / "bdpt_truth_z.png").is_file()
     assert "## Failures" in (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
+
+
+def rounding(mean_ratio: float, **changes: Any) -> Result:
+    """A result that differs by 60 standard errors of its noise, but by less than rounding may."""
+    (refused,) = run(rows.REFUSALS[0], quick=True)
+    return replace(
+        refused.result, row=1, name="sphere", hard="all of it", truth="1 − ½^3", z_max=3.1, z_limit=5.4,
+        mean_ratio=mean_ratio, mean_ratio_standard_error=4e-6, resolution=0.003, seen_bias=0.00046,
+        seen_block_bias=4.5, max_over_mean=1.01, truth_max_over_mean=1.0, path_ratio=1.00066,
+        path_ratio_standard_error=5e-6, **changes,
+    )  # fmt: skip
+
+
+def test_what_passes_as_rounding_is_marked_and_stands_beside_path() -> None:
+    text = report.markdown(report.Report([rounding(1.00024)]), "made so")
+    assert "| 1.0002400 ± 4.0e-06 ° (≤ 0.003) | 1.0006600 ± 5.0e-06 | 0.046 %, 450 % |" in text
+    assert "- 01-sphere: `bdpt` +0.024 %, `path` +0.066 %" in text
+
+
+def test_what_is_right_or_fails_is_not_called_rounding() -> None:
+    for result in (rounding(1.00001), rounding(1.01, faults=("wrong",))):
+        assert "° (≤" not in report.markdown(report.Report([result]), "made so")
+
+
+def test_every_column_of_the_table_is_explained_in_a_line_of_its_own() -> None:
+    text = report.markdown(report.Report([rounding(1.0)]), "made so")
+    header = next(line for line in text.splitlines() if line.startswith("| row |"))
+    explained = [line for line in text.splitlines() if line.startswith("- **")]
+    for column in header.strip("| ").split(" | "):
+        told = column.partition(":")[0]
+        assert told in ("row", "scene", "verdict") or any(line.startswith(f"- **{told}**: ") for line in explained)
+
+
+def test_what_is_hard_is_said_once_for_each_row() -> None:
+    results = [rounding(1.0), rounding(1.0, settings="0,0"), replace(rounding(1.0), name="deep")]
+    assert "## What is hard\n\n- 1: all of it\n" in report.markdown(report.Report(results), "made so")
+    results.append(replace(rounding(1.0), name="dim", hard="light is rare"))
+    text = report.markdown(report.Report(results), "made so")
+    assert "- 1: *sphere, deep*: all of it; *dim*: light is rare\n" in text
+
+
+def test_path_is_compared_with_an_exact_truth_and_with_no_other() -> None:
+    by_label = {scene.label: scene for scene in rows.SCENES}
+    (exact,) = run(by_label["05-empty"], quick=True, settings=[Settings(1, 1.0)])
+    assert exact.result.path_ratio == pytest.approx(1.0, abs=1e-5)
+    (rendered,) = run(by_label["28-orthographic"], quick=True)
+    assert rendered.result.path_ratio is None
 
 
 def test_rows_and_scenes_are_counted_apart_and_refusals_without_a_row_by_themselves() -> None:

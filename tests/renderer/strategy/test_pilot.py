@@ -11,8 +11,9 @@ from photonfarm.renderer import backend
 mi = backend.load(threads=1)
 
 from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render  # noqa: E402
 from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights  # noqa: E402
-from photonfarm.renderer.strategy.pilot import PLAIN, Candidate, Render, choose  # noqa: E402
+from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
 from photonfarm.shared.statistics import block_z_test  # noqa: E402
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
@@ -77,7 +78,7 @@ def test_the_better_half_is_measured_longer_and_what_is_kept_to_the_end() -> Non
         )
 
     choice = choose(render, many, seconds=100, spp=1, clock=clock, keep=[many[7]])
-    images = {row.candidate: row.images for row in choice.measured}
+    images = {row.candidate: row.errors.images for row in choice.measured}
     assert images[PLAIN] == images[many[7]] == max(images.values())
     assert min(images.values()) == 8 < max(images.values())
 

@@ -4,17 +4,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from photonfarm.renderer import backend
 
 backend.load(threads=1)
 
-from photonfarm.renderer.strategy import cache  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy import cache, plan  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
+from photonfarm.renderer.strategy.comparison import Errors  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, Measurement, Row  # noqa: E402
-from photonfarm.renderer.strategy.pilot import PLAIN, Candidate, plus_minus  # noqa: E402
-from photonfarm.renderer.strategy.plan import _knows, plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import Plan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.printed import lines  # noqa: E402
+from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
 from photonfarm.shared.cli import main  # noqa: E402
 from photonfarm.shared.scene import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
 
@@ -42,88 +45,178 @@ def spec_with(**transport: Any) -> SceneSpec:
     return parse_spec(document, where="spec")
 
 
-def row(connections: int, ratio: float, cost: float, fixed_s: float, sample_s: float) -> Row:
+LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
+
+
+def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, scatter: float = 0.1) -> Row:
+    """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
+    own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
     return Row(
-        connections=connections, light_ratio=ratio, images=8, error=0.1, missed=0.0, relative_cost=cost,
-        spread=0.1 * cost if ratio else 0.0, fixed_s=fixed_s, sample_s=sample_s,
+        connections=candidate.connections, light_ratio=candidate.light_ratio, missed=0.0,
+        errors=Errors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
     )  # fmt: skip
 
 
-def measurement(chosen: Candidate) -> Measurement:
+def measurement(*rows: Row) -> Measurement:
+    """As of a spec with (1, 1) and 2 samples per pixel."""
+    default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
-        film=Film(width=16, height=16), spp=2, half_spp=2, views=3, max_depth=3,
-        modelled=("lights: 1 area",), left_out=(),
-        rows=(row(0, 0.0, 1.0, 0.01, 0.01), row(0, 1.0, 0.5, 0.02, 0.02), row(1, 1.0, 0.8, 0.02, 0.04)),
-        chosen=(chosen.connections, chosen.light_ratio), reasons=("measured",), filled=(1.0, 0.9, 0.8),
-        near=(1.0, 0.9, 0.8), power=(0.7, 0.295, 0.005), asked_s=60.0, spent_s=5.0, compiling_s=1.0,
+        film=Film(width=16, height=16), spp=2, half_s=0.1, views=3, max_depth=3,
+        modelled=("lights: 1 area",), left_out=(), rows=rows or default, shared=0.0, filled=(1.0, 0.9, 0.8),
+        near=((1.0, 0.9, 0.8),), power=((0.7, 0.295, 0.005),), asked_s=60.0, spent_s=5.0, compiling_s=1.0,
     )  # fmt: skip
+
+
+def text_of(found: Plan) -> str:
+    return "\n".join(lines(found))
 
 
 def test_a_half_keeps_its_cost() -> None:
     """(1, 1) at 8 samples takes 0.02 + 8·0.04 = 0.34 s; (0, 1) does 0.02 + 16·0.02 in that time."""
-    plan = plan_of(spec_with(half_spp=8), measurement(Candidate(0, 1.0)), cached=False)
-    assert plan.half_spp == 16
-    assert plan.settings["transport"] == {"connections": 0, "light_ratio": 1.0, "half_spp": 16}
-    assert plan.settings["photons"] == {"paths": 64, "depth": 2}
-    # once written, the plan asks for nothing else
-    written = spec_with(half_spp=16, connections=0, light_ratio=1.0)
-    assert plan_of(written, measurement(Candidate(0, 1.0)), cached=True).half_spp == 16
+    found = plan_of(spec_with(half_spp=8), measurement(), cached=False)
+    assert found.half_spp == 16
+    assert found.settings["transport"] == {"connections": 0, "light_ratio": 1.0, "half_spp": 16}
+    assert found.settings["photons"] == {"paths": 64, "depth": 2}
+    assert found.changes == found.settings
+
+
+def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -> None:
+    """At 2 samples (0, 1) has the least error × time: 0.08·0.10 s, plain path tracing 0.1·0.084 s.
+
+    In the 0.1 s that 2 samples of (1, 1) take, it has 2 samples still, plain path tracing has 10 of 0.02 relMSE.
+    """
+    rows = row(PLAIN, 0.1, 0.08, 0.002), row(LIGHT, 0.08, 0.0, 0.05), row(JOINED, 0.1, 0.02, 0.04)
+    rows = tuple(r.model_copy(update={"errors": r.errors.model_copy(update={"plain": (0.1,) * 3})}) for r in rows)
+    found = plan_of(spec_with(), measurement(*rows), cached=False)
+    assert (found.candidate, found.half_spp) == (PLAIN, 10)
+    assert found.offers[PLAIN].half_error == pytest.approx(0.1 * 2 / 10)
+    assert found.offers[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = [row(c, *np.exp(rng.normal(-3, 1, 3)), scatter=rng.uniform(0, 0.1)) for c in GRID]
+    plain = tuple(rows[0].errors.own)
+    rows = [r.model_copy(update={"errors": r.errors.model_copy(update={"plain": plain})}) for r in rows]
+    now = GRID[rng.integers(len(GRID))]
+    transport = {"connections": now.connections, "light_ratio": now.light_ratio, "half_spp": int(rng.integers(1, 9))}
+    half_s = next(r for r in rows if r.candidate == now).cost.time_s(transport["half_spp"])
+    found = measurement(*rows).model_copy(update={"half_s": half_s})
+    first = plan_of(spec_with(**transport), found, cached=False)
+    written = spec_with(**first.settings["transport"])
+    again = plan_of(written, found, cached=True)
+    assert (again.candidate, again.half_spp) == (first.candidate, first.half_spp)
+    assert "transport" not in again.changes
+    assert _knows(found, written)
+    assert cache.digest(written) == cache.digest(first.spec)
+
+
+@pytest.mark.parametrize(
+    ("error", "scatter", "changed"),
+    [
+        (0.096, 0.0, False),  # 1.04 times as fast
+        (0.09, 0.15, False),  # 1.11 times, of which 9 % are uncertain
+        (0.06, 0.6, False),  # 1.67 times, of which 35 % are
+        (0.06, 0.1, True),
+    ],
+)
+def test_settings_are_kept_unless_others_are_significantly_better(error: float, scatter: float, changed: bool) -> None:
+    """All have 2 samples in 0.1 s, so that errors alone decide: 0.1 is that of (1, 1)."""
+    rows = row(PLAIN, 0.2, 0.02, 0.04), row(LIGHT, error, 0.016, 0.042, scatter), row(JOINED, 0.1, 0.02, 0.04, 0.0)
+    found = plan_of(spec_with(), measurement(*rows), cached=False)
+    verdict = lines(found)[1]
+    if changed:
+        assert (found.candidate, list(found.changes)) == (LIGHT, ["transport", "photons"])
+        assert verdict.startswith(
+            "change them: 1.67 ± 0.10 times as fast to the same error as the spec's settings, light"
+        )
+    else:
+        assert (found.candidate, found.half_spp, list(found.changes)) == (JOINED, 2, ["photons"])
+        assert verdict == "no significant gain over the spec's settings: keep them"
+        assert "light ratio 1 without connections was measured 1." in text_of(found)
+
+
+def test_the_best_settings_are_kept_as_the_best() -> None:
+    spec = spec_with(connections=0, light_ratio=1.0)
+    assert lines(plan_of(spec, measurement(), cached=False))[1] == (
+        "the spec's settings are the best measured: keep them"
+    )
 
 
 def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() -> None:
     """One sample of (0, 0) takes 0.02 s, and of (0, 1) 0.04 s."""
     spec = spec_with(half_spp=1, connections=0, light_ratio=0.0)
-    plan = plan_of(spec, measurement(Candidate(0, 1.0)), cached=False)
-    assert (plan.candidate, plan.half_spp) == (PLAIN, 1)
-    taken = (
-        "but one sample of light ratio 1 without connections costs more than a half-estimate does now, so plain path"
-    )
-    assert taken in "\n".join(lines(plan))
+    found = plan_of(spec, measurement(row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.02, 0.02, 0.02)), cached=False)
+    assert (found.candidate, found.half_spp) == (PLAIN, 1)
+    assert "one sample of light ratio 1 without connections costs more than a half-estimate does now" in text_of(found)
+    assert any(line.endswith("too costly") for line in lines(found))
     richer = spec_with(half_spp=3, connections=0, light_ratio=0.0)
-    plan = plan_of(richer, measurement(Candidate(0, 1.0)), cached=False)
-    assert (plan.candidate, plan.half_spp) == (Candidate(0, 1.0), 1)
+    found = plan_of(richer, measurement(), cached=False)
+    assert (found.candidate, found.half_spp) == (LIGHT, 1)
 
 
-@pytest.mark.parametrize(("half_spp", "known"), [(1, True), (2, True), (8, True), (9, False), (256, False)])
-def test_a_measurement_holds_for_about_the_samples_that_it_was_made_for(half_spp: int, known: bool) -> None:
-    assert _knows(measurement(PLAIN), spec_with(half_spp=half_spp)) == known
+@pytest.mark.parametrize(("half_spp", "known"), [(1, True), (2, True), (9, True), (10, False), (256, False)])
+def test_a_measurement_holds_for_about_the_time_that_it_was_made_for(half_spp: int, known: bool) -> None:
+    """It was made for 0.1 s: 9 samples of (1, 1) take 0.38 s."""
+    assert _knows(measurement(), spec_with(half_spp=half_spp)) == known
+
+
+def test_the_same_time_is_many_samples_of_cheap_settings() -> None:
+    assert _knows(measurement(), spec_with(half_spp=39, connections=0, light_ratio=0.0))
+    assert not _knows(measurement(), spec_with(half_spp=1, connections=0, light_ratio=0.0))
 
 
 def test_savings_are_ratios_of_time_to_equal_error() -> None:
-    plan = plan_of(spec_with(), measurement(Candidate(0, 1.0)), cached=False)
-    assert [(s.over, s.factor) for s in plan.savings] == [(PLAIN, 2.0), (Candidate(1, 1.0), pytest.approx(1.6))]
-    assert [s.spread for s in plan.savings] == pytest.approx([2 * 0.1, 1.6 * 0.02**0.5])
-    text = "\n".join(lines(plan))
+    """In 0.1 s plain path tracing has 9 samples, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
+    found = plan_of(spec_with(), measurement(), cached=False)
+    assert [(s.over, s.factor) for s in found.savings] == [
+        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))), (JOINED, pytest.approx(2)),
+    ]  # fmt: skip
+    assert found.savings[0].spread == pytest.approx(0.2 / 9 / (0.05 / 4) * 0.1 / 3**0.5)
+    text = text_of(found)
     for sentence in (
-        "2.0 ± 0.2 times as fast to the same error as plain path tracing\n",
-        "1.6 ± 0.2 times as fast to the same error as light ratio 1 with 1 connection, the spec's settings now\n",
-        "half_spp 4 costs what 2 does with the spec's settings, light ratio 1 with 1 connection\n",
+        "1.8 ± 0.1 times as fast to the same error as plain path tracing\n",
+        "half_spp 4 costs about what 2 does with the spec's settings, light ratio 1 with 1 connection\n",
         "lights: 1 area\n",
-        "connections: light paths that",
+        "connections: all settings with them take longer to the same error here\n",
     ):
         assert sentence in text
 
 
+def test_what_was_not_shown_is_not_claimed() -> None:
+    rows = row(PLAIN, 0.1, 0.01, 0.01), row(LIGHT, 0.05, 0.01, 0.02, 0.3), row(JOINED, 0.0501, 0.01, 0.02, 0.9)
+    text = text_of(plan_of(spec_with(connections=0), measurement(*rows), cached=False))
+    assert "not told apart from it, within 2 standard errors: plain path tracing, light ratio 1 with 1" in text
+    assert "connections: no settings with them that fit the cost are shown to be worth a change" in text
+    text = text_of(plan_of(spec_with(connections=0, light_ratio=0.0), measurement(*rows), cached=False))
+    assert "light paths: no settings with them that fit the cost are shown to be worth a change" in text
+    for claim in ("is best:", "pays here", "reach the same error sooner"):
+        assert claim not in text
+
+
 def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:
-    text = lines(plan_of(spec_with(), measurement(Candidate(0, 1.0)), cached=False))
+    text = lines(plan_of(spec_with(), measurement(), cached=False))
     first = next(i for i, line in enumerate(text) if line.startswith("connections  light ratio"))
     assert text[first : first + 4] == [
-        "connections  light ratio  images  relMSE     ms  error × time",
-        "          0            0       8   0.100   30.0   1",
-        "          0            1       8   0.100   60.0   0.50 ± 0.05  chosen",
-        "          1            1       8   0.100  100.0   0.80 ± 0.08",
+        "connections  light ratio  images  half_spp  relMSE     ms  error × time",
+        "          0            0      12         9  0.0444  100.0   1",
+        "          0            1      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
+        "          1            1      12         2  0.0500  100.0   1.13 ± 0.06",
     ]
     legend = "\n".join(text[first + 4 :])
-    for column in ("connections:", "light ratio:", "relMSE:", "ms:", "error × time:"):
+    for column in ("connections:", "light ratio:", "half_spp:", "relMSE and ms:", "error × time:"):
         assert column in legend
     assert all(line == line.rstrip() for line in text)
 
 
-def test_nothing_measured_is_no_table() -> None:
-    black = measurement(PLAIN).model_copy(update={"rows": (), "reasons": ("every view is black",)})
-    text = "\n".join(lines(plan_of(spec_with(), black, cached=False)))
-    assert "error × time" not in text
+def test_where_nothing_was_measured_nothing_is_said_of_time() -> None:
+    black = measurement().model_copy(update={"rows": ()})
+    text = text_of(plan_of(spec_with(), black, cached=False))
+    assert "nothing was measured: every view is black" in text
     assert "none: nothing to compare with" in text
+    for claim in ("error × time", "both half-estimates", "costs about"):
+        assert claim not in text
 
 
 @pytest.mark.parametrize(
@@ -166,7 +259,7 @@ def test_what_was_measured_elsewhere_is_not_taken_for_what_was_measured_here(
 
 def test_a_measurement_that_cannot_be_read_is_as_good_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    spec, found = spec_with(), measurement(PLAIN)
+    spec, found = spec_with(), measurement()
     assert cache.find(spec) is None
     file = cache.keep(spec, found)
     assert cache.find(spec) == found
@@ -207,20 +300,69 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     }
     assert (tmp_path / "box.toml").read_text() == SPEC
 
-    code, out, err = run("box.toml", "--json", "--write")
+    code, out, err = run("box.toml", "--seconds", "2", "--json", "--write")
     assert (code, json.loads(out)["cached"]) == (0, True)
     assert json.loads(out)["settings"] == first["settings"]
+    for table in ("transport", "photons"):
+        assert f"[{table}] {'written' if table in first['changes'] else 'stays as it is'}" in err
     written = load_spec(tmp_path / "box.toml")
     assert written.transport.model_dump() == {"max_depth": 3, "rr_depth": 5, **first["settings"]["transport"]}
     assert written.photons.model_dump() == first["settings"]["photons"]
     assert "max_depth = 3  # edges\n" in (tmp_path / "box.toml").read_text()
 
-    code, out, _ = run("box.toml")
+    code, out, _ = run("box.toml", "--seconds", "1")
     assert code == 0
     assert "kept from an earlier pilot" in out
 
     code, out, _ = run("box.toml", "--seconds", "1", "--json", "--again")
     assert (code, json.loads(out)["cached"]) == (0, False)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The seconds of each pilot, in place of the pilots."""
+    seconds: list[float] = []
+
+    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, talk: Any) -> Measurement:
+        seconds.append(asked_s)
+        return measurement().model_copy(update={"asked_s": asked_s})
+
+    monkeypatch.setattr(plan, "measure", measure)
+    return seconds
+
+
+def test_a_short_pilot_does_not_serve_for_the_default(run: Run, asked: list[float]) -> None:
+    for arguments, pilots in ((["--seconds", "5"], [5]), ([], [5, 60]), (["--seconds", "5"], [5, 60]), ([], [5, 60])):
+        run("box.toml", *arguments)
+        assert asked == pilots
+
+
+def test_settings_that_do_not_gain_are_not_written(
+    run: Run, asked: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeps = measurement(row(PLAIN, 0.2, 0.01, 0.01), row(JOINED, 0.02, 0.02, 0.04))
+    monkeypatch.setattr(plan, "measure", lambda *_: keeps)
+    code, _, err = run("box.toml", "--write")
+    assert code == 0
+    assert "box.toml: [transport] stays as it is\n" in err
+    assert "box.toml: [photons] written\n" in err
+    assert (tmp_path / "box.toml").read_text() == SPEC + "depth = 2\n"
+    run("box.toml", "--write")
+    assert (tmp_path / "box.toml").read_text() == SPEC + "depth = 2\n"
+
+
+@pytest.mark.slow
+def test_settings_that_the_content_makes_pointless_are_measured_where_the_spec_has_them(
+    run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "box.toml").write_text(SPEC.replace("max_depth = 3", "max_depth = 2"))
+    code, out, _ = run("box.toml", "--seconds", "1", "--json")
+    assert code == 0
+    found = json.loads(out)["measurement"]
+    assert "max_depth is 2" in found["left_out"][0]
+    plain, default = found["rows"]
+    assert [(r["connections"], r["light_ratio"]) for r in (plain, default)] == [(0, 0), (1, 1)]
+    assert plain["errors"] == default["errors"]  # the same images: no light paths are traced for two edges
 
 
 def test_a_built_in_spec_is_refused_before_it_is_measured(run: Run) -> None:

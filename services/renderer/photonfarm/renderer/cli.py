@@ -104,13 +104,14 @@ def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
 @click.option(
     "--seconds",
     type=click.IntRange(1, 86400),
-    show_default="60",
-    help="CPU time of the measurement, loading and compiling apart; one that is kept counts if not shorter.",
+    default=60,
+    show_default=True,
+    help="CPU time of the measurement, loading and compiling apart; one that is kept counts if it had no less.",
 )
-@click.option("--write", is_flag=True, help="Put the settings into SPEC's file; samples planned before keep theirs.")
+@click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
-def scene_plan(spec: str, seconds: int | None, write: bool, again: bool, as_json: bool) -> None:
+def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer import backend
     from photonfarm.shared.scene import find_spec, load_spec
@@ -125,8 +126,10 @@ def scene_plan(spec: str, seconds: int | None, write: bool, again: bool, as_json
     plan = make_plan(loaded, file.parent, seconds=seconds, again=again, talk=partial(click.echo, err=True))
     click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))
     if write:
-        spec_file.write(file, plan.settings)
-        click.echo(f"written into {file}", err=True)
+        if plan.changes:
+            spec_file.write(file, plan.changes)
+        for table in plan.settings:
+            click.echo(f"{file}: [{table}] {'written' if table in plan.changes else 'stays as it is'}", err=True)
 
 
 @click.command()

@@ -143,4 +143,4 @@ _FLAT: Any = {"name": "default", "configuration": {"separator": "."}}  # c.0.0 i
 def _codecs(*, compressed: bool) -> list[Any]:
     from zarr.codecs import BloscCodec, Crc32cCodec
 
-    return [BloscCodec(**BLOSC), Crc32cCodec()] if compressed else [Crc32cCodec()]  # type: ignore[arg-type]
+    return [BloscCodec(**BLOSC), Crc32cCodec()] if compressed else [Crc32cCodec()]

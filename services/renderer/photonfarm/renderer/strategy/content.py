@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer.strategy.pilot import PLAIN, Candidate
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
 
 _LIGHTS = {
     "AreaLight": "area",
@@ -89,9 +89,6 @@ def restrict(
     reason = _why_no_light_paths(content, max_depth, hit_share)
     if reason:
         return [PLAIN], [LeftOut("light paths, and with them connections", reason)]
-    if max_depth == 2:
-        reason = "max_depth is 2, and a path with a connection has 3 edges at least"
-        return [c for c in candidates if not c.connections], [LeftOut("connections", reason)]
     return candidates, []
 
 
@@ -100,6 +97,8 @@ def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> s
         return "there is no light that shines"
     if max_depth in (0, 1):
         return f"max_depth is {max_depth}: only lights themselves are seen"
+    if max_depth == 2:
+        return "max_depth is 2: connections need 3 edges, and `bdpt` traces no light paths for direct light alone"
     if content.camera not in _CAMERAS.values():
         return f"they cannot be joined to a camera of type {content.camera}"
     if content.specular == content.surfaces:

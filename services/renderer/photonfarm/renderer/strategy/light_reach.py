@@ -22,12 +22,12 @@ power that arrives there, what the bounces left out may carry."""
 
 @dataclass(frozen=True, slots=True)
 class LightReach:
-    """Shares of light paths and of their power, means over configurations."""
+    """Shares of light paths and of their power; (C, D): by configurations and bounces."""
 
-    hit: float  # of the light paths, those that hit any surface
-    filled: tuple[float, ...]  # (D,) of the light paths, those with such a bounce: the slots that are filled
-    near: tuple[float, ...]  # (D,) those with such a bounce in the cameras' surroundings
-    power: tuple[float, ...]  # (D,) of the power that arrives in the cameras' surroundings, sum 1 (or 0)
+    hit: float  # of the light paths, those that hit any surface, mean over configurations
+    filled: tuple[float, ...]  # (D,) those with such a bounce, mean over configurations: the slots that are filled
+    near: tuple[tuple[float, ...], ...]  # (C, D) those with such a bounce in the cameras' surroundings
+    power: tuple[tuple[float, ...], ...]  # (C, D) of the power that arrives there, of each configuration sum 1 (or 0)
 
 
 def measure(scenes: Iterable[Any], view: ViewSpec, seed: int) -> LightReach:
@@ -48,9 +48,15 @@ def measure(scenes: Iterable[Any], view: ViewSpec, seed: int) -> LightReach:
             [float(np.sum(at & near)) / PATHS for at in of_bounce],
             [float(np.sum(photons.power[at & near], dtype=np.float64)) for at in of_bounce],
         ])  # fmt: skip
-    filled, near_share, power = np.mean(rows, axis=0)
-    shares = power / power.sum() if power.sum() > 0 else power
-    return LightReach(float(filled[0]), tuple(filled.tolist()), tuple(near_share.tolist()), tuple(shares.tolist()))
+    filled, near_share, power = np.array(rows).transpose(1, 0, 2)
+    arrived = power.sum(axis=1, keepdims=True)
+    shares = np.divide(power, arrived, out=np.zeros_like(power), where=arrived > 0)
+    mean = filled.mean(axis=0)
+    return LightReach(float(mean[0]), tuple(mean.tolist()), _tuples(near_share), _tuples(shares))
+
+
+def _tuples(rows: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in rows.tolist())
 
 
 def _inside(position: NDArray[np.float32], view: ViewSpec) -> NDArray[np.bool_]:
@@ -61,25 +67,31 @@ def _inside(position: NDArray[np.float32], view: ViewSpec) -> NDArray[np.bool_]:
 
 
 def recommend(
-    wanted: PhotonSpec, near: Sequence[float], power: Sequence[float], max_depth: int
+    wanted: PhotonSpec, near: Sequence[Sequence[float]], power: Sequence[Sequence[float]], max_depth: int
 ) -> tuple[PhotonSpec, str]:
-    """The photons worth storing, and why; never more than the spec wants.
+    """The photons worth storing, and why; never more than the spec wants. `near` and `power` as of `LightReach`.
 
-    A hit of bounce d lies on paths of d + 2 edges at least, so bounces that max_depth cuts off shine in no image.
+    What is left out must be next to nothing in each configuration, as nothing measures it again. A hit of bounce d lies
+    on paths of d + 2 edges at least, so bounces that max_depth cuts off shine in no image.
     """
     if not wanted.paths:
         return wanted, "photons: none, as the spec says"
-    if max(near) < LEAST_SHARE or max_depth in (0, 1):
-        reason = f"{max(near):.1%} of the light paths reach the cameras' surroundings"
+    reaching = float(np.max(near))
+    if reaching < LEAST_SHARE or max_depth in (0, 1):
+        reason = f"{reaching:.1%} of the light paths, at most, reach the cameras' surroundings"
         if max_depth in (0, 1):
             reason = "max_depth shows no light that a surface reflects"
-        return wanted.model_copy(update={"paths": 0}), f"photons: none, as {reason}"
-    beyond = 1 - np.cumsum(power)
-    enough = int(np.argmax(beyond < LEAST_SHARE)) + 1 if (beyond < LEAST_SHARE).any() else len(power)
+        return wanted.model_copy(update={"paths": 0}), f"photons: none, as {reason}; {_BY_HAND}"
+    beyond = np.max(np.sum(power, axis=1, keepdims=True) - np.cumsum(power, axis=1), axis=0)
+    enough = int(np.argmax(beyond < LEAST_SHARE)) + 1 if (beyond < LEAST_SHARE).any() else len(beyond)
     longest = max_depth - 1 if max_depth > 0 else wanted.depth
     depth = max(1, min(wanted.depth, enough, longest))
     sentence = (
-        f"photons: {wanted.paths} paths of {depth} hits; {max(near):.0%} of the paths reach the cameras' surroundings, "
-        f"and bounces beyond carry {max(0.0, float(beyond[depth - 1])):.1%} of the power there"
+        f"photons: {wanted.paths} paths of {depth} hits; up to {reaching:.0%} of the paths reach the cameras' "
+        f"surroundings, and bounces beyond carry up to {max(0.0, beyond[depth - 1]):.1%} of the power there, in "
+        f"{len(power)} draws of the configuration" + (f"; {_BY_HAND}" if depth < wanted.depth else "")
     )
     return wanted.model_copy(update={"depth": depth}), sentence
+
+
+_BY_HAND = "no later plan undoes that once it is written: raise it by hand"

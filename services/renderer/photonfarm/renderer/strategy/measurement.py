@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
-from photonfarm.renderer.strategy.pilot import Candidate, Render
+from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
+from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
+from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.renderer.strategy.stage import SEED, Stage
 from photonfarm.shared.scene import Film, Frozen, SceneSpec
-
-DEFAULT = Candidate(1, 1.0)
-"""The settings of a spec that names none."""
 
 GRID = tuple(
     Candidate(c, r)
@@ -30,22 +30,25 @@ are eye vertices, so that a ratio above 1 would buy connections nothing.
 FIRST_ROUND = 0.4
 """Share of the pilot's time for its first round, at most: what follows decides between the best."""
 
+TIMING = 0.2
+"""Share of the time for how long images take."""
+
 LEAST_VIEWS, MOST_VIEWS = 3, 8
+
+LIT = 16
+"""Configurations in which light paths are traced: photons that shine in any of them are worth storing."""
 
 Talk = Callable[[str], None]
 """Takes a line on what is going on."""
 
 
 class Row(Frozen):
-    """One candidate: as `pilot.Measured`, and what its time is made of."""
+    """One candidate: what `Measured` rests on, and what its time is made of."""
 
     connections: int
     light_ratio: float
-    images: int
-    error: float
-    missed: float
-    relative_cost: float
-    spread: float | None
+    errors: Errors  # of images of `Measurement.spp`
+    missed: float  # as of `Measured`
     fixed_s: float  # as of `ImageCost`, on the spec's film
     sample_s: float
 
@@ -54,116 +57,106 @@ class Row(Frozen):
         """The settings."""
         return Candidate(self.connections, self.light_ratio)
 
-    def time_s(self, spp: float) -> float:
+    @property
+    def cost(self) -> ImageCost:
         """CPU time of an image of the spec's film."""
-        return self.fixed_s + spp * self.sample_s
+        return ImageCost(self.fixed_s, self.sample_s)
 
 
 class Measurement(Frozen):
-    """One pilot of one scene; it does not depend on the settings that a plan changes."""
+    """One pilot of one scene. All that a plan rests on, whatever settings of those that it decides a spec has."""
 
     film: Film  # of the pilot
     spp: int
-    half_spp: int  # of the spec when it was measured: what the time in `relative_cost` is that of
+    half_s: float  # CPU time of a half-estimate that the spec had accepted: what the pilot compared at
     views: int
     max_depth: int
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
     rows: tuple[Row, ...]  # without any where every view is black
-    chosen: tuple[int, float]  # connections, light ratio
-    reasons: tuple[str, ...]
+    shared: float  # as of `Choice`
     filled: tuple[float, ...]  # of light_reach
-    near: tuple[float, ...]
-    power: tuple[float, ...]
+    near: tuple[tuple[float, ...], ...]
+    power: tuple[tuple[float, ...], ...]
     asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time of everything
     compiling_s: float  # of it: loading, kernels, and what the images are weighted with
 
-    @property
-    def candidate(self) -> Candidate:
-        """The settings to render with."""
-        return Candidate(*self.chosen)
+    def knows(self, candidate: Candidate) -> bool:
+        """Whether it was measured."""
+        return any(row.candidate == candidate for row in self.rows)
 
-    def row(self, candidate: Candidate) -> Row | None:
-        """What was measured of a candidate, if it was."""
-        return next((row for row in self.rows if row.candidate == candidate), None)
+    def row(self, candidate: Candidate) -> Row:
+        """What was measured of a candidate."""
+        return next(row for row in self.rows if row.candidate == candidate)
 
 
 @dataclass(frozen=True, slots=True)
-class ImageCost:
-    """CPU time of an image: what it takes whatever its samples are, and what each sample per pixel adds."""
+class _Compared:
+    """The candidates' images: of which film and how many samples per pixel, and what the pilot found in them."""
 
-    fixed_s: float
-    sample_s: float
-
-    @classmethod
-    def of(cls, render: Render, candidate: Candidate, clock: Callable[[], float]) -> ImageCost:
-        """From images of 1 and of 5 samples per pixel; of two the faster, as what disturbs never makes faster."""
-        render(candidate, 0, 1)  # compiles
-        one, five = (min(_time_of(render, candidate, spp, clock) for _ in range(2)) for spp in (1, 5))
-        sample_s = max((five - one) / 4, 0.02 * one)  # a small film may drown in the noise of its fixed part
-        return cls(max(one - sample_s, 0.0), sample_s)
-
-    def time_s(self, spp: float) -> float:
-        """Of an image with so many samples per pixel."""
-        return self.fixed_s + spp * self.sample_s
-
-
-def _time_of(render: Render, candidate: Candidate, spp: int, clock: Callable[[], float]) -> float:
-    start = clock()
-    render(candidate, 1, spp)
-    return clock() - start
+    film: Film
+    spp: int
+    half_s: float
+    choice: pilot.Choice
+    rows: tuple[Row, ...]
 
 
 def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) -> Measurement:
     """Load the scene of a spec and measure what its light transport needs, in about `seconds` of CPU time.
 
-    Raises SpecError and BackendError as loading does.
+    The spec's settings are measured in any case. Raises SpecError and BackendError as loading does.
     """
     begun = time.process_time()
     talk(f"loading {spec.name}")
     stage = Stage(spec, beside)
     found = content.read(stage.loaded.scene, stage.camera())
-    reach = light_reach.measure(stage.configurations(LEAST_VIEWS), spec.view, SEED)
+    reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
-    candidates, left_out = content.restrict(found, depth, reach.hit, dict.fromkeys([*GRID, present(spec)]))
-    costs = {candidate: ImageCost.of(stage.renders(1)[0], candidate, stage.clock) for candidate in candidates}
-    film, spp, views = _pilot_film(spec, list(costs.values()), seconds)
-    if film != spec.film:
-        stage = Stage(spec.model_copy(update={"film": film}), beside)
-    talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
-    pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
-    half_spp = spec.transport.half_spp
-    choice = pilot.choose(
-        stage.renders(views),
-        candidates,
-        seconds=seconds,
-        spp=spp,
-        seed=SEED,
-        keep=[c for c in (DEFAULT, present(spec)) if c in candidates],
-        later={candidate: cost.time_s(half_spp) / cost.time_s(pilot_spp) for candidate, cost in costs.items()},
-        clock=stage.clock,
-    )
-    rows = [_row(measured, costs[measured.candidate], pilot_spp) for measured in choice.measured]
+    candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
+    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, talk)
     spent = time.process_time() - begun
     return Measurement(
-        film=film,
-        spp=spp,
-        half_spp=half_spp,
-        views=choice.views,
+        film=compared.film,
+        spp=compared.spp,
+        half_s=compared.half_s,
+        views=compared.choice.views,
         max_depth=depth,
         modelled=tuple(content.sentences(found, depth)),
         left_out=tuple(map(str, left_out)),
-        rows=tuple(rows),
-        chosen=(choice.candidate.connections, choice.candidate.light_ratio),
-        reasons=choice.reasons,
+        rows=compared.rows,
+        shared=compared.choice.shared,
         filled=reach.filled,
         near=reach.near,
         power=reach.power,
         asked_s=seconds,
         spent_s=spent,
-        compiling_s=spent - choice.spent_s + choice.scouting_s,
+        compiling_s=spent - compared.choice.spent_s + compared.choice.scouting_s,
     )
+
+
+def _compare(stage: Stage, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk) -> _Compared:
+    spec = stage.spec
+    now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
+    costs = time_images(stage.renders(1)[0], candidates, half_spp, TIMING * seconds, stage.clock)
+    half_s = costs[now].time_s(half_spp)
+    film, spp, views = _pilot_film(spec, costs, left_s)
+    if film != spec.film:
+        stage = Stage(spec.model_copy(update={"film": film}), beside)
+    talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
+    pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
+    choice = pilot.choose(
+        stage.renders(views),
+        candidates,
+        seconds=left_s,
+        spp=spp,
+        seed=SEED,
+        keep=[c for c in (DEFAULT, now) if c in candidates],
+        later={candidate: _images(cost, half_s, spp) / cost.time_s(pilot_spp) for candidate, cost in costs.items()},
+        clock=stage.clock,
+    )
+    rows = tuple(_row(measured, costs[measured.candidate], pilot_spp, half_spp) for measured in choice.measured)
+    return _Compared(film, spp, half_s, choice, rows)
 
 
 def present(spec: SceneSpec) -> Candidate:
@@ -171,14 +164,20 @@ def present(spec: SceneSpec) -> Candidate:
     return Candidate(spec.transport.connections, spec.transport.light_ratio)
 
 
-def _pilot_film(spec: SceneSpec, costs: Sequence[ImageCost], seconds: float) -> tuple[Film, int, int]:
+def _images(cost: ImageCost, half_s: float, spp: int) -> float:
+    """CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
+    samples = cost.bought(half_s)
+    return spp / samples * cost.time_s(samples)
+
+
+def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
     """Film, samples per pixel and number of views whose first round takes no more than its share of the time.
 
     Wanted are those of the spec, and as many views as there is time for. Samples are given up first; then the film is
     halved, as long as the samples are what takes the time.
     """
-    fixed, sample = sum(cost.fixed_s for cost in costs), sum(cost.sample_s for cost in costs)
-    images = 2 + max(1.0, pilot.SCOUTS / len(costs))
+    fixed, sample = sum(cost.fixed_s for cost in costs.values()), sum(cost.sample_s for cost in costs.values())
+    images = 2 + max(1.0, SCOUTS / len(costs))
     budget = FIRST_ROUND * seconds / images  # for one image of each candidate in each view
     spp = int(np.clip((budget / LEAST_VIEWS - fixed) / sample, 1, spec.transport.half_spp))
     film = spec.film
@@ -188,17 +187,18 @@ def _pilot_film(spec: SceneSpec, costs: Sequence[ImageCost], seconds: float) -> 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: pilot.Measured, cost: ImageCost, pilot_spp: float) -> Row:
-    """The cost that was found beforehand, corrected by the many images of the pilot."""
-    correction = measured.time_s / cost.time_s(pilot_spp)
+def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> Row:
+    """The cost that was found beforehand, corrected by the many images of the pilot.
+
+    Unless these are of far fewer samples: then what they take beside their samples says little of the samples' time.
+    """
+    similar = RANGE * pilot_spp >= half_spp
+    correction = measured.time_s / cost.time_s(pilot_spp) if similar else 1.0
     return Row(
         connections=measured.candidate.connections,
         light_ratio=measured.candidate.light_ratio,
-        images=measured.images,
-        error=measured.error,
+        errors=measured.errors,
         missed=measured.missed,
-        relative_cost=measured.relative_cost,
-        spread=measured.spread,
         fixed_s=correction * cost.fixed_s,
         sample_s=correction * cost.sample_s,
     )

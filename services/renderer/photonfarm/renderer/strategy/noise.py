@@ -1,5 +1,9 @@
 """How noisy a candidate's images are, also where the pilot is too short to see all of its noise.
 
+A candidate's error is the variance between its images, and where another finds significantly more light in some block
+of the image, the variance that it must have there to have missed that light. Rare bright samples that all candidates
+have at equal seeds do not count. The rest of this text says how much is significant, and how much is charged.
+
 Shape letters: H W image, B × B blocks. All is measured in images of the pilot, whatever their samples per pixel. Seen
 from a pixel, x is its value, r the reference of the view, and y = x/√(r² + ε·mean(r)²) its weighted value; so that the
 mean variance of y is the relative mean squared error (relMSE) of one image. ε = 0.01, as in `statistics.relative_mse`.

@@ -10,7 +10,7 @@ from typing import Any
 
 from photonfarm.renderer.scenes import LoadedScene, integrator_of
 from photonfarm.renderer.sensor import AimedSensor
-from photonfarm.renderer.strategy.pilot import Candidate, Render
+from photonfarm.renderer.strategy.candidate import Candidate, Render
 from photonfarm.shared.modification import Modification, sample_modification
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec

@@ -1,0 +1,33 @@
+"""What is chosen among: settings of `bdpt` that leave its mean as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from photonfarm.shared.records import F32
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Candidate:
+    """Settings of `bdpt` that leave its mean as it is."""
+
+    connections: int  # light vertices joined to each eye vertex
+    light_ratio: float  # light paths per eye path; 0: plain path tracing
+
+    def __str__(self) -> str:
+        if not self.light_ratio:
+            return "plain path tracing"
+        few = {0: "without connections", 1: "with 1 connection"}
+        return f"light ratio {self.light_ratio:g} " + few.get(self.connections, f"with {self.connections} connections")
+
+
+PLAIN = Candidate(0, 0.0)
+"""Plain path tracing with next event estimation: what others are measured against."""
+
+DEFAULT = Candidate(1, 1.0)
+"""The settings of a spec that names none."""
+
+Render: TypeAlias = Callable[[Candidate, int, int], F32]
+"""(candidate, seed, samples per pixel) → one unbiased noisy image (H, W, 3) of one configuration and view."""

@@ -1,0 +1,82 @@
+"""Candidates at equal cost: what each makes of the CPU time that a spec accepts for a half-estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
+from photonfarm.renderer.strategy.comparison import Measured, saving
+from photonfarm.renderer.strategy.measurement import Measurement, Row
+from photonfarm.renderer.strategy.pilot import longest
+
+
+@dataclass(frozen=True, slots=True)
+class Offer(Measured):
+    """A candidate at the samples per pixel that the time buys; `time_s` is that of such a half-estimate."""
+
+    half_spp: int
+    half_error: float  # relMSE of such a half-estimate
+    fits: bool  # whether a sample per pixel costs about that time or less
+
+
+def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
+    """Every candidate that was measured, at the samples that `half_s` buys it.
+
+    The variance of an image is that of a sample over their number, so error × time is error a sample × time / samples.
+    """
+    plain = measurement.row(PLAIN)
+    return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
+
+
+def _offer(row: Row, plain: Row, spp: int, half_s: float) -> Offer:
+    samples = row.cost.bought(half_s)
+    cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
+    relative = row.errors.relative_spread(plain.errors)
+    return Offer(
+        candidate=row.candidate,
+        errors=row.errors,
+        missed=row.missed,
+        time_s=row.cost.time_s(samples),
+        relative_cost=cost,
+        spread=None if relative is None else cost * relative,
+        half_spp=samples,
+        half_error=row.errors.mean * spp / samples,
+        fits=row.cost.pays(half_s),
+    )
+
+
+def _per_sample_s(row: Row, half_s: float) -> float:
+    samples = row.cost.bought(half_s)
+    return row.cost.time_s(samples) / samples
+
+
+def best(offered: dict[Candidate, Offer]) -> Offer:
+    """Of least error × time, among those measured longest."""
+    return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
+
+
+def _cost(offer: Offer) -> float:
+    return offer.relative_cost
+
+
+def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
+    """The settings to take where those given are accepted now: themselves, unless others are significantly better.
+
+    A whole number of samples changes the cost a little, at which something else may be better still; so gains are
+    followed until there is none, and a plan that is written asks for itself. Where they lead back, nothing is gained.
+    """
+    seen = [(candidate, half_spp)]
+    while (better := _better(measurement, *seen[-1])) is not None:
+        if better in seen:
+            return seen[0]
+        seen.append(better)
+    return seen[-1]
+
+
+def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
+    offered = offers(measurement, measurement.row(candidate).cost.time_s(half_spp))
+    fitting = {c: offer for c, offer in offered.items() if offer.fits}
+    found = best(fitting)
+    if found.candidate == candidate or not saving(found, over=offered[candidate]).significant:
+        return None
+    return found.candidate, found.half_spp

@@ -1,0 +1,163 @@
+"""The images of a pilot: who has rendered how many, and what they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
+from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights
+from photonfarm.renderer.strategy.reasons import SUSPICIOUS
+from photonfarm.shared.records import F32
+
+SCOUTS = 8
+"""Images of each view at least that only serve to weight the others."""
+
+MOST_PAIRS = 32
+"""Pairs of images of one view: more would refine what depends on the views drawn anyway."""
+
+
+@dataclass(slots=True)
+class _Record:
+    """One candidate's measurements in one view."""
+
+    errors: list[float] = field(default_factory=list)  # relMSE of an image, by each pair
+    times_s: list[float] = field(default_factory=list)
+
+
+class Rounds:
+    """The views, the candidates and what is known so far."""
+
+    def __init__(
+        self,
+        views: Sequence[Render],
+        candidates: Sequence[Candidate],
+        spp: int,
+        seed: int,
+        later: Mapping[Candidate, float],
+        clock: Callable[[], float],
+    ) -> None:
+        self._views = views
+        self._candidates = candidates
+        self._spp = spp
+        self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
+        self._later = later
+        self._clock = clock
+        self._begun = clock()
+        self.scouting_s = 0.0
+        self.weights: dict[int, F32] = {}  # by view; black views are left out
+        self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
+        self._tallies = {c: Tally() for c in candidates}
+        self._shared: dict[int, list[float]] = {}  # by view, of each pair
+
+    # ------------------------------------------------------------------------------------------------------ rendering
+
+    def scout(self) -> None:
+        """Compile, and render what the images of each view will be weighted with."""
+        turns = -(-SCOUTS // len(self._candidates))
+        for view, render in enumerate(self._views):
+            every = list(self._candidates) * turns
+            weights = view_weights([self._render(render, c, next(self._seeds[view])) for c in every])
+            if weights is not None:
+                self.weights[view] = weights
+                for candidate in self._candidates:
+                    self._records[candidate][view] = _Record()
+        self.scouting_s = self.spent_s()
+
+    def round(self, candidates: Sequence[Candidate], pairs: int) -> None:
+        """Render images, the candidates in turn: what slows the machine down slows down all of them."""
+        for view in self.weights:
+            for _ in range(pairs):
+                seeds = next(self._seeds[view]), next(self._seeds[view])
+                images: dict[Candidate, list[F32]] = {c: [] for c in candidates}
+                for seed in seeds:
+                    for candidate in candidates:
+                        start = self._clock()
+                        images[candidate].append(self._render(self._views[view], candidate, seed))
+                        self._records[candidate][view].times_s.append(self._clock() - start)
+                self._note(view, {candidate: (a, b) for candidate, (a, b) in images.items()})
+
+    def _note(self, view: int, pairs: dict[Candidate, tuple[F32, F32]]) -> None:
+        errors, shared = pair_errors(list(pairs.values()), self.weights[view])
+        self._shared.setdefault(view, []).append(shared)
+        for (candidate, (a, b)), error in zip(pairs.items(), errors, strict=True):
+            self._records[candidate][view].errors.append(error)
+            self._tallies[candidate].add(a, b, self.weights[view], view)
+
+    def _render(self, render: Render, candidate: Candidate, seed: int) -> F32:
+        image = render(candidate, seed, self._spp)
+        if not np.isfinite(image).all():
+            raise ValueError(f"choose: seed {seed} of candidate {candidate} gave an image that is not finite")
+        return image
+
+    def affordable(self, candidates: Sequence[Candidate], pairs: int, seconds: float) -> int:
+        """How many pairs per view, of those wanted, the time that is left allows."""
+        left = seconds - self.spent_s()
+        per_pair = 2 * len(self.weights) * sum(self._time(c) for c in candidates)
+        room = MOST_PAIRS - max(self.images(c) for c in candidates) // (2 * len(self.weights))
+        return max(0, min(pairs, room, int(left / max(per_pair, 1e-9))))
+
+    # ------------------------------------------------------------------------------------------------------- figures
+
+    def images(self, candidate: Candidate) -> int:
+        """Images rendered of a candidate that count."""
+        return sum(len(record.times_s) for record in self._records[candidate].values())
+
+    def spent_s(self) -> float:
+        """Time since the beginning."""
+        return self._clock() - self._begun
+
+    def _time(self, candidate: Candidate) -> float:
+        return float(np.mean([np.median(record.times_s) for record in self._records[candidate].values()]))
+
+    def _time_later(self, candidate: Candidate) -> float:
+        return self._time(candidate) * self._later.get(candidate, 1.0)
+
+    def _missed(self, candidate: Candidate) -> float:
+        return missed(self._tallies[candidate], [tally for c, tally in self._tallies.items() if c != candidate])
+
+    def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
+        """relMSE that counts, by pairs and views, (pairs, views)."""
+        columns = []
+        for view, record in self._records[candidate].items():
+            columns.append(np.array(record.errors) - not_counted(self._shared[view])[: len(record.errors)])
+        return np.stack(columns, axis=1)
+
+    def shared(self) -> float:
+        """relMSE of an image that all candidates share in rare bright samples, and that does not count."""
+        return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
+
+    def is_suspect(self, candidate: Candidate) -> bool:
+        """Whether it seems to miss light that others find; how much of it grows with the images it is judged by."""
+        inferred = self._missed(candidate)
+        return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
+
+    def cost(self, candidate: Candidate) -> float:
+        """Error × time of a candidate: less is better."""
+        return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
+
+    def measured(self, candidate: Candidate) -> Measured:
+        """Error × time against plain path tracing, over the images that both rendered with equal seeds."""
+        seen, inferred = self._seen(candidate), self._missed(candidate)
+        plain = self._seen(PLAIN)[: len(seen)] + self._missed(PLAIN)
+        errors = Errors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
+        cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
+        relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
+        return Measured(
+            candidate=candidate,
+            errors=errors,
+            missed=inferred,
+            time_s=self._time(candidate),
+            relative_cost=cost,
+            spread=None if relative is None else cost * relative,
+        )
+
+
+def _by_views(errors: NDArray[np.float64]) -> tuple[float, ...]:
+    """Means over pairs, (pairs, views); of a single view its pairs."""
+    return tuple((errors.mean(axis=0) if errors.shape[1] > 1 else errors[:, 0]).tolist())

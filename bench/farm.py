@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import results
 import workers
@@ -192,7 +192,7 @@ class Run:
     """What a number of processes did at once."""
 
     rate: float  # per second, all together
-    cpu_s: float  # processor time of one piece of work
+    cpu_s: Mapping[int, float]  # processor time of each piece of work, by number: equal ones have equal numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,8 +218,14 @@ def pair_of(what: str, runs: Sequence[tuple[Run, Run]]) -> Pair:
         ratio=statistics.median(ratios),
         ratio_from=ratios[0],
         ratio_to=ratios[-1],
-        cpu_ratio=statistics.median(2 * one.cpu_s / two.cpu_s for one, two in runs),
+        cpu_ratio=statistics.median(2 / cost_of_company(one, two) for one, two in runs),
     )
+
+
+def cost_of_company(one: Run, two: Run) -> float:
+    """Processor time of two at work over that of one, for the pieces of work that both have done."""
+    same = one.cpu_s.keys() & two.cpu_s.keys()
+    return sum(two.cpu_s[number] for number in same) / sum(one.cpu_s[number] for number in same)
 
 
 def planned(store: Path, url: str, count: int, options: argparse.Namespace) -> SceneStore:
@@ -243,33 +249,36 @@ def farm(folder: Path, options: argparse.Namespace, count: int) -> Run:
         codes = [process.wait() for process in running]
     if any(codes):
         raise SystemExit("a worker has failed; what it said stands above")
-    steady = steady_jobs(jobs_of(scene), count)
-    rate = sum((len(ends) - 1) / (ends[-1][0] - ends[0][0]) for ends in steady)
-    cpu_s = statistics.fmean(cpu_s for ends in steady for _, cpu_s in ends[1:])
-    return Run(rate, cpu_s)
+    steady = steady_ends(ends_of_jobs(scene), count)
+    rate = sum((len(ends) - 1) / (ends[-1].at - ends[0].at) for ends in steady)
+    return Run(rate, {end.job: end.cpu_s for ends in steady for end in ends[1:]})
 
 
-Jobs = Sequence[tuple[float, float]]
-"""When each job of a worker ended, in order, and its processor time, in seconds."""
+class End(NamedTuple):
+    """The end of a job."""
+
+    at: float
+    job: int
+    cpu_s: float  # its processor time
 
 
-def jobs_of(scene: SceneStore) -> Sequence[Jobs]:
-    """Every worker's, by the times of the markers and what is in them."""
-    found: dict[str, list[tuple[float, float]]] = {}
+def ends_of_jobs(scene: SceneStore) -> Sequence[Sequence[End]]:
+    """Every worker's, in order, by the times of the markers and what is in them."""
+    found: dict[str, list[End]] = {}
     for job in scene.committed_jobs():
         placed = scene.storage.local(markers.name_of(scene.name, job)).stat().st_mtime
         figures = scene.marker(job)["figures"]
-        found.setdefault(figures["worker"], []).append((placed, figures["core_s"]))
+        found.setdefault(figures["worker"], []).append(End(placed, job, figures["core_s"]))
     return [sorted(ends) for ends in found.values()]
 
 
-def steady_jobs(found: Sequence[Jobs], count: int) -> Sequence[Jobs]:
-    """Those that ended while each of `count` workers was past its first and had not ended its last.
+def steady_ends(found: Sequence[Sequence[End]], count: int) -> Sequence[Sequence[End]]:
+    """Those of jobs that ended while each of `count` workers was past its first and had not ended its last.
 
     Between the first and the last of them a worker did whole jobs and nothing else. Ends the program if one did none.
     """
-    begin, end = max(ends[0][0] for ends in found), min(ends[-1][0] for ends in found)
-    steady = [[job for job in ends if begin <= job[0] <= end] for ends in found]
+    begin, end = max(ends[0].at for ends in found), min(ends[-1].at for ends in found)
+    steady = [[one for one in ends if begin <= one.at <= end] for ends in found]
     if len(steady) != count or any(len(ends) < 2 for ends in steady):
         raise SystemExit("too few jobs for a steady state; take more (--jobs)")
     return steady
@@ -294,7 +303,7 @@ class Twins:
         for pipe in self._pipes[:count]:
             pipe.send(True)
         cpu_s = statistics.fmean([pipe.recv() for pipe in self._pipes[:count]])
-        return Run(count / (time.perf_counter() - start), cpu_s)
+        return Run(count / (time.perf_counter() - start), {0: cpu_s})
 
     def end(self) -> None:
         """Let them go."""
@@ -417,9 +426,9 @@ are rendered, is spread over them.
 `photonfarm work --until-complete` with an embedded Redis, the same {options.jobs} jobs for one worker and for two.
 What is counted are whole jobs, from when each worker has ended its first until one has ended its last. All sides
 {options.repetitions} times by turns; medians. **Ratio**: of neighbouring runs, median (least … greatest). **By
-processor time**: twice what a job takes with one at work over what it takes with two at work (a worker's as its markers
-tell, without the commit), which is the ratio if nobody had to wait: for a processor that others use, the disk, or each
-other.
+processor time**: twice what work takes with one at it over what the same takes with two (a worker's jobs as their
+markers tell, without the commit), which is the ratio if nobody had to wait: for a processor that others use, the disk,
+or each other.
 
 {pair_table(two)}
 

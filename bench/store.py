@@ -32,6 +32,7 @@ from store_contents import Contents, EncodedPool, Pool, commit, commit_encoded
 
 BATCH = 32
 BUFFERS = ("depth", "albedo", "normal")
+WRITING = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +47,7 @@ class Row:
     ratio_from: float
     ratio_to: float
     cpu_ratio: float  # of processor seconds, bare over ours: what the ratio would be if nothing waited for anything
+    cpu_s: float  # processor seconds of one run of one process, ours
 
 
 # -------------------------------------------------------------------------------------------------------- the processes
@@ -184,7 +186,8 @@ def row_of(
     ratios = sorted(b[0] / o[0] for b, o in zip(bare, ours, strict=True))
     speeds = [size * processes / 1e6 / statistics.median(wall for wall, _ in side) for side in (bare, ours)]
     cpu = statistics.median(b[1] / o[1] for b, o in zip(bare, ours, strict=True))
-    return Row(what, processes, *speeds, statistics.median(ratios), ratios[0], ratios[-1], cpu)
+    cpu_s = statistics.median(cpu for _, cpu in ours) / processes
+    return Row(what, processes, *speeds, statistics.median(ratios), ratios[0], ratios[-1], cpu, cpu_s)
 
 
 def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Namespace) -> list[Row]:
@@ -220,17 +223,16 @@ def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namesp
     workers.seconds([("ours", first)])
     for name in renamed(scene, first, first):
         (bare / name).parent.mkdir(parents=True, exist_ok=True)
-    names = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
-    found: dict[str, list[Row]] = {way: [] for way in names}
+    found: dict[str, list[Row]] = {way: [] for way in WRITING}
     for processes in (1, 2):
-        times: dict[str, list[tuple[float, float]]] = {"bare": [], **{way: [] for way in names}}
+        times: dict[str, list[tuple[float, float]]] = {"bare": [], **{way: [] for way in WRITING}}
         for i in range(options.repetitions):
             for way in turned(list(times), i):
                 chosen = [next(jobs) for _ in range(processes)]
                 given = [renamed(scene, first, job) for job in chosen] if way == "bare" else chosen
                 times[way].append(workers.seconds([(way, one) for one in given]))
         size = sum(renamed(scene, first, first).values())
-        for way, what in names.items():
+        for way, what in WRITING.items():
             found[way].append(row_of(what, processes, size, times["bare"], times[way]))
     workers.end()
     return [row for rows in found.values() for row in rows]
@@ -278,6 +280,12 @@ def cell(row: store_bytes.Row) -> str:
     return f"{row.bytes_per_sample / 1e3:.0f} kB (÷{row.saving:.1f})"
 
 
+def encoding_ms(speeds: list[Row]) -> float:
+    """Processor time per sample of what is not there to do for rows encoded before, in one process."""
+    cpu_s = {row.what: row.cpu_s for row in speeds if row.processes == 1}
+    return 1e3 * (cpu_s[WRITING["ours"]] - cpu_s[WRITING["encoded"]]) / BATCH
+
+
 def page(
     speeds: list[Row], sizes: tuple[list[store_bytes.Row], store_bytes.Whole, int], options: Any, spec: Any
 ) -> str:
@@ -308,9 +316,10 @@ kind of reused memory, every byte checked; MB/s are those of the decoded values.
 depth, albedo and normal (compressed). **Bare** writing: files of the same names and sizes as the job's, each written at
 once, synced and linked, then their folders synced; **store**: a job of {BATCH} samples from its first row to its
 marker, handed over as fast as it is taken. *Write jobs* is all that the store does: a thread checks, scales, rounds to
-float16 and compresses the rows, while another gives them checksums and writes them. *Encoded before* is what the second
-thread and the commit do, given rows whose bytes are ready; the difference is the first thread's, which behind rendering
-is a small part of a sample's time ([farm.md](farm.md): store overhead). MB/s are those of the bytes on the disk, equal
+float16 and compresses the rows, and another gives them checksums and writes them. *Encoded before* is what the second
+thread and the commit do, given rows whose bytes are ready. The difference, {encoding_ms(speeds):.1f} ms of processor
+time per sample, is the first thread's work; in a worker that is the thread that renders, and [farm.md](farm.md) has the
+share of its time that the store takes (store overhead). MB/s are those of the bytes on the disk, equal
 on all sides. {options.repetitions} runs by turns ({zarr_runs(options)} of zarr-python); medians; ratios of
 neighbouring runs: median (least … greatest).
 

@@ -19,7 +19,7 @@ from photonfarm.shared.records import arrays_of
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import SceneStore, Store, schema
 from photonfarm.shared.store.schema import ArraySchema
-from photonfarm.shared.store.shards import ShardWriter
+from photonfarm.shared.store.shards import ShardWriter, encode
 from store_contents import Contents, Pool, commit
 
 COUNTS = (1, 2, 4, 8)
@@ -132,6 +132,6 @@ def _bytes_per_row(path: Path, rows: list[Mapping[str, Any]], arrays: Mapping[st
         writer = ShardWriter(path.with_suffix(f".{name}"), arrays[name], len(rows))
         for i, row in enumerate(rows):
             with np.errstate(over="ignore", under="ignore"):
-                writer.append(i, np.asarray(row[name], arrays[name].dtype))
+                writer.append(i, encode(arrays[name], row[name]))
         total += writer.finish()["size"]
     return total / len(rows)

@@ -62,27 +62,34 @@ def test_the_ledger_counts_threads_by_their_names(monkeypatch: pytest.MonkeyPatc
     assert counted[1] == counted[0]
 
 
+def ends(*times: float) -> list[farm.End]:
+    return [farm.End(at, job, 1.0) for job, at in enumerate(times)]
+
+
 def test_the_steady_state_is_while_every_worker_has_whole_jobs_to_do() -> None:
-    early = [(at, 1.0) for at in (2.0, 4.0, 6.0, 8.0, 10.0)]
-    late = [(at, 1.0) for at in (5.0, 7.0, 9.0)]
-    assert farm.steady_jobs([early, late], 2) == [early[2:4], late]
-    assert farm.steady_jobs([early], 1) == [early]
+    early, late = ends(2.0, 4.0, 6.0, 8.0, 10.0), ends(5.0, 7.0, 9.0)
+    assert farm.steady_ends([early, late], 2) == [early[2:4], late]
+    assert farm.steady_ends([early], 1) == [early]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_run_without_a_steady_state_ends_the_program(count: int) -> None:
-    few = [[(1.0, 1.0), (9.0, 1.0)], [(8.0, 1.0), (9.5, 1.0)]]
     with pytest.raises(SystemExit, match="take more"):
-        farm.steady_jobs(few, count)
+        farm.steady_ends([ends(1.0, 9.0), ends(8.0, 9.5)], count)
 
 
 def test_ratios_are_of_neighbouring_runs() -> None:
-    runs = [(farm.Run(1.0, 3.0), farm.Run(1.8, 4.0)), (farm.Run(2.0, 3.0), farm.Run(3.8, 3.0))]
-    runs.append((farm.Run(4.0, 3.0), farm.Run(6.0, 6.0)))
+    runs = [(farm.Run(1.0, {0: 3.0}), farm.Run(1.8, {0: 4.0})), (farm.Run(2.0, {0: 3.0}), farm.Run(3.8, {0: 3.0}))]
+    runs.append((farm.Run(4.0, {0: 3.0}), farm.Run(6.0, {0: 6.0})))
     found = farm.pair_of("jobs", runs)
     assert (found.one, found.two) == (2.0, 3.8)
     assert (found.ratio, found.ratio_from, found.ratio_to) == pytest.approx((1.8, 1.5, 1.9))
     assert found.cpu_ratio == pytest.approx(1.5)
+
+
+def test_processor_time_is_compared_for_the_same_jobs() -> None:
+    one, two = farm.Run(1.0, {1: 4.0, 2: 10.0, 3: 6.0}), farm.Run(2.0, {2: 11.0, 3: 7.0, 4: 100.0})
+    assert farm.cost_of_company(one, two) == pytest.approx(18 / 16)
 
 
 def test_the_page_has_the_figures_and_their_targets() -> None:

@@ -165,12 +165,15 @@ class RenderWorker(SimpleWorker):
         self._talk.pausing(held_back)
         until = time.monotonic() + self._settings.idle_s
         while True:
-            job, strangers = (None, 0) if held_back else queue.take(self._queue, leave=self._not_here)
+            job, strangers = (None, 0) if held_back else self._next()
             if strangers:
                 log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
             if job is not None or time.monotonic() >= until:
                 return job
             time.sleep(POLL_S)
+
+    def _next(self) -> tuple[RenderJob | None, int]:
+        return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._not_here)
 
     def _fill_or_finish(self) -> bool:
         """Look at the store, as there is no coordinator; True if there is nothing left to wait for."""
@@ -224,14 +227,13 @@ class RenderWorker(SimpleWorker):
             return
         self._failed = True
         log.warning("job %s failed: %s", job.id, error, exc_info=None if isinstance(error, PhotonfarmError) else error)
-        scene_id = job.id.rpartition("-")[0]
-        ours = self._settings.scene_id in (None, scene_id)
         if is_full(error):
             self._disk.refused()
-        elif isinstance(error, SceneNotHereError) and self._settings.scene_id != scene_id:
+        elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
+            scene_id = job.id.rpartition("-")[0]
             self._not_here[scene_id] = error
             log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
-        elif ours and isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
+        elif isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
             self._fatal = error  # the next job would fail as well
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)

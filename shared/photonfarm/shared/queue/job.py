@@ -46,20 +46,22 @@ return names
 
 _TAKE = f"""
 local left, passed, dropped = {{}}, 0, 0
-for _, scene in ipairs(ARGV) do left[scene] = true end
+for i = 2, #ARGV do left[ARGV[i]] = true end
 while dropped < 1000 do
-  local name = redis.call('LINDEX', KEYS[1], passed)
-  if not name then break end
-  local scene = #name <= {MAX_NAME} and string.match(name, '^(%x+)%-%d+$')
-  if scene and left[scene] then
-    passed = passed + 1
-  else
-    redis.call('LREM', KEYS[1], 1, name)
-    if scene then
-      redis.call('RPUSH', KEYS[2], name)
-      return {{name, dropped}}
+  local names = redis.call('LRANGE', KEYS[1], passed, passed + 63)
+  if #names == 0 then break end
+  for _, name in ipairs(names) do
+    local scene = #name <= {MAX_NAME} and string.match(name, '^(%x+)%-%d+$')
+    if scene and (left[scene] or (ARGV[1] ~= '' and scene ~= ARGV[1])) then
+      passed = passed + 1
+    else
+      redis.call('LREM', KEYS[1], 1, name)
+      if scene then
+        redis.call('RPUSH', KEYS[2], name)
+        return {{name, dropped}}
+      end
+      dropped = dropped + 1
     end
-    dropped = dropped + 1
   end
 end
 return {{'', dropped}}
@@ -138,14 +140,14 @@ def open_queue(connection: Redis) -> RenderQueue:
     return RenderQueue(QUEUE, connection=connection, job_class=RenderJob, serializer=JSONSerializer)
 
 
-def take(queue: RenderQueue, *, leave: Iterable[str] = ()) -> tuple[RenderJob | None, int]:
+def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str] = ()) -> tuple[RenderJob | None, int]:
     """The next job, taken as RQ takes it, or None; and how many entries that were no jobs were thrown away.
 
-    Jobs of the scenes to `leave` stay where they are, for other workers. Whoever wants to wait asks again: blocking, RQ
-    fetches whatever stands in the list, of whatever size.
+    Jobs of other scenes than `scene_id`, and of those to `leave`, stay where they are, for other workers. Whoever wants
+    to wait asks again: blocking, RQ fetches whatever stands in the list, of whatever size.
     """
     keys = [queue.key, queue.intermediate_queue_key]
-    name, dropped = queue.connection.register_script(_TAKE)(keys=keys, args=[*leave])
+    name, dropped = queue.connection.register_script(_TAKE)(keys=keys, args=[scene_id or "", *leave])
     if not name:
         return None, dropped
     try:

@@ -126,12 +126,16 @@ class LocalStorage:
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove parts that dead writers left; how many."""
-        swept, now_s = 0, time.time()
-        for name in self.names(TMP):
-            path = self.root / TMP / name
+        if not (names := self.names(TMP)):
+            return 0
+        tmp, swept = self.root / TMP, 0
+        os.utime(tmp)  # stamped as the parts are, by a file server's clock, say, from which ours may be far
+        now_s = tmp.stat().st_mtime
+        for name in names:
+            path = tmp / name
             with contextlib.suppress(FileNotFoundError):  # another sweeper was faster
                 age_s = now_s - path.stat().st_mtime
-                if age_s > FOREIGN_AGE_S or (age_s > stray_age_s and _is_of_the_dead(name)):
+                if age_s > FOREIGN_AGE_S or (age_s >= stray_age_s and _is_of_the_dead(name)):
                     _remove(path)
                     swept += 1
         return swept

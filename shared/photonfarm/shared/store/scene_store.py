@@ -5,6 +5,7 @@ Plans and markers are the truth. Nothing here needs a lock: a name appears once,
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -94,7 +95,7 @@ class SceneStore:
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         return PlanResult(self.scene_id, len(found), expansion.new, expansion.known, jobs)
                 finally:
-                    shutil.rmtree(built, ignore_errors=True)
+                    _remove(built)
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -166,7 +167,7 @@ class SceneStore:
                 _build_base(built, {"geometry": geometry, "cloud": cloud})
                 self.storage.adopt_folder(built, f"{self.name}/base")
             finally:
-                shutil.rmtree(built, ignore_errors=True)
+                _remove(built)
 
 
 def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
@@ -183,6 +184,21 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
     if spec.scene_id != scene_id:
         raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
     return spec
+
+
+def _remove(built: Path) -> None:
+    """Remove what was built of a folder, if it is still there.
+
+    Where the disk refuses one of several files, zarr-python raises at once and goes on with the others: these are
+    waited for, as they would make the folder again.
+    """
+    from zarr.core.sync import sync
+
+    async def others() -> None:
+        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()}, return_exceptions=True)
+
+    sync(others())
+    shutil.rmtree(built, ignore_errors=True)
 
 
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:

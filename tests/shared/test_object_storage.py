@@ -22,9 +22,11 @@ from obstore.store import from_url
 from zarr.storage import ObjectStore
 
 from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import StoreError
+from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, object_cache, objects, store_status
+from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.findings import Cause
 from photonfarm.shared.store.objects import ObjectStorage
 from photonfarm.shared.store.storage import open_storage
 
@@ -235,6 +237,8 @@ def test_an_object_is_copied_once_and_again_when_it_has_been_replaced(
     put(storage, b"first", "object")
     assert [storage.local("object").read_bytes() for _ in range(2)] == [b"first"] * 2
     assert fetched == ["object"]
+    storage.local("object").write_bytes(b"firs")  # cut, as by a power failure
+    assert storage.local("object").read_bytes() == b"first"
     put(storage, b"second", "object", replace=True)
     assert storage.local("object").read_bytes() == b"second"
     assert list((storage._cache._parts.root / "tmp").iterdir()) == []
@@ -252,7 +256,7 @@ def test_copies_used_longest_ago_make_room(tmp_path: Path, monkeypatch: pytest.M
     for i in range(20):
         with cache.filling(cache.path(f"folder/{i}", "v")) as file:
             file.write(bytes(100))
-        assert cache.has(cache.path("folder/0", "v"))
+        assert cache.has(cache.path("folder/0", "v"), 100)
         time.sleep(0.01)
     left = {int(path.name.split("@")[0]) for path in (tmp_path / "files/folder").iterdir()}
     assert 0 in left
@@ -260,11 +264,115 @@ def test_copies_used_longest_ago_make_room(tmp_path: Path, monkeypatch: pytest.M
     assert 8 <= len(left) <= 10
 
 
+def a_row(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[10] ^= 1
+    path.write_bytes(content)
+
+
+def the_index(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-7] ^= 1
+    path.write_bytes(content)
+
+
+def the_end(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def all_of_it(path: Path) -> None:
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+HARMS = (a_row, the_index, the_end, all_of_it)
+
+
+@pytest.fixture
+def harmed(url: str, tmp_path: Path) -> Callable[[Callable[[Path], None]], SceneStore]:
+    """A whole scene in a bucket, and its copies on this machine, which are harmed."""
+
+    def make(harm: Callable[[Path], None]) -> SceneStore:
+        scene = planned(url, modifications=4)
+        scene.write_base(*samples.base())
+        samples.commit_all(scene)
+        assert check_store(Store(url), when="now").exit_code == 0
+        copies = [path for path in (tmp_path / "cache").rglob("c.*@*") if path.stat().st_size]
+        assert len(copies) >= 8
+        for copy in copies:
+            harm(copy)
+        return scene
+
+    return make
+
+
+@pytest.mark.parametrize("harm", HARMS)
+@pytest.mark.parametrize("when", ["before it is opened", "while it is open"])
+def test_a_reader_heals_from_a_copy_that_is_damaged_on_this_machine(
+    url: str, harmed: Callable[..., SceneStore], harm: Callable[[Path], None], when: str
+) -> None:
+    is_open = when == "while it is open"
+    scene = harmed((lambda _: None) if is_open else harm)
+    reader = SceneReader(url, scene.scene_id)
+    reader.refresh()
+    truth = {row: given for job in (0, 1) for row, given in samples.outputs(scene, job).radiance.items()}
+    if is_open:
+        reader.read(0)
+        harm(scene.storage.local(f"{scene.name}/plans/000000/radiance/c.0.0.0.0.0"))
+    for row, radiance in truth.items():
+        np.testing.assert_array_equal(reader.read(row).radiance, radiance)
+        assert np.isfinite(reader.read_photons(row).power).all()
+    again = SceneReader(url, scene.scene_id)
+    again.refresh()
+    np.testing.assert_array_equal(again.read(0).radiance, truth[0])
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_a_copy_that_is_damaged_on_this_machine_is_no_damage_of_the_store(
+    url: str, harmed: Callable[..., SceneStore], harm: Callable[[Path], None]
+) -> None:
+    scene = harmed(harm)
+    report = check_store(Store(url), when="now", repair=True)
+    assert (report.exit_code, [scene.groups for scene in report.scenes]) == (0, [()])
+    assert (report.scenes[0].jobs, report.scenes[0].samples) == (2, 4), "none is counted twice"
+    assert scene.missing_jobs() == []
+    assert scene.storage.names("quarantine") == []
+
+
+def test_an_object_that_is_damaged_in_the_bucket_is_fetched_once_more_and_found(url: str) -> None:
+    scene = planned(url, modifications=4)
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    name = f"{scene.name}/plans/000000/radiance/c.0.0.0.0.0"
+    content = bytearray(scene.storage.read(name))
+    content[10] ^= 1
+    put(scene.storage, bytes(content), name, replace=True)
+    reader = SceneReader(url, scene.scene_id)
+    reader.refresh()
+    with pytest.raises(CorruptError, match="fails its CRC-32C"):
+        reader.read(0)
+    report = check_store(Store(url), when="now", repair=True)
+    assert [group.cause for group in report.scenes[0].groups] == [Cause.CHECKSUM]
+    assert report.scenes[0].set_aside == ("job 0",)
+    assert scene.missing_jobs() == [0]
+
+
+def test_a_claim_is_completed_from_the_bucket_and_not_from_a_damaged_copy(url: str) -> None:
+    scene = planned(url, modifications=2)
+    claim, folder = f"{scene.name}/plans/000001.claim", f"{scene.name}/plans/000001"
+    scene.plan(Request(modifications=4))
+    all_of_it(scene.storage.local(claim))
+    scene.storage.move(f"{folder}/zarr.json", "aside")
+    part = scene.storage.part()
+    part.mkdir()
+    assert not scene.storage.adopt_folder(part, folder)
+    assert scene.storage.read(f"{folder}/zarr.json") == scene.storage.read("aside")
+
+
 def test_a_copy_that_fails_half_way_is_not_there(tmp_path: Path) -> None:
     cache = object_cache.ObjectCache(tmp_path, 1000)
     with pytest.raises(ZeroDivisionError), cache.filling(cache.path("name", "v")) as file:
         file.write(bytes(1 // 0))
-    assert not cache.has(cache.path("name", "v"))
+    assert not cache.has(cache.path("name", "v"), 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 

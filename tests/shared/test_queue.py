@@ -1,18 +1,22 @@
 """Only our own function runs, and the queue is what the store lacks. All against a real server."""
 
 import importlib.util
+import json
 import os
 import pickle
+import shutil
 import socket
 import subprocess
 import time
 import traceback
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import redis
+from redis.connection import AbstractConnection as Connection
 from rq.job import Callback, Job
 from rq.serializers import JSONSerializer
 from rq.webhook import Webhook
@@ -46,6 +50,7 @@ _spec.loader.exec_module(samples)
 SCENE_ID = "0123456789abcdef" * 2
 NAME = f"{SCENE_ID}-7"
 KWARGS = {"scene_id": SCENE_ID, "job": 7}
+WORKERS = f"rq:workers:{QUEUE}"
 
 
 @pytest.fixture(scope="module")
@@ -214,6 +219,120 @@ def test_entries_too_long_for_a_job_are_not_fetched_when_the_queue_is_filled(
     assert connection.info("stats")["total_net_output_bytes"] - sent < 100_000
 
 
+def test_names_too_long_for_ours_are_not_fetched(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
+    """Keys with our prefixes, and members of RQ's registry of workers; what is short is there for us all the same."""
+    queue.beat(connection, "worker", "host", job_name(scene.scene_id, 0), ttl_s=60)
+    queue.record_failure(connection, job_name(scene.scene_id, 1), "broken")
+    for i in range(8):
+        long = b"%d" % i + b"x" * 1_000_000
+        for prefix in (queue.ALIVE, FAILED, queue.WORKER):
+            connection.set(prefix.encode() + long, 1)
+        connection.sadd(WORKERS, long, b"rq:worker:" + long)
+    sent = connection.info("stats")["total_net_output_bytes"]
+    assert reconcile(store, connection) == 8
+    status = queue_status(connection)
+    assert (status.running, status.workers, len(status.failed)) == (1, 1, 1)
+    assert queue.hosts(connection) == {"host"}
+    assert connection.info("stats")["total_net_output_bytes"] - sent < 100_000
+    assert not connection.exists(WORKERS)
+
+
+def test_workers_that_are_gone_and_what_is_no_worker_leave_the_registry(connection: redis.Redis, store: Store) -> None:
+    lives, gone, strange = "rq:worker:lives", "rq:worker:gone", ["evil", "", "rq:job:x", b"\xff"]
+    connection.hset(lives, "birth", 1)
+    connection.sadd(WORKERS, lives, gone, *strange)
+    connection.sadd("rq:workers", lives, gone, *strange, "rq:worker:of-another-queue")
+    reconcile(store, connection)
+    assert connection.smembers(WORKERS) == {lives.encode()}
+    assert connection.smembers("rq:workers") == {lives.encode(), b"rq:worker:of-another-queue"}
+
+
+def test_a_registry_without_end_does_not_hold_redis_up(connection: redis.Redis, store: Store) -> None:
+    connection.sadd(WORKERS, *(f"evil-{i}" for i in range(5000)))
+    reconcile(store, connection)
+    assert connection.scard(WORKERS) == 4000
+    for _ in range(4):
+        reconcile(store, connection)
+    assert not connection.exists(WORKERS)
+
+
+FIXED_KEYS = [
+    f"rq:queue:{QUEUE}", f"rq:queue:{QUEUE}:intermediate", f"rq:wip:{QUEUE}", f"rq:failed:{QUEUE}", "rq:queues",
+    "rq:workers", WORKERS, "rq:photonfarm:reconcile",
+]  # fmt: skip
+JOBS_KEYS = ["rq:job:", "rq:executions:", "rq:results:", queue.STARTS, "rq:photonfarm:failures:"]
+
+
+@pytest.mark.parametrize("key", [*FIXED_KEYS, *JOBS_KEYS])
+@pytest.mark.parametrize("kind", ["string", "stream"])
+def test_a_key_that_has_become_one_of_another_kind_stops_nothing(
+    connection: redis.Redis, store: Store, scene: SceneStore, key: str, kind: str
+) -> None:
+    names = [job_name(scene.scene_id, job) for job in range(10)]
+    for name in [""] if key in FIXED_KEYS else names:
+        if kind == "string":
+            connection.set(key + name, "x")
+        else:
+            connection.xadd(key + name, {"x": "x"})
+    assert reconcile(store, connection) == 10
+    assert queued(connection) == names
+    job, _ = queue.take(open_queue(connection))
+    connection.incr(queue.STARTS + job.id)
+    connection.xadd(f"rq:results:{job.id}", {"x": "x"})
+    connection.zadd(f"rq:executions:{job.id}", {"x": 1})
+    assert queue.record_failure(connection, job.id, "broken").times == 1
+    assert queue_status(connection).queued == 9
+
+
+@pytest.mark.parametrize("count", ["x", "-1", "1e3", "9" * 30, "9" * 10_000])
+def test_a_count_that_is_none_begins_anew(connection: redis.Redis, count: str) -> None:
+    connection.set(f"rq:photonfarm:failures:{NAME}", count)
+    assert queue.record_failure(connection, NAME, "broken").times == 1
+    assert queue.record_failure(connection, NAME, "broken").times == 2
+
+
+def test_values_of_another_kind_are_read_as_none(connection: redis.Redis) -> None:
+    for key in (
+        FAILED + NAME,
+        f"rq:photonfarm:failures:{NAME}",
+        queue.WORKER + "evil",
+        f"rq:photonfarm:consumed:{SCENE_ID}",
+    ):
+        connection.rpush(key, "x")
+    assert queue_status(connection).failed == {NAME: Failure("", 1, set_aside=True)}
+    assert queue.hosts(connection) == set()
+    assert queue.job_of_worker(connection, "evil") is None
+    assert queue.consumed_samples(connection, [SCENE_ID]) == 0
+
+
+def test_entries_that_are_no_text_are_tidied_away(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
+    listed = open_queue(connection)
+    connection.rpush(listed.key, b"\xff\xfe-1")
+    connection.rpush(listed.intermediate_queue_key, b"\xff\xfe-2")
+    connection.zadd(listed.started_job_registry.key, {b"\xff\xfe-3:execution": 2e9})
+    assert reconcile(store, connection) == 10
+    assert connection.llen(listed.intermediate_queue_key) == connection.zcard(listed.started_job_registry.key) == 0
+
+
+@pytest.mark.parametrize("ttl_s", [None, 3600])
+def test_a_lock_that_is_not_ours_is_broken(
+    connection: redis.Redis, store: Store, scene: SceneStore, ttl_s: int | None
+) -> None:
+    connection.set("rq:photonfarm:reconcile", "x", ex=ttl_s)
+    assert reconcile(store, connection, wait_s=0) == 10
+
+
+@pytest.mark.parametrize("ttl_s", [None, 10**6])
+def test_a_heartbeat_that_does_not_end_is_none(
+    connection: redis.Redis, store: Store, scene: SceneStore, ttl_s: int | None
+) -> None:
+    for job in range(10):
+        connection.set(queue.ALIVE + job_name(scene.scene_id, job), "x", ex=ttl_s)
+    queue.beat(connection, "worker", "host", job_name(scene.scene_id, 3), ttl_s=120)
+    assert reconcile(store, connection) == 9
+    assert queue_status(connection).running == 1
+
+
 def test_a_refused_job_does_not_run(connection: redis.Redis) -> None:
     job = stored(connection)
     job.refuse("its worker died")
@@ -271,6 +390,54 @@ def test_no_more_is_queued_than_the_limit(connection: redis.Redis, store: Store,
     assert reconcile(store, connection, limit=4) == 0
     open_queue(connection).pop_job_id()
     assert reconcile(store, connection, limit=4) == 1
+
+
+def by_scene(connection: redis.Redis) -> list[int]:
+    """How many jobs are queued of each scene, the fewest first."""
+    return sorted(Counter(name.rpartition("-")[0] for name in queued(connection)).values())
+
+
+def planned(store: Store, points: int, jobs: int) -> SceneStore:
+    request = Request(modifications=jobs)
+    return store.scene(store.plan(samples.small_spec(points=points), request, shard_rows=1).scene_id)
+
+
+def test_scenes_share_the_queue(connection: redis.Redis, store: Store) -> None:
+    for points, jobs in ((16, 3), (17, 30), (18, 30)):
+        planned(store, points, jobs)
+    assert reconcile(store, connection, limit=20) == 20
+    assert by_scene(connection) == [3, 8, 9]
+    assert reconcile(store, connection, limit=20) == 0
+
+
+def test_a_scene_whose_jobs_nobody_takes_makes_place_for_another(connection: redis.Redis, store: Store) -> None:
+    first = planned(store, 16, 30)
+    assert reconcile(store, connection, limit=20) == 20
+    second = planned(store, 17, 30)
+    assert reconcile(store, connection, limit=20) == 10
+    assert by_scene(connection) == [10, 10]
+    assert queued(connection)[:10] == [job_name(first.scene_id, job) for job in range(10)]
+    assert sorted(connection.keys("rq:job:*")) == sorted(f"rq:job:{name}".encode() for name in queued(connection))
+    taken = []
+    while len(taken) < 30:
+        job, _ = queue.take(open_queue(connection), leave=[first.scene_id])
+        if job is None:
+            assert reconcile(store, connection, limit=20)
+            continue
+        taken.append(job.id)
+        number = int(job.id.rpartition("-")[2])
+        samples.commit(second, number, samples.outputs(second, number))
+    assert sorted(taken) == sorted(job_name(second.scene_id, job) for job in range(30))
+    assert reconcile(store, connection, limit=20) == 10
+    assert by_scene(connection) == [20], "place that nobody else needs is taken again"
+
+
+def test_a_scene_asked_for_alone_gets_its_share_too(connection: redis.Redis, store: Store) -> None:
+    planned(store, 16, 30)
+    reconcile(store, connection, limit=20)
+    second = planned(store, 17, 4)
+    assert reconcile(store, connection, scene_id=second.scene_id, limit=20) == 4
+    assert by_scene(connection) == [4, 16]
 
 
 def test_a_redis_that_lost_everything_is_filled_again(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
@@ -335,6 +502,23 @@ def test_a_job_that_fails_three_times_is_set_aside_until_asked_for(
     assert reconcile(store, connection, retry_set_aside=True) == 1
     assert queue_status(connection).failed == {}
     assert queue.record_failure(connection, name, "broken").times == 1
+
+
+def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis) -> None:
+    for i in range(1500):
+        connection.set(f"{FAILED}{SCENE_ID}-{i}", f"why {i}", ex=None if i % 2 else 3600)
+    requests, plain = [], Connection.send_packed_command
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Connection, "send_packed_command", lambda *args, **how: (requests.append(1), plain(*args, **how)))
+        failed = queue_status(connection).failed
+        assert len(requests) < 40
+        requests.clear()
+        queue.forget_failures(connection, set_aside=False)
+        assert len(requests) < 40
+    assert len(failed) == 1500
+    assert failed[f"{SCENE_ID}-1499"] == Failure("why 1499", 1, set_aside=True)
+    assert failed[f"{SCENE_ID}-1498"] == Failure("why 1498", 1, set_aside=False)
+    assert len(connection.keys(f"{FAILED}*")) == 750
 
 
 def test_a_job_that_has_ended_well_has_nothing_counted_against_it(connection: redis.Redis) -> None:
@@ -403,6 +587,7 @@ def test_what_trainers_have_used_is_told_by_scene_and_lost_with_redis(connection
 # ------------------------------------------------------------------------------------------------------- permissions
 
 START = Path(__file__).parents[2] / "docker/redis.sh"
+COMPOSE = Path(__file__).parents[2] / "docker-compose.yml"
 
 
 @pytest.fixture(scope="module")
@@ -458,6 +643,31 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
                 limited.execute_command(*command)
         with pytest.raises(redis.RedisError):
             limited.set("rq:large", b"x" * (2 << 20))
+
+
+def test_the_health_check_of_the_compose_file_shows_the_password_to_nobody(
+    guarded: tuple[int, Path], tmp_path: Path
+) -> None:
+    """It is run with a `redis-cli` that tells what it was given, and then does its work if it is there."""
+    port, password = guarded
+    (line,) = [line for line in COMPOSE.read_text().splitlines() if "redis-cli" in line]
+    _, check = json.loads(line.partition(": ")[2])
+    real = shutil.which("redis-cli")
+    told, fake = tmp_path / "told", tmp_path / "redis-cli"
+    ping = f'exec "{real}" -p {port} "$@"' if real else "read -r word; [ ${#word} = 64 ] && echo PONG"
+    fake.write_text(f'#!/bin/sh\nenv > "{told}"\necho "$@" >> "{told}"\n{ping}\n')
+    fake.chmod(0o755)
+
+    def rc(file: Path) -> int:
+        command = check.replace("$$", "$").replace("/run/photonfarm/redis_password", str(file))
+        environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+        return subprocess.run(["sh", "-c", command], env=environment, check=False, stderr=subprocess.DEVNULL).returncode
+
+    assert rc(password) == 0
+    assert "ping" in told.read_text()
+    assert password.read_text().strip() not in told.read_text()
+    (tmp_path / "wrong").write_text("wrong\n")
+    assert rc(tmp_path / "wrong") != 0
 
 
 # ---------------------------------------------------------------------------------------------------------- passwords

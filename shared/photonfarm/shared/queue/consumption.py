@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from redis import Redis
-from rq.utils import as_text
+
+from photonfarm.shared.queue.untrusted import beginnings
 
 CONSUMED = "rq:photonfarm:consumed:"
 CONSUMED_TTL_S = 7 * 86400
@@ -22,5 +23,5 @@ def tell_consumed(connection: Redis, scene_id: str, samples: int) -> None:
 
 def consumed_samples(connection: Redis, scene_ids: Iterable[str]) -> int:
     """How many samples of these scenes trainers have used, by what they said last; 0 where none has said anything."""
-    told = [as_text(connection.getrange(CONSUMED + scene_id, 0, 20)) for scene_id in scene_ids]
+    told = beginnings(connection, [CONSUMED + scene_id for scene_id in scene_ids], 20)
     return sum(int(samples) for samples in told if samples.isdecimal())

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from redis import Redis
-from rq.utils import as_text
 
 from photonfarm.shared.errors import QueueError
-from photonfarm.shared.queue.heartbeat import names_below
 from photonfarm.shared.queue.job import FAILURE_TTL_S, STARTS, RenderArguments
+from photonfarm.shared.queue.untrusted import batches, beginnings, names_below, remove_others
 
 FAILED = "rq:photonfarm:failed:"
 FAILURES = "rq:photonfarm:failures:"
@@ -57,6 +56,7 @@ class Cause:
 
 def record_failure(connection: Redis, name: str, reason: str) -> Failure:
     """Leave a job alone, and say why: for a while, or for good once it has failed too often."""
+    remove_others(connection, {FAILURES + name: "counter"})
     times = int(connection.incr(FAILURES + name))
     connection.expire(FAILURES + name, FAILURES_TTL_S)
     set_aside = times >= FAILURES_ALLOWED
@@ -67,11 +67,11 @@ def record_failure(connection: Redis, name: str, reason: str) -> Failure:
 
 def forget_failures(connection: Redis, *, set_aside: bool) -> None:
     """Have failed jobs queued again; those that are set aside only if asked to, which then begin anew."""
-    for name in failed_names(connection):
-        if set_aside:
-            connection.delete(FAILED + name, FAILURES + name, STARTS + name)
-        elif connection.ttl(FAILED + name) >= 0:
-            connection.delete(FAILED + name, STARTS + name)
+    names = sorted(failed_names(connection))
+    ttls = _ttls(connection, names)
+    for some in batches([name for name in names if set_aside or ttls[name] >= 0]):
+        prefixes = (FAILED, STARTS, FAILURES) if set_aside else (FAILED, STARTS)
+        connection.delete(*(prefix + name for prefix in prefixes for name in some))
 
 
 def forget_failures_of(connection: Redis, name: str) -> None:
@@ -86,18 +86,26 @@ def failed_names(connection: Redis) -> set[str]:
 
 def read_failures(connection: Redis) -> dict[str, Failure]:
     """The failed jobs by name."""
-    found = {}
-    for name in sorted(failed_names(connection)):
+    names = sorted(failed_names(connection))
+    reasons = beginnings(connection, [FAILED + name for name in names], 4 * REASON_LETTERS)
+    counts = beginnings(connection, [FAILURES + name for name in names], 20)
+    ttls = _ttls(connection, names)
+    return {
+        name: Failure(_printable(reason), int(times) if times.isdecimal() else 1, set_aside=ttls[name] == -1)
+        for name, reason, times in zip(names, reasons, counts, strict=True)
+        if ttls[name] != -2  # it has not just run out
+    }
+
+
+def _ttls(connection: Redis, names: Sequence[str]) -> dict[str, int]:
+    """For how many seconds failures are remembered yet: -1 for good, -2 no longer."""
+    found: list[int] = []
+    for some in batches(names):
         with connection.pipeline(transaction=False) as pipeline:
-            pipeline.getrange(FAILED + name, 0, 4 * REASON_LETTERS)
-            pipeline.getrange(FAILURES + name, 0, 20)
-            pipeline.ttl(FAILED + name)
-            reason, times, ttl = pipeline.execute()
-        if ttl != -2:  # it has not just run out
-            counted = as_text(times)
-            said = _printable(reason.decode(errors="replace"))
-            found[name] = Failure(said, int(counted) if counted.isdecimal() else 1, set_aside=ttl == -1)
-    return found
+            for name in some:
+                pipeline.ttl(FAILED + name)
+            found += pipeline.execute()
+    return dict(zip(names, found, strict=True))
 
 
 def causes(failures: Mapping[str, Failure]) -> list[Cause]:

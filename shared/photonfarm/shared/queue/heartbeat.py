@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from redis import Redis
-from rq.utils import as_text
+
+from photonfarm.shared.queue.untrusted import beginnings, names_below
 
 ALIVE = "alive:"
 WORKER = "rq:photonfarm:worker:"
@@ -31,20 +30,11 @@ def bury(connection: Redis, worker: str) -> str | None:
 
 def job_of_worker(connection: Redis, worker: str) -> str | None:
     """The job that a worker last said to render."""
-    words = _words(connection, WORKER + worker)
+    words = next(beginnings(connection, [WORKER + worker], _VALUE_BYTES)).split()
     return words[1] if len(words) == 2 and words[1] != "-" else None
 
 
 def hosts(connection: Redis) -> set[str]:
     """The hosts that have a worker alive."""
-    return {words[0] for key in names_below(connection, WORKER) if (words := _words(connection, WORKER + key))}
-
-
-def _words(connection: Redis, key: str) -> list[str]:
-    return as_text(connection.getrange(key, 0, _VALUE_BYTES)).split()
-
-
-def names_below(connection: Redis, prefix: str) -> set[str]:
-    """What follows a prefix in the keys that have it."""
-    keys: Iterable[bytes] = connection.scan_iter(f"{prefix}*", count=1000)
-    return {key.decode(errors="replace").removeprefix(prefix) for key in keys}
+    said = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
+    return {value.split()[0] for value in said if value.strip()}

@@ -17,8 +17,10 @@ from rq import Queue
 from rq.job import Job, JobStatus
 from rq.serializers import JSONSerializer
 from rq.utils import as_text, import_attribute, now
+from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
 from photonfarm.shared.errors import IncompleteError, QueueError
+from photonfarm.shared.queue.untrusted import remove_others
 from photonfarm.shared.scene import Frozen, sentences
 
 QUEUE = "photonfarm"
@@ -136,8 +138,24 @@ class RenderQueue(Queue):
 
 
 def open_queue(connection: Redis) -> RenderQueue:
-    """The queue. A worker listens to this one alone: on several, RQ would lose a job with the worker that took it."""
-    return RenderQueue(QUEUE, connection=connection, job_class=RenderJob, serializer=JSONSerializer)
+    """The queue. A worker listens to this one alone: on several, RQ would lose a job with the worker that took it.
+
+    What is under its keys, and under RQ's registries, and is of another kind, has been removed. Raises RedisError.
+    """
+    queue = RenderQueue(QUEUE, connection=connection, job_class=RenderJob, serializer=JSONSerializer)
+    remove_others(
+        connection,
+        {
+            queue.key: "list",
+            queue.intermediate_queue_key: "list",
+            queue.started_job_registry.key: "zset",
+            queue.failed_job_registry.key: "zset",
+            queue.redis_queues_keys: "set",
+            REDIS_WORKER_KEYS: "set",
+            WORKERS_BY_QUEUE_KEY % QUEUE: "set",
+        },
+    )
+    return queue
 
 
 def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str] = ()) -> tuple[RenderJob | None, int]:
@@ -157,13 +175,21 @@ def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str
         return None, dropped + 1
 
 
-def queued_names(queue: RenderQueue, key: str | None = None) -> list[str]:
-    """The names in the queue, or in another of its lists, without those too long to be ours."""
-    read = queue.connection.register_script(_NAMES)
-    return [as_text(name) for name in read(keys=[key or queue.key], args=["LRANGE"])]
+def queued_names(queue: RenderQueue) -> list[str]:
+    """The names in the queue, in order, without those too long to be ours."""
+    return [name.decode(errors="replace") for name in _names(queue, queue.key, "LRANGE")]
 
 
-def running_names(queue: RenderQueue) -> list[str]:
-    """The entries of RQ's registry of running jobs: name, colon, execution."""
-    read = queue.connection.register_script(_NAMES)
-    return [as_text(entry) for entry in read(keys=[queue.started_job_registry.key], args=["ZRANGE"])]
+def taken_names(queue: RenderQueue) -> list[bytes]:
+    """The names that were taken and are not said to have ended, as they stand there; without those too long."""
+    return _names(queue, queue.intermediate_queue_key, "LRANGE")
+
+
+def running_names(queue: RenderQueue) -> list[bytes]:
+    """The entries of RQ's registry of running jobs, as they stand there: name, colon, execution."""
+    return _names(queue, queue.started_job_registry.key, "ZRANGE")
+
+
+def _names(queue: RenderQueue, key: str, command: str) -> list[bytes]:
+    found: list[bytes] = queue.connection.register_script(_NAMES)(keys=[key], args=[command])
+    return found

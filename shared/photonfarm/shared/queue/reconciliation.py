@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import islice
 
 import redis
 from redis import Redis
 from rq import Queue
-from rq.worker_registration import clean_worker_registry
+from rq.job import Job
+from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
 from photonfarm.shared.errors import QueueError
-from photonfarm.shared.queue.failures import Failure, failed_names, forget_failures, read_failures
-from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, names_below
+from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
+from photonfarm.shared.queue.heartbeat import ALIVE, WORKER
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
+    QUEUE,
     RQ_TIMEOUT_S,
+    STARTS,
     RenderQueue,
     job_name,
     open_queue,
     queued_names,
     running_names,
+    taken_names,
 )
+from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
@@ -31,6 +36,18 @@ QUEUE_LIMIT = 10_000
 
 LOCK_TTL_S = 120
 _LOCK = "rq:photonfarm:reconcile"
+
+HEARTBEAT_MOST_S = 3600
+"""What says for longer that a job is being rendered, for good say, is no heartbeat of a worker."""
+
+_KINDS: dict[str, Kind] = {
+    "rq:job:": "hash",
+    "rq:executions:": "zset",
+    "rq:results:": "stream",
+    STARTS: "counter",
+    FAILURES: "counter",
+}
+"""Of the keys that are written of a job, by what precedes its name."""
 
 
 def reconcile(
@@ -46,10 +63,13 @@ def reconcile(
     """Queue every job that is planned, not committed, not queued, not alive and not failed; how many that were.
 
     Of one scene, or of all. One caller at a time: 0 if another one is at it for longer than `wait_s`. At most `limit`
-    jobs are queued in all; the rest follows later. `retry_failed` forgets failures first, and `retry_set_aside` also
-    those of jobs that failed too often. Raises QueueError if Redis fails, StoreError if the scene is not there.
+    jobs are queued in all; the rest follows later. Scenes share them alike, as one whose jobs nobody takes would hold
+    up the others: what one has beyond its share leaves the queue again when another needs the place. `retry_failed`
+    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. Raises QueueError if Redis
+    fails, StoreError if the scene is not there.
     """
     try:
+        remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # ours ends by itself by then
         lock = connection.lock(_LOCK, timeout=LOCK_TTL_S)
         if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
             return 0
@@ -66,22 +86,62 @@ def reconcile(
 
 def _reconcile(scenes: Iterable[SceneStore], connection: Redis, limit: int) -> int:
     queue = open_queue(connection)
-    queued = set(queued_names(queue))
+    queued = list(dict.fromkeys(queued_names(queue)))
+    remove_lasting(connection, [ALIVE + name for name in names_below(connection, ALIVE)], HEARTBEAT_MOST_S)
     alive = names_below(connection, ALIVE)
     _tidy(queue, alive)
-    busy = queued | alive | failed_names(connection)
-    missing = (
-        (scene.scene_id, job)
-        for scene in scenes
-        for job in scene.missing_jobs()
-        if job_name(scene.scene_id, job) not in busy
-    )
-    wanted = list(islice(missing, max(limit - len(queued), 0)))
-    _enqueue(queue, wanted)
+    busy = {*queued, *alive, *failed_names(connection)}
+    held = _by_scene(queued)
+    lacking = {scene.scene_id: _lacking(scene, busy, limit) for scene in scenes}
+    has = {scene_id: len(held.get(scene_id, ())) for scene_id in {**held, **lacking}}
+    shares = _shares({scene_id: count + len(lacking.get(scene_id, ())) for scene_id, count in has.items()}, limit)
+    wanted = [
+        (scene_id, job)
+        for scene_id, jobs in lacking.items()
+        for job in jobs[: max(shares[scene_id] - has[scene_id], 0)]
+    ]
+    if wanted:
+        beyond = [name for scene_id, names in held.items() for name in names[shares[scene_id] :]]
+        _withdraw(queue, beyond[: max(len(queued) + len(wanted) - limit, 0)])
+        _enqueue(queue, wanted)
     return len(wanted)
 
 
-def _enqueue(queue: RenderQueue, jobs: Iterable[tuple[str, int]]) -> None:
+def _lacking(scene: SceneStore, busy: Set[str], limit: int) -> list[int]:
+    """The first missing jobs of a scene that are neither queued nor to be left alone: no more than can be queued."""
+    missing = (job for job in scene.missing_jobs() if job_name(scene.scene_id, job) not in busy)
+    return list(islice(missing, limit))
+
+
+def _by_scene(names: Iterable[str]) -> dict[str, list[str]]:
+    """Names by the scene id that they begin with, in order."""
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(name.rpartition("-")[0], []).append(name)
+    return found
+
+
+def _shares(demand: Mapping[str, int], limit: int) -> dict[str, int]:
+    """How many places each gets: what it asks for, or as many as all others that ask for more than there is."""
+    shares = {}
+    for done, scene_id in enumerate(sorted(demand, key=lambda scene_id: demand[scene_id])):
+        shares[scene_id] = min(demand[scene_id], limit // (len(demand) - done))
+        limit -= shares[scene_id]
+    return shares
+
+
+def _withdraw(queue: RenderQueue, names: Sequence[str]) -> None:
+    """Take jobs out of the queue again, the last ones of their scene; the store has them."""
+    with queue.connection.pipeline(transaction=False) as pipeline:
+        for name in names:
+            pipeline.lrem(queue.key, -1, name)
+            pipeline.unlink(Job.key_for(name))
+        pipeline.execute()
+
+
+def _enqueue(queue: RenderQueue, jobs: Sequence[tuple[str, int]]) -> None:
+    names = [job_name(scene_id, job) for scene_id, job in jobs]
+    remove_others(queue.connection, {before + name: kind for name in names for before, kind in _KINDS.items()})
     data = [
         Queue.prepare_data(
             FUNCTION,
@@ -94,19 +154,23 @@ def _enqueue(queue: RenderQueue, jobs: Iterable[tuple[str, int]]) -> None:
         )
         for scene_id, job in jobs
     ]
-    if data:
-        queue.enqueue_many(data)
+    queue.enqueue_many(data)
 
 
 def _tidy(queue: RenderQueue, alive: set[str]) -> None:
     """Take what dead workers left out of RQ's registries, which would otherwise be watched as if it were running."""
-    stale = [entry for entry in running_names(queue) if entry.split(":")[0] not in alive]
+    stale = [entry for entry in running_names(queue) if _text(entry).split(":")[0] not in alive]
     if stale:
         queue.connection.zrem(queue.started_job_registry.key, *stale)
-    for name in set(queued_names(queue, queue.intermediate_queue_key)) - alive:
-        queue.connection.lrem(queue.intermediate_queue_key, 0, name)
+    for name in taken_names(queue):
+        if _text(name) not in alive:
+            queue.connection.lrem(queue.intermediate_queue_key, 0, name)
     queue.failed_job_registry.cleanup()
-    clean_worker_registry(queue)
+    forget_dead_workers(queue.connection, WORKERS_BY_QUEUE_KEY % QUEUE, REDIS_WORKER_KEYS)
+
+
+def _text(name: bytes) -> str:
+    return name.decode(errors="replace")
 
 
 # ------------------------------------------------------------------------------------------------------------- status

@@ -6,13 +6,15 @@ import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from types import TracebackType
 from typing import Self
 
 from photonfarm.shared.store.content_check import Tally
-from photonfarm.shared.store.findings import Finding
+from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.halves import HalvesTest
 from photonfarm.shared.store.job_check import Checked, JobCheck
+from photonfarm.shared.store.storage import renew_copy
 
 MOST_THREADS = 4
 """More of them would wait for the disk, or for each other."""
@@ -46,12 +48,43 @@ class JobPool:
         return self._threads.map(self._check, jobs)
 
     def _check(self, job: int) -> tuple[list[Finding], bytes]:
-        if not hasattr(self._own, "check"):
-            tally = Tally(HalvesTest(self._scenes))
-            self.tallies.append(tally)
-            self._own.check = JobCheck(self._scene, tally)
-        found: tuple[list[Finding], bytes] = self._own.check.run(job)
+        if not hasattr(self._own, "checker"):
+            self._own.checker = _Checker(self._scene, self._scenes)
+            self.tallies.append(self._own.checker.tally)
+        found: tuple[list[Finding], bytes] = self._own.checker.run(job)
         return found
+
+
+class _Checker:
+    """Checks jobs of a scene one after the other; knows damage of the store from that of this machine's copies."""
+
+    def __init__(self, scene: Checked, scenes: int) -> None:
+        self.tally = Tally(HalvesTest(scenes))
+        self._scene = scene
+        self._scenes = scenes
+        self._of_job = Tally(HalvesTest(scenes))  # so that a job that is checked once more counts once
+        self._check = JobCheck(scene, self._of_job)
+
+    def run(self, job: int) -> tuple[list[Finding], bytes]:
+        """What is found of a job, and its marker; where copies may be to blame, of new ones."""
+        found, marker = self._check.run(job)
+        if self._renewed(found):
+            self._begin()
+            found, marker = self._check.run(job)
+        self.tally.add(self._of_job)
+        self._begin()
+        return found, marker
+
+    def _renewed(self, found: list[Finding]) -> bool:
+        """Whether what was read differs from what was committed, and was a copy: then the copies are new now."""
+        damaged = {finding.file for finding in found if finding.cause is Cause.CHECKSUM and finding.file}
+        renewed = [renew_copy(self._scene.storage, file) for file in sorted(damaged)]
+        return any(renewed)
+
+    def _begin(self) -> None:
+        fresh = Tally(HalvesTest(self._scenes))
+        for field in fields(Tally):
+            setattr(self._of_job, field.name, getattr(fresh, field.name))
 
 
 def _cores() -> int:

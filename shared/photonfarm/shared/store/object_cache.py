@@ -56,13 +56,13 @@ class ObjectCache:
         """Where the copy of an object's version lies, or would lie; nothing lies at that of no version."""
         return self._files / (name if version is None else f"{name}@{version}")
 
-    def has(self, copy: Path) -> bool:
-        """Whether a copy is there; if so, it has been used now."""
+    def has(self, copy: Path, size: int) -> bool:
+        """Whether a copy of so many bytes is there; if so, it has been used now."""
         try:
             os.utime(copy)
+            return copy.stat().st_size == size
         except FileNotFoundError:
             return False
-        return True
 
     @contextlib.contextmanager
     def filling(self, copy: Path) -> Iterator[BinaryIO]:

@@ -92,12 +92,19 @@ class ObjectStorage:
 
     def local(self, name: str) -> Path:
         """A copy on this machine, made if there is none of the object as it is now; costs a request in any case."""
+        return self._copy(name)
+
+    def renew(self, name: str) -> None:
+        """Fetch an object once more: what this machine holds of it is not what the bucket does, or may not be."""
+        self._copy(name, anew=True)
+
+    def _copy(self, name: str, *, anew: bool = False) -> Path:
         with os_errors(name):
             for _ in PAUSES_S:
                 try:
                     about = obstore.head(self._objects, name)
                     copy = self._cache.path(name, _version(about))
-                    if not self._cache.has(copy):
+                    if anew or not self._cache.has(copy, about["size"]):
                         self._fetch(name, about, copy)
                 except FileNotFoundError:
                     return self._cache.path(name, None)
@@ -171,7 +178,7 @@ class ObjectStorage:
             if ours := self._put(packed, claim_of(folder)):
                 self._complete(folder, packed)
             else:
-                self._complete(folder, self.local(claim_of(folder)))
+                self._complete(folder, self._copy(claim_of(folder), anew=True))  # for good: not of a damaged copy
         finally:
             packed.unlink(missing_ok=True)
         return ours

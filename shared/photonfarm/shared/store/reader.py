@@ -28,7 +28,7 @@ from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
 from photonfarm.shared.store.shards import Shard
-from photonfarm.shared.store.storage import open_storage, store_errors
+from photonfarm.shared.store.storage import open_storage, renew_copy, store_errors
 from photonfarm.shared.store.store import FORMAT_FILE, check_format
 from photonfarm.shared.view import View
 
@@ -234,11 +234,15 @@ class SceneReader:
         self._read_from(shard, name, row, values)
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
-        """A row of an open shard; of the file that is there now, where that fails: it may have been repaired since."""
-        within = row % self._plans[0].shard_rows
+        """A row of an open shard; of the file that is there now, where that fails: it may have been repaired since.
+
+        Of a bucket's, of a new copy: this machine's may be damaged.
+        """
+        job, within = divmod(row, self._plans[0].shard_rows)
         try:
             shard.read_into(within, values)
         except CorruptError:
+            renew_copy(self._storage, self._file(name, job))
             again, _ = self._shard(name, row, anew=True)
             if again is None or within not in again:
                 raise
@@ -256,9 +260,19 @@ class SceneReader:
             file, array = self._file(name, job), self._arrays[name]
             if array.kind == "sample" and not self._storage.exists(file):
                 return None, within
-            shard = Shard(self._storage.local(file), array, self._plans[0].shard_rows)
+            shard = self._open(file, array)
             self._shards.put((name, job), shard)
         return shard, within
+
+    def _open(self, file: str, array: schema.ArraySchema) -> Shard:
+        """A file of the store; of a new copy, if it is a copy and damaged."""
+        shard_rows = self._plans[0].shard_rows
+        try:
+            return Shard(self._storage.local(file), array, shard_rows)
+        except CorruptError:
+            if not renew_copy(self._storage, file):
+                raise
+        return Shard(self._storage.local(file), array, shard_rows)
 
 
 class _OpenShards:

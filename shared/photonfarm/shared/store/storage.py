@@ -11,7 +11,7 @@ import contextlib
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from photonfarm.shared.errors import StoreError
 
@@ -82,6 +82,22 @@ class Storage(Protocol):
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove parts that dead writers left; how many."""
+
+
+@runtime_checkable
+class Copying(Protocol):
+    """A storage whose `local` files are copies, which may rot on this machine while the store is whole."""
+
+    def renew(self, name: str) -> None:
+        """Make the copy of a name anew, as `local` made it."""
+
+
+def renew_copy(storage: Storage, name: str) -> bool:
+    """Make this machine's copy of a name anew, whose bytes are not what was committed; False if it is no copy."""
+    if not isinstance(storage, Copying):
+        return False
+    storage.renew(name)
+    return True
 
 
 SCHEMES = ("s3", "gs", "az")

@@ -124,3 +124,77 @@ def test_a_commit_that_meets_nobody_reads_nothing_back(scene: SceneStore, monkey
     monkeypatch.setattr(scene.storage, "local", lambda name: read.append(name) or local(name))
     assert samples.commit(scene, 1, samples.outputs(scene, 1))
     assert read == []
+
+
+@pytest.fixture
+def another(scene: SceneStore) -> SceneStore:
+    """The scene as another worker sees it, with a job 1 that is planned and not committed."""
+    scene.plan(Request(modifications=8))
+    return Store(scene.storage.root).scene(scene.scene_id)
+
+
+def values_of(scene: SceneStore) -> dict[int, np.ndarray]:
+    reader = SceneReader(scene.storage.root, scene.scene_id)
+    return {row: reader.read(row).radiance for row in reader.refresh().tolist()}
+
+
+def test_a_writer_that_slept_before_its_marker_announces_no_files_that_a_repair_has_moved(
+    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All files were its own; then another committed them, one rotted, and a repair set the job aside."""
+
+    def meanwhile() -> None:
+        assert samples.commit(another, 1, samples.outputs(another, 1))
+        rotten = next((scene.folder / "plans/000001/radiance").glob("c.0.*"))
+        rotten.write_bytes(rotten.read_bytes()[:5] + b"?" + rotten.read_bytes()[6:])
+        assert check_store(Store(scene.storage.root), when="now", repair=True).scenes[0].set_aside == ("job 1",)
+
+    before(monkeypatch, markers, "place", meanwhile)
+    assert not samples.commit(scene, 1, samples.outputs(scene, 1))
+    assert scene.missing_jobs() == [1]
+    samples.commit_all(scene)
+    whole(scene)
+
+
+def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_came_first(
+    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def meanwhile() -> None:
+        """Of a writer that slept as well, and whose files a repair had moved before ours were named."""
+        rows = next(plan for plan in another.plans() if plan.number == 1)
+        file = f"{rows.folder}/depth/c.0.0.0"
+        about = {"size": 1, "crc32c": "00000000"}
+        figures = scene.marker(0)["figures"]
+        assert markers.place(another.storage, another.name, 1, {file: about}, figures)
+
+    before(monkeypatch, markers, "place", meanwhile)
+    assert samples.commit(scene, 1, samples.outputs(scene, 1))
+    whole(scene)
+
+
+def test_a_late_writer_that_has_a_file_more_takes_nothing_back(
+    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its render overflows float16 in one row, and the other's does not; it has looked before that was committed."""
+    ours, theirs = samples.outputs(scene, 1), samples.outputs(scene, 1)
+    ours.radiance[5][0, 0, 0, 0] = 1e9
+    before(monkeypatch, scene.storage, "adopt", lambda: samples.commit(another, 1, theirs))
+    assert not samples.commit(scene, 1, ours)
+    assert not (scene.storage.root / "quarantine").exists()
+    whole(scene)
+    for row, halves in theirs.radiance.items():
+        np.testing.assert_array_equal(values_of(scene)[row], halves)
+
+
+def test_a_late_writer_whose_file_would_be_read_first_announces_it(
+    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The committed job has radiance_wide alone; readers take the rows from radiance, where they find it."""
+    ours, theirs = samples.outputs(scene, 1), samples.outputs(scene, 1)
+    for halves in theirs.radiance.values():
+        halves[0, 0, 0, 0] = 1e9
+    before(monkeypatch, scene.storage, "adopt", lambda: samples.commit(another, 1, theirs))
+    assert samples.commit(scene, 1, ours)
+    assert {Path(name).parent.name for name in scene.marker(1)["files"]} >= {"radiance", "radiance_wide"}
+    for row, halves in ours.radiance.items():
+        np.testing.assert_array_equal(values_of(scene)[row], halves)

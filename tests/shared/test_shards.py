@@ -1,5 +1,6 @@
 """Shards of ours and of zarr-python are the same; damaged ones raise, and never give other values or a crash."""
 
+import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -258,3 +259,62 @@ def test_a_chunk_whose_checksum_is_right_but_whose_content_is_not_a_row_raises(t
     path.write_bytes(b"".join(part + google_crc32c.value(part).to_bytes(4, "little") for part in parts))
     with pytest.raises(CorruptError, match=f"{path}: row 0"):
         Shard(path, array, SHARD_ROWS).read(0)
+
+
+# --------------------------------------------------------------------------------------------------- disks that refuse
+
+
+@pytest.mark.parametrize("number", [1, 2], ids=["index", "row"])
+def test_a_read_that_the_disk_refuses_is_damage_and_names_the_file(
+    noise: tuple[Path, ArraySchema, dict[int, Any]], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    path, array, _ = noise
+    preadv, calls = os.preadv, iter(range(1, 100))
+
+    def failing(*arguments: Any) -> int:
+        if next(calls) == number:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return preadv(*arguments)
+
+    monkeypatch.setattr(os, "preadv", failing)
+    with pytest.raises(CorruptError, match="shard: cannot be read: Input/output error"):
+        Shard(path, array, SHARD_ROWS).read(0)
+
+
+def test_checksums_that_the_disk_refuses_are_damage(
+    noise: tuple[Path, ArraySchema, dict[int, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, array, _ = noise
+    shard = Shard(path, array, SHARD_ROWS)
+    monkeypatch.setattr(os, "preadv", lambda *_: (_ for _ in ()).throw(OSError(errno.EIO, "Input/output error")))
+    with pytest.raises(CorruptError, match="shard: cannot be read: Input/output error"):
+        shard.summary()
+
+
+def test_a_folder_in_place_of_a_file_is_damage(tmp_path: Path) -> None:
+    """A read that really fails."""
+    folder = tmp_path / "shard"
+    folder.mkdir()
+    for n in range(20):  # of more bytes than an index has
+        (folder / f"{n:0200d}").touch()
+    with pytest.raises(CorruptError, match=r"shard: (cannot be read: Is a directory|has .* bytes, too few)"):
+        Shard(folder, array_of("<f2", (2,), compressed=False), SHARD_ROWS)
+
+
+@pytest.mark.parametrize(("number", "raised"), [(errno.EIO, CorruptError), (errno.EMFILE, OSError)])
+def test_only_a_disk_makes_a_file_that_cannot_be_opened_damaged(
+    noise: tuple[Path, ArraySchema, dict[int, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    raised: type[OSError],
+) -> None:
+    """For want of descriptors, no job is to be set aside."""
+    path, array, _ = noise
+
+    def failing(*_: Any) -> int:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "open", failing)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        Shard(path, array, SHARD_ROWS)
+    assert type(caught.value) is raised

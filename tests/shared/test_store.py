@@ -1,16 +1,21 @@
 """What is committed comes back, whole or not at all, while the store grows."""
 
+import errno
 import importlib.util
 import json
+import os
 import re
 import resource
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import IncompleteError, StoreError
+from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers, arrays_of
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
@@ -297,3 +302,113 @@ def test_a_commit_that_the_disk_refuses_is_a_store_error_and_leaves_the_job_miss
     scene.storage.local("tmp").unlink()
     assert scene.missing_jobs() == [0, 1, 2]
     assert samples.commit(scene, 0, given)
+
+
+def test_a_disk_that_turns_read_only_in_the_middle_of_a_job_is_a_store_error(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its files can then be neither named nor removed; a sweep removes them, once the disk can be written."""
+
+    def refuse(path: Any, *_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", refuse)
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(StoreError, match="cannot commit job 0: Read-only file system"):
+            samples.commit(scene, 0, samples.outputs(scene, 0))
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+
+
+def test_a_leftover_file_on_a_bad_sector_is_replaced(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    (scene.folder / "committed/000000000000.json").unlink()
+    bad, preadv = (scene.folder / "plans/000000/radiance/c.0.0.0.0.0").stat().st_ino, os.preadv
+
+    def failing(descriptor: int, *rest: Any) -> int:
+        if os.fstat(descriptor).st_ino == bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return preadv(descriptor, *rest)
+
+    monkeypatch.setattr(os, "preadv", failing)
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    assert reader_of(scene).read(0).row == 0
+
+
+# ------------------------------------------------------------------------------------------------- plans that are lost
+
+
+LOSSES: dict[str, Callable[[Path], None]] = {
+    "zarr.json of the first": lambda plans: (plans / "000000/zarr.json").unlink(),
+    "zarr.json of the last": lambda plans: (plans / "000002/zarr.json").unlink(),
+    "all files of the last": lambda plans: [shutil.rmtree(plans / "000002"), (plans / "000002").mkdir()],
+    "one between others": lambda plans: shutil.rmtree(plans / "000001"),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_a_plan_that_is_lost_is_an_error_that_names_it_and_nothing_is_read_or_planned_without_it(
+    store: Store, scene: SceneStore, loss: Callable[[Path], None]
+) -> None:
+    requests = [Request(modifications=n, views_per_modification=2) for n in (6, 7, 8)]
+    for request in requests[:2]:
+        scene.plan(request)
+    samples.commit_all(scene)
+    loss(scene.folder / "plans")
+    said = r"plans/00000\d: the plan is missing, .* put the folder back"
+    with pytest.raises(CorruptError, match=said):
+        reader_of(scene)
+    for work in (lambda: scene_of(store).jobs(), lambda: store_status(Store(store.root))):
+        with pytest.raises(CorruptError, match=said):
+            work()
+    with pytest.raises(CorruptError, match=said):
+        scene_of(store).plan(requests[2])
+
+
+def scene_of(store: Store) -> SceneStore:
+    """As a new process sees it."""
+    (scene,) = Store(store.root).scenes()
+    return scene
+
+
+def test_no_plan_takes_the_number_of_jobs_that_are_committed(store: Store, scene: SceneStore) -> None:
+    """The folder of the last plan is gone, and only the marker of its job tells of it."""
+    scene.plan(Request(modifications=6, views_per_modification=2))
+    samples.commit_all(scene)
+    shutil.rmtree(scene.folder / "plans/000001")
+    with pytest.raises(CorruptError, match=r"committed/000000000003\.json: no plan has this job"):
+        scene_of(store).plan(Request(modifications=7, views_per_modification=2))
+    assert not (scene.folder / "plans/000001").exists()
+
+
+def test_a_plan_that_is_claimed_and_not_written_yet_is_not_there_yet(store: Store, scene: SceneStore) -> None:
+    """As it may lie in a bucket, for a moment."""
+    (scene.folder / "plans/000001/view").mkdir(parents=True)
+    (scene.folder / "plans/000001.claim").write_bytes(b"")
+    (scene.folder / "plans/7").mkdir()  # not a plan's name
+    assert len(scene_of(store).plans()) == 1
+    assert reader_of(scene).planned == 10
+
+
+# ----------------------------------------------------------------------------------------------------------- sweeping
+
+
+def test_a_part_that_cannot_be_removed_is_left_alone_and_not_counted(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of another user, say, whose folder is not ours to empty."""
+    theirs, ours = store.storage.part(), store.storage.part()
+    for part in (theirs, ours):
+        part.mkdir()
+        os.utime(part, (1, 1))
+    remove = shutil.rmtree
+
+    def refusing(path: Path, *rest: Any, **options: Any) -> None:
+        if path == theirs:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        remove(path, *rest, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", refusing)
+    assert store.sweep() == 1
+    assert (theirs.exists(), ours.exists()) == (True, False)

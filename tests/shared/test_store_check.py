@@ -1,5 +1,6 @@
 """`photonfarm store check` finds what is wrong with a store, and `--repair` has it written again, losing nothing."""
 
+import errno
 import importlib.util
 import json
 import os
@@ -18,11 +19,13 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.shared import cli
-from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store, repeated_seeds, schema
 from photonfarm.shared.store.check import StoreReport, check_store
+from photonfarm.shared.store.job_check import JobCheck
+from photonfarm.shared.store.local import LocalStorage
 from photonfarm.shared.store.quarantine import Quarantine
 from photonfarm.shared.view import Camera
 
@@ -234,6 +237,74 @@ def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
     assert found(checked(store)) == {"unused-row": 1, "missing-row": 1 + 3}
 
 
+def test_a_bad_sector_is_a_finding_like_others_and_its_job_is_set_aside(
+    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Row 5 of the scene, which is row 1 of the shard."""
+    path, preadv = shard(scene, "radiance", 1), os.preadv
+    bad, rows = path.stat().st_ino, range(760, 780)
+
+    def failing(descriptor: int, memory: Any, offset: int, *flags: int) -> int:
+        if os.fstat(descriptor).st_ino == bad and offset in rows and len(memory) > 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return preadv(descriptor, memory, offset, *flags)
+
+    monkeypatch.setattr(os, "preadv", failing)
+    report = checked(store, repair=True)
+    assert found(report) == {"checksum": 1}
+    assert (report.exit_code, report.scenes[0].set_aside) == (7, ("job 1",))
+    (group,) = report.scenes[0].groups
+    assert (group.first[0].detail, group.first[0].row) == ("cannot be read: Input/output error", 6)
+
+
+def test_a_marker_that_cannot_be_read_is_told_and_the_rest_is_checked_and_repaired(
+    store: Store, scene: SceneStore
+) -> None:
+    marker(scene, 0).rename(marker(scene, 0).with_suffix(".kept"))
+    marker(scene, 0).mkdir()
+    flip(shard(scene, "depth", 1), 20)
+    report = checked(store, repair=True)
+    assert found(report) == {"unreadable": 1, "checksum": 1}
+    assert (report.exit_code, report.scenes[0].set_aside) == (4, ("job 1",))
+
+
+@pytest.mark.parametrize("name", ["plans/000000/view", "base/cloud/normal"])
+def test_inputs_and_base_that_cannot_be_read_are_told_and_the_rest_is_checked(
+    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """They may be whole, in a bucket that did not answer, say; so nothing is set aside for it."""
+    plain = schema.read_input
+
+    def failing(storage: Any, folder: str, array: Any) -> Any:
+        if folder.endswith(name):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return plain(storage, folder, array)
+
+    monkeypatch.setattr(schema, "read_input", failing)
+    report = checked(store, repair=True)
+    assert (found(report), report.scenes[0].samples, report.scenes[0].set_aside) == ({"unreadable": 1}, 10, ())
+
+
+def test_a_store_that_cannot_be_reached_ends_the_check(
+    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a network that fails would be a finding of each job."""
+
+    def failing(*_: Any) -> Any:
+        raise OSError(errno.EIO, "no answer")
+
+    read = JobCheck.run
+
+    def unplugged(self: JobCheck, job: int) -> Any:
+        monkeypatch.setattr(LocalStorage, "read", failing)
+        monkeypatch.setattr(LocalStorage, "names", failing)
+        return read(self, job)
+
+    monkeypatch.setattr(JobCheck, "run", unplugged)
+    with pytest.raises(StoreError, match="cannot check the store: no answer"):
+        checked(store)
+
+
 # ----------------------------------------------------------------------------------------------------------- content
 
 
@@ -261,6 +332,23 @@ def test_samples_that_share_a_half_are_found_across_jobs(store: Store, scene: Sc
     assert found(report) == {"equal-samples": 2}
     (group,) = [g for g in report.scenes[0].groups if g.cause.label == "equal-samples"]
     assert {(f.row, f.job) for f in group.first} == {(2, 0), (8, 2)}
+
+
+def test_samples_whose_keys_give_one_seed_are_noted_and_not_rendered_again(
+    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seeds have 32 bits; rendered again, these samples would come out the same. Here all keys give one."""
+    purposes = set()
+    monkeypatch.setattr(repeated_seeds, "seed_of", lambda _, purpose: purposes.add(purpose) or 7)
+
+    def change(given: Any) -> None:
+        given.radiance[8][0] = outputs(scene, 0).radiance[2][1]
+
+    recommitted(scene, 2, change)
+    report = checked(store, repair=True)
+    assert (noted(report), report.exit_code, report.scenes[0].set_aside) == ({"same-seed": 2}, 0, ())
+    attempts = ("", ", attempt 1", ", attempt 2", ", attempt 3")
+    assert purposes == {f"half {half}{attempt}" for half in "AB" for attempt in attempts}
 
 
 def many(tmp_path: Path, change: Callable[[np.ndarray], None], samples_: int = 256) -> StoreReport:
@@ -367,6 +455,33 @@ def test_a_plan_that_is_missing_among_others_is_found(store: Store, scene: Scene
     scene.plan(Request(modifications=6, views_per_modification=2))
     (scene.folder / "plans/000000").rename(Path(store.root).with_name("gone"))
     assert "plan" in found(checked(store))
+
+
+@pytest.mark.parametrize("gone", ["000000", "000001", "000002"])
+@pytest.mark.parametrize("what", ["folder", "zarr.json"])
+def test_a_plan_that_is_lost_is_told_and_none_of_its_jobs_is_set_aside(
+    store: Store, scene: SceneStore, gone: str, what: str
+) -> None:
+    """Without it they cannot be rendered again; and once it is put back, nothing is wrong."""
+    for n in (6, 7):
+        scene.plan(Request(modifications=n, views_per_modification=2))
+    commit_all(scene)
+    path, aside = scene.folder / "plans" / gone, Path(store.root).with_name("aside")
+    path = path if what == "folder" else path / "zarr.json"
+    path.rename(aside)
+    report = checked(store, repair=True)
+    assert (found(report), report.scenes[0].set_aside) == ({"plan": 1}, ())
+    (group,) = report.scenes[0].groups
+    assert group.first[0].file == f"{scene.name}/plans/{gone}/zarr.json"
+    assert "the plan is missing" in group.first[0].detail
+    aside.rename(path)
+    assert noted(checked(store)) == {}
+
+
+def test_a_plan_that_is_claimed_and_not_written_yet_is_no_finding(store: Store, scene: SceneStore) -> None:
+    (scene.folder / "plans/000001/view").mkdir(parents=True)
+    (scene.folder / "plans/000001.claim").write_bytes(b"")
+    assert noted(checked(store)) == {}
 
 
 @pytest.mark.parametrize("harm", ["flip", "chunk", "marker", "index", "removed"])

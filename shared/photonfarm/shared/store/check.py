@@ -125,7 +125,9 @@ class _SceneChecking:
         self._add(plans.check_base(needed=bool(committed)))
         scene = None
         if plans.shard_rows is not None:
-            scene = Checked(self._storage, self._scene_id, self._name, spec, plans.plans, plans.shard_rows)
+            scene = Checked(
+                self._storage, self._scene_id, self._name, spec, plans.plans, plans.shard_rows, frozenset(plans.lost)
+            )
             self._jobs(scene, committed)
             self._add(strangers(scene))
         return self._report(spec.name, self._repair(scene, quarantine) if quarantine else [])

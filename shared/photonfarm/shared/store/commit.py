@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from collections.abc import Mapping, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from types import TracebackType
@@ -76,11 +76,13 @@ class JobWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the thread and remove what has not been committed."""
+        """End the thread and remove what has not been committed, if the disk lets us: a sweep does it otherwise."""
         self._join()
         for shard in self._shards.values():
-            shard.close()
-            shard.part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # why a disk refuses is told by the error that is under way
+                shard.close()
+            with contextlib.suppress(OSError):
+                shard.part.unlink(missing_ok=True)
 
     # ------------------------------------------------------------------------------------------------------------- rows
 
@@ -149,6 +151,9 @@ class JobWriter:
     def commit(self, figures: Figures) -> bool:
         """Make the rows part of the store, all or nothing; False if another worker's commit came first.
 
+        False too if a repair has set aside files that we had named already, with a commit that relied on them, say; the
+        job is missing then, and rendered again.
+
         Files that another writer left are kept where every row of the job can be read from them and ours, and are
         replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError
         if others go on changing the files meanwhile.
@@ -156,7 +161,8 @@ class JobWriter:
         Who meets files of others may meet those at work too: a repair, which has taken the marker back, and goes on to
         move the files, and a writer that replaces what it cannot read. Each acts first and looks then, so that one of
         two sees the other: a repair looks for a new marker once it has moved the files, and we compare marker and files
-        once the marker is placed.
+        once the marker is placed. Who meets nobody compares nothing, and only looks whether the files are still there:
+        however long ago they were named, others may have committed them since, and a repair may have moved them.
         """
         self._check_complete()
         self._join()
@@ -174,7 +180,7 @@ class JobWriter:
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
                 placed = self._place(described, figures)
-                if alone or self._is_marker_right():
+                if (placed and alone and self._are_there(described)) or self._is_marker_right():
                     return placed
             raise CorruptError(
                 f"{self._storage.where}/{self._scene.name}: the files of job {self._rows.job} change while it is "
@@ -182,7 +188,10 @@ class JobWriter:
             )
 
     def _adopt_all(self) -> bool | None:
-        """Have every row of the job lie under its names; whether all files are ours. None if the job is committed."""
+        """Have every row of the job lie under its names; whether all files are ours.
+
+        None if the job is committed, or files of ours are set aside.
+        """
         left = [name for name, shard in self._shards.items() if shard.part.exists()]
         kept = [name for name in left if not self._adopt(name)]
         others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
@@ -190,7 +199,7 @@ class JobWriter:
             return True
         if not self._is_readable():
             # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
-            if self._scene.is_committed(self._rows.job):
+            if self._scene.is_committed(self._rows.job) or self._is_set_aside():
                 return None
             for name in kept:
                 self._adopt(name, replace=True)
@@ -199,6 +208,14 @@ class JobWriter:
 
     def _adopt(self, name: str, *, replace: bool = False) -> bool:
         return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
+
+    def _is_set_aside(self) -> bool:
+        """Whether a file that we have named is gone: only a repair moves one."""
+        named = [name for name, shard in self._shards.items() if not shard.part.exists()]
+        return not self._are_there(named)
+
+    def _are_there(self, names: Iterable[str]) -> bool:
+        return all(self._storage.exists(self._file(name)) for name in names)
 
     def _summaries(self) -> dict[str, dict[str, Any]]:
         """Size and checksum of the files that are there, by array; none of those that cannot be read."""
@@ -214,7 +231,11 @@ class JobWriter:
         return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
 
     def _is_marker_right(self) -> bool:
-        """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside."""
+        """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside.
+
+        A file that it does not name takes nothing from those that it does: a writer that was late, and whose render
+        needs float32, has added it. Only `radiance` would be read instead of `radiance_wide`.
+        """
         name = markers.name_of(self._scene.name, self._rows.job)
         try:
             marker = self._storage.read(name)
@@ -222,7 +243,8 @@ class JobWriter:
             return False
         told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
         there = self._summaries()
-        if all(_is_told(told.get(self._plan_file(name)), there.get(name)) for name in self._arrays):
+        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
+        if all(_is_told(told.get(self._plan_file(name)), there.get(name)) for name in relevant):
             return True
         from photonfarm.shared.store.findings import Cause, Finding
         from photonfarm.shared.store.quarantine import Quarantine

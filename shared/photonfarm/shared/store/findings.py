@@ -37,7 +37,17 @@ class Cause(Enum):
     NOT_FINITE = "not-finite", "a stored value is NaN or infinite", Remedy.RENDER
     EQUAL_HALVES = "equal-halves", "halves A and B of a sample are equal: one seed, used twice", Remedy.RENDER
     EQUAL_SAMPLES = "equal-samples", "halves of different samples are equal: one seed, used twice", Remedy.RENDER
+    SAME_SEED = (
+        "same-seed",
+        "halves of different samples are equal: their keys happen to give one seed, and would give it again",
+        Remedy.LOOK,
+    )
     HALVES_DIFFER = "halves-differ", "A and B are not distributed alike: one of them is biased", Remedy.REPORT
+    UNREADABLE = (
+        "unreadable",
+        "cannot be read: disk, rights or server refuse it; what it holds may be whole",
+        Remedy.REPORT,
+    )
     SPEC = "spec", "the scene's spec is missing or not what was stored", Remedy.SUBMIT
     PLAN = (
         "plan",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,7 @@ class Checked:
     spec: SceneSpec
     plans: list[StoredPlan] | None  # None if one is damaged: then only what markers tell can be checked
     shard_rows: int
+    lost: frozenset[str] = frozenset()  # folders of plans that are missing
 
     def files_of(self, job: int) -> dict[str, str]:
         """The names that a job's files may have, by array; none for a job of no plan that is known."""
@@ -62,6 +64,11 @@ class JobCheck:
         storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
         try:
             content = storage.read(name)
+        except FileNotFoundError:
+            return [], b""
+        except OSError as error:
+            return [self._unreadable(job, name, error)], b""
+        try:
             found = list(self._of(job, content))
             if not found or storage.read(name) == content:
                 return found, content
@@ -73,7 +80,7 @@ class JobCheck:
         scene, name = self._scene, markers.name_of(self._scene.name, job)
         own = scene.files_of(job)
         if scene.plans is not None and not own:
-            yield self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
+            yield self._without_plan(job, marker, name)
             return
         try:
             named = marker_files(marker, scene.name, job)
@@ -91,6 +98,15 @@ class JobCheck:
         for kind in KINDS:
             yield from self._rows(job, kind, files, shards, rows)
 
+    def _without_plan(self, job: int, marker: bytes, name: str) -> Finding:
+        """What a marker of no plan tells: that the last plan is missing, if it names files in the folder of one."""
+        scene = self._scene
+        with contextlib.suppress(CorruptError):
+            named = {_plan_of(file) for file in marker_files(marker, scene.name, job)}
+            if missing := named - {plan.folder for plan in scene.plans or []}:
+                return Finding(Cause.PLAN, plans.MISSING, scene.scene_id, job, file=f"{min(missing)}/zarr.json")
+        return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
+
     # ------------------------------------------------------------------------------------------------------------ files
 
     def _open(self, job: int, file: str, about: dict[str, Any], shards: dict[str, Shard]) -> Iterator[Finding]:
@@ -98,8 +114,12 @@ class JobCheck:
         array = self._arrays[_array_of(file)]
         try:
             size = self._scene.storage.size(file)
-        except FileNotFoundError:
-            yield self._finding(Cause.MISSING_FILE, job, "the marker names it", file)
+        except (FileNotFoundError, NotADirectoryError):
+            if _plan_of(file) not in self._scene.lost:  # without its plan it cannot be rendered again
+                yield self._finding(Cause.MISSING_FILE, job, "the marker names it", file)
+            return
+        except OSError as error:
+            yield self._unreadable(job, file, error)
             return
         self._tally.size_bytes += size
         if size != about["size"]:
@@ -110,6 +130,9 @@ class JobCheck:
             crc32c = shard.summary()["crc32c"]
         except CorruptError as error:
             yield self._finding(Cause.CHECKSUM, job, _said(error), file)
+            return
+        except OSError as error:
+            yield self._unreadable(job, file, error)
             return
         shards[array.name] = shard
         if crc32c != about["crc32c"]:
@@ -189,6 +212,11 @@ class JobCheck:
             view = None if rows is None else rows.views.get(row)
             yield from self._contents.view(values["depth"], values["normal"], view)
 
+    def _unreadable(self, job: int, file: str, error: OSError) -> Finding:
+        """The finding for a file that cannot be read; raises OSError if it is the whole store that cannot be."""
+        self._scene.storage.names(self._scene.name)
+        return self._finding(Cause.UNREADABLE, job, error.strerror or str(error), file)
+
     def _finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
         return Finding(cause, detail, self._scene.scene_id, job, row, file)
 
@@ -196,6 +224,11 @@ class JobCheck:
 def _array_of(file: str) -> str:
     """The array that a file named by a marker belongs to."""
     return file.rsplit("/", 2)[1]
+
+
+def _plan_of(file: str) -> str:
+    """The folder of the plan that a file of an output lies in."""
+    return file.rsplit("/", 2)[0]
 
 
 def _said(error: CorruptError) -> str:

@@ -125,7 +125,7 @@ class LocalStorage:
     # --------------------------------------------------------------------------------------------------------- sweeping
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
-        """Remove parts that dead writers left; how many."""
+        """Remove parts that dead writers left; how many. Those of others, which cannot be removed, are left alone."""
         if not (names := self.names(TMP)):
             return 0
         tmp, swept = self.root / TMP, 0
@@ -133,7 +133,7 @@ class LocalStorage:
         now_s = tmp.stat().st_mtime
         for name in names:
             path = tmp / name
-            with contextlib.suppress(FileNotFoundError):  # another sweeper was faster
+            with contextlib.suppress(OSError):  # another sweeper was faster, or it is for its owner to remove
                 age_s = now_s - path.stat().st_mtime
                 if age_s > FOREIGN_AGE_S or (age_s >= stray_age_s and _is_of_the_dead(name)):
                     _remove(path)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import UNUSED, PlannedRows
 from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.sampling import sample_keys
@@ -38,19 +38,23 @@ class PlanCheck:
         self._scene = scene  # its folder
         self.shard_rows: int | None = None  # as the first plan that can be read tells
         self.plans: list[StoredPlan] | None = None  # once checked; None if one is damaged
+        self.lost: set[str] = set()  # folders of plans that are missing
 
     # ------------------------------------------------------------------------------------------------------------ plans
 
     def check_plans(self) -> Iterator[Finding]:
         """What is wrong with the plans."""
-        numbers = sorted(int(name) for name in self._storage.names(f"{self._scene}/plans") if name.isdecimal())
-        found = [Finding(Cause.PLAN, f"plan {n} is missing", self._id) for n in set(range(len(numbers))) - set(numbers)]
-        for number in numbers:
-            found += self._plan(plans.folder(self._scene, number))
+        found: list[Finding] = []
+        for number in range(plans.count(self._storage, self._scene)):
+            folder = plans.folder(self._scene, number)
+            try:
+                found += self._plan(folder)
+            except OSError as error:
+                found.append(self._unreadable(folder, error))
         if not found:
             try:
                 self.plans = plans.load_all(self._storage, self._scene, [])
-            except CorruptError as error:
+            except StoreError as error:
                 found.append(Finding(Cause.PLAN, str(error), self._id))
         yield from found
         if self.plans:
@@ -62,10 +66,17 @@ class PlanCheck:
     def _id(self) -> str:
         return self._spec.scene_id
 
+    def _unreadable(self, folder: str, error: OSError) -> Finding:
+        return Finding(Cause.UNREADABLE, error.strerror or str(error), self._id, file=folder)
+
     def _plan(self, folder: str) -> Iterator[Finding]:
         """What is wrong with the files of a plan."""
         import zarr
 
+        if not self._storage.exists(f"{folder}/zarr.json"):
+            self.lost.add(folder)
+            yield Finding(Cause.PLAN, plans.MISSING, self._id, file=f"{folder}/zarr.json")
+            return
         try:
             group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
             jobs, shard_rows = (int(str(group.attrs[name])) for name in ("jobs", "shard_rows"))
@@ -138,9 +149,15 @@ class PlanCheck:
 
     def check_base(self, *, needed: bool) -> Iterator[Finding]:
         """What is wrong with geometry and base point cloud; `needed` once a job is committed."""
+        folder = f"{self._scene}/base"
+        try:
+            yield from self._base(folder, needed=needed)
+        except OSError as error:
+            yield self._unreadable(folder, error)
+
+    def _base(self, folder: str, *, needed: bool) -> Iterator[Finding]:
         import zarr
 
-        folder = f"{self._scene}/base"
         if not self._storage.exists(f"{folder}/zarr.json"):
             if needed:
                 yield Finding(Cause.BASE, "is missing, and jobs are committed", self._id, file=folder)

@@ -25,6 +25,12 @@ from photonfarm.shared.view import View
 
 NAME_DIGITS = 6
 
+MISSING = (
+    "the plan is missing, or its zarr.json is; it says what the rows of its jobs are, and cannot be made anew: put the "
+    "folder back from a copy of the store"
+)
+"""Of a plan."""
+
 _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
 
@@ -119,12 +125,28 @@ def build(
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan]) -> list[StoredPlan]:
-    """The plans of a scene in order, those already loaded taken over."""
-    with store_errors("list the plans", f"{storage.where}/{scene}"):
-        numbers = sorted(int(name) for name in storage.names(f"{scene}/plans") if name.isdecimal())[len(loaded) :]
-        if numbers and not storage.exists(f"{folder(scene, numbers[-1])}/zarr.json"):  # in a bucket it comes last
-            del numbers[-1]
-    return loaded + [_load(storage, scene, number) for number in numbers]
+    """The plans of a scene in order, those already loaded taken over.
+
+    Raises CorruptError if one of them is missing or is not as it was written: later rows refer to its rows, and a plan
+    that is left out would be planned again without end.
+    """
+    with store_errors("read the plans", f"{storage.where}/{scene}"):
+        return loaded + [_load(storage, scene, n) for n in range(len(loaded), count(storage, scene, len(loaded)))]
+
+
+def count(storage: Storage, scene: str, loaded: int = 0) -> int:
+    """How many plans a scene must have, by the last one's number; the first `loaded` are known to be there.
+
+    The last one does not count yet while it is being written, which can be seen in a bucket alone: it is claimed there,
+    and its zarr.json comes last.
+    """
+    names = [name for name in storage.names(f"{scene}/plans") if name.isascii() and name.isdecimal()]
+    found = max((int(name) + 1 for name in names if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
+    if found <= loaded:
+        return loaded
+    last = folder(scene, found - 1)
+    is_being_written = not storage.exists(f"{last}/zarr.json") and storage.exists(f"{last}.claim")
+    return found - 1 if is_being_written else found
 
 
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
@@ -139,7 +161,9 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
         about: dict[str, Any] = dict(group.attrs)
         request = _REQUEST.validate_python(about["request"], extra="ignore")  # of a later program
         first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
-    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
+    except FileNotFoundError as error:
+        raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
+    except (ValueError, KeyError, RuntimeError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}") from error
     return StoredPlan(number, name, request, first_job, jobs, shard_rows, rows)
 

@@ -1,4 +1,8 @@
-"""Samples that have a half in common: a seed was used twice."""
+"""Samples that have a half in common: a seed was used twice.
+
+Seeds have 32 bits, so that among many samples some have one in common by chance. Rendered again, these would come out
+the same; so they are told from those that a fault has made.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError
-from photonfarm.shared.store import schema
+from photonfarm.shared.keys import seed_of
+from photonfarm.shared.store import plans, schema
 from photonfarm.shared.store.content_check import Tally, is_constant
 from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.job_check import Checked
 from photonfarm.shared.store.shards import Shard
+
+DRAWN = 4
+"""Seeds of a half that a renderer may draw: three are tried, and one may be the other half's."""
 
 
 def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
@@ -22,18 +30,29 @@ def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
         first, reference = next(read, (0, None))
         if reference is None or any(is_constant(half) for half in reference):
             continue
-        other = None
-        for row, halves in read:
-            if any(np.array_equal(a, b) for a in reference for b in halves):
-                other = row
-                yield _shared(scene, row, first)
-        if other is not None:
-            yield _shared(scene, first, other)
+        causes = {
+            row: Cause.SAME_SEED if _seeds(scene, row) & _seeds(scene, first) else Cause.EQUAL_SAMPLES
+            for row, halves in read
+            if any(np.array_equal(a, b) for a in reference for b in halves)
+        }
+        for row, cause in causes.items():
+            yield _shared(scene, cause, row, first)
+        for cause in dict.fromkeys(causes.values()):
+            yield _shared(scene, cause, first, max(row for row in causes if causes[row] is cause))
 
 
-def _shared(scene: Checked, row: int, other: int) -> Finding:
+def _shared(scene: Checked, cause: Cause, row: int, other: int) -> Finding:
     detail = f"has a half in common with row {other}"
-    return Finding(Cause.EQUAL_SAMPLES, detail, scene.scene_id, row // scene.shard_rows, row)
+    return Finding(cause, detail, scene.scene_id, row // scene.shard_rows, row)
+
+
+def _seeds(scene: Checked, row: int) -> set[int]:
+    """The seeds that the halves of a sample may have been rendered with, by its key; none if no plan tells that."""
+    sample = plans.sample_at(scene.plans, row) if scene.plans else None
+    if sample is None:
+        return set()
+    purposes = [f"half {half}{again}" for half in "AB" for again in ("", *(f", attempt {n}" for n in range(1, DRAWN)))]
+    return {seed_of(sample.key, purpose) for purpose in purposes}
 
 
 def _halves(scene: Checked, row: int) -> NDArray[np.floating] | None:

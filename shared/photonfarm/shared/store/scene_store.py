@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -27,6 +28,9 @@ from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import TopUp, expand_top_up
 
 SCENES = "scenes"
+
+_removing = threading.Lock()
+"""One thread at a time waits for the tasks of others; two would wait for each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +78,18 @@ class SceneStore:
     def plan(self, request: Request | TopUp, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
         """Plan what is new of a request; racing submitters try again, each against the other's plan.
 
-        Raises SpecError for a request or a number of rows that cannot be.
+        Raises SpecError for a request or a number of rows that cannot be, and CorruptError if a plan is missing.
         """
         while True:
+            committed = self.committed_jobs()  # before the plans: each one's plan is there by now
             found = self.plans()
             rows_per_job = self._shard_rows(found, shard_rows)
             first_job = found[-1].end_job if found else 0
+            if (job := max(committed, default=-1)) >= first_job:
+                raise CorruptError(
+                    f"{self.storage.where}/{markers.name_of(self.name, job)}: no plan has this job, and a new one "
+                    "would: `photonfarm store check` tells whether the last plan is missing"
+                )
             known = Known((plan.first_row, plan.rows) for plan in found)
             if isinstance(request, TopUp):
                 expansion = expand_top_up(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
@@ -197,7 +207,8 @@ def _remove(built: Path) -> None:
     async def others() -> None:
         await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()}, return_exceptions=True)
 
-    sync(others())
+    with _removing:
+        sync(others())
     shutil.rmtree(built, ignore_errors=True)
 
 

@@ -11,6 +11,7 @@ is cut or whose disk fails ends the process, where reading raises.
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import weakref
@@ -30,6 +31,9 @@ _CRC_BYTES = 4
 _BLOSC_HEADER_BYTES = 16
 _FLUSH_BYTES = 4 << 20
 """Written before the disk is set to work on it: the sync, which a commit waits for, has little left to do."""
+
+_DAMAGED = (errno.EIO, errno.EBADMSG, errno.EUCLEAN)
+"""Why a file system refuses a file that is there: the disk, or its own checksums."""
 
 _PIECE_BYTES = 256 << 10
 """Copied at once, then checked while a core's own cache still holds it."""
@@ -93,13 +97,20 @@ class Shard:
     """One whole shard, open for reading, its index checked. Safe for several threads at once."""
 
     def __init__(self, path: Path, array: ArraySchema, shard_rows: int) -> None:
-        """Open; raises CorruptError, with the file's name, for a missing, cut or damaged file."""
+        """Open; raises CorruptError, with the file's name, for a missing, cut or damaged file.
+
+        Whether one cannot be opened for want of rights or descriptors says nothing of it: that is a plain OSError.
+        """
+        self.path = path
         try:
             self._descriptor = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
             raise CorruptError(f"{path}: is committed, but missing") from error
+        except OSError as error:
+            if error.errno in _DAMAGED:
+                raise self._refused(error) from error
+            raise
         weakref.finalize(self, os.close, self._descriptor)
-        self.path = path
         self._array = array
         self._size = os.fstat(self._descriptor).st_size
         self._index: list[list[int]] = self._read_index(shard_rows)  # offset and length of each row
@@ -110,8 +121,9 @@ class Shard:
         wanted = 16 * shard_rows + _CRC_BYTES
         if self._size < wanted:
             raise CorruptError(f"{self.path}: has {self._size} bytes, too few for the index of {shard_rows} rows")
-        data = os.pread(self._descriptor, wanted, self._size - wanted)
-        if len(data) < wanted or _crc(memoryview(data)[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
+        data = bytearray(wanted)
+        read = self._read_at(self._size - wanted, data)
+        if read < wanted or _crc(memoryview(data)[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
             raise self._damaged("the index")
         index = np.frombuffer(data, "<u8", 2 * shard_rows).reshape(shard_rows, 2)
         offset, length = index[(index != _EMPTY).any(axis=1)].T
@@ -155,7 +167,7 @@ class Shard:
         end, crc = offset + length - _CRC_BYTES, bytearray(_CRC_BYTES)
         if (mapped := self._mapped(row, end, crc)) is None:
             content = np.empty(length - _CRC_BYTES, np.uint8) if memory is None else memory
-            whole = os.preadv(self._descriptor, [content.data, crc], offset) == length and _crc(content) == crc
+            whole = self._read_at(offset, content.data, crc) == length and _crc(content) == crc
         elif memory is None:
             content = mapped[offset:end]
             whole = _crc(content) == crc
@@ -165,6 +177,13 @@ class Shard:
         if not whole:
             raise self._damaged(f"row {row} of the shard")
         return content
+
+    def _read_at(self, offset: int, *memory: memoryview | bytearray) -> int:
+        """Read into some memory from an offset on; how many bytes came. Raises CorruptError where the disk fails."""
+        try:
+            return os.preadv(self._descriptor, memory, offset)
+        except OSError as error:
+            raise self._refused(error) from error
 
     def _mapped(self, row: int, end: int, crc: bytearray) -> NDArray[np.uint8] | None:
         """The file in memory, if the row should be taken from there, with the row's checksum read into `crc`.
@@ -194,14 +213,19 @@ class Shard:
         except (RuntimeError, ValueError) as error:  # whole, and yet not of this array
             raise self._damaged(f"row {row} of the shard") from error
 
+    def _refused(self, error: OSError) -> CorruptError:
+        return CorruptError(f"{self.path}: cannot be read: {error.strerror}")
+
     def _damaged(self, what: str) -> CorruptError:
         return CorruptError(f"{self.path}: {what} fails its CRC-32C; the stored bytes are not what was committed")
 
     def summary(self) -> dict[str, Any]:
         """Size and checksum as `ShardWriter.finish` gave them, from the checksums that are stored."""
         ends = [offset + length for offset, length in self._index if offset != _EMPTY]
-        crcs = b"".join(os.pread(self._descriptor, _CRC_BYTES, end - _CRC_BYTES) for end in ends)
-        checksum = _crc(crcs + _crc(np.array(self._index, "<u8").tobytes()))
+        crcs = [bytearray(_CRC_BYTES) for _ in ends]
+        for end, crc in zip(ends, crcs, strict=True):
+            self._read_at(end - _CRC_BYTES, crc)
+        checksum = _crc(b"".join(crcs) + _crc(np.array(self._index, "<u8").tobytes()))
         return {"size": os.fstat(self._descriptor).st_size, "crc32c": checksum.hex()}
 
 

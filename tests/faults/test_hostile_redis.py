@@ -188,6 +188,8 @@ class Stranger:
         self._connection.set("rq:photonfarm:worker:evil", "")
         self._connection.zadd(f"rq:executions:{self._honest()}", {"evil": 2e9})
         self._connection.set("rq:clean_registries:photonfarm", 1)
+        self._connection.set("rq:photonfarm:store", "ab" * 16)
+        self._connection.set("rq:photonfarm:paused:\x1b]0;owned\x07", "\x1b]0;owned\x07")
 
 
 def run_plain(where: Field, serializer: str) -> None:
@@ -361,6 +363,7 @@ SMALL_ENTRIES = {
     "all workers that are none": ("SET", "rq:workers", "x"),
     "queues that are none": ("SET", "rq:queues", "x"),
     "a lock for ever": ("SET", "rq:photonfarm:reconcile", "x"),
+    "a store for ever": ("SET", "rq:photonfarm:store", "ab" * 16),
     "taken jobs that are no text": ("RPUSH", f"{KEY}:intermediate", b"\xff"),
 }
 

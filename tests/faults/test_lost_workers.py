@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.worker_settings import GRACE_S
-from photonfarm.shared.queue import STARTS, connect, queue_status, reconcile
+from photonfarm.shared.queue import OVERDUE, STARTS, connect, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
@@ -226,6 +226,40 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
     running.send_signal(signal.SIGTERM)
     running.wait(20)
     told = running.stderr.read().decode()
-    assert "Timeout" in told
+    job = f"{scene.scene_id}-0"
+    assert f"job {job} took longer than --deadline 4 s and was ended, while in\n" in told
     assert "in render_half" in told
     assert "starting again" in told
+    assert "Timeout" not in told
+    assert len(told.splitlines()) <= 12 * told.count("starting again") + 3, "its own stack, and of that the innermost"
+
+
+@pytest.mark.parametrize(
+    ("overdue", "reason"),
+    [
+        (4, "it was started 5 times, and each time it took longer than --deadline 2 s and was ended"),
+        (
+            0,
+            "each time its worker died or lost Redis, or it took longer than --deadline 2 s and was ended (1 times)",
+        ),
+    ],
+)
+def test_a_job_that_is_given_up_after_its_last_deadline_has_the_deadline_as_its_reason(
+    analytic: ModuleType,
+    planned: Callable[..., SceneStore],
+    redis_server: EmbeddedRedis,
+    start: Starter,
+    overdue: int,
+    reason: str,
+) -> None:
+    """It has been started four times before."""
+    scene = planned(1)
+    connection, name = connect(redis_server.url), f"{scene.scene_id}-0"
+    connection.set(f"{STARTS}{name}", 4)
+    connection.set(f"{OVERDUE}{name}", overdue)
+    running = start(
+        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=2.0, until_complete=True
+    )
+    assert running.wait(60) == 7
+    assert reason in queue_status(connection).failed[name].reason
+    assert not connection.exists(f"{OVERDUE}{name}")

@@ -5,6 +5,7 @@ import importlib.util
 import io
 import itertools
 import os
+import shutil
 import signal
 import threading
 import zipfile
@@ -88,7 +89,7 @@ def test_a_replacement_that_arrives_late_does_not_undo_a_later_one(
 ) -> None:
     storage = ObjectStorage(url)
     storage.adopt(part_of(storage, b"damaged"), "name")
-    monkeypatch.setattr(objects, "PAUSES_S", (0.0,))
+    monkeypatch.setattr(objects, "PATIENCE_S", 0.0)
     late = threading.Event()
     with s3_server.faulty_way(port, lambda method, _: late if method == "PUT" else None) as way:
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{way}")
@@ -121,6 +122,14 @@ def test_the_doctor_tries_the_bucket(url: str, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
     with pytest.raises(StoreError, match="403 Forbidden"):
         doctor._writes(url)
+
+
+def test_the_doctor_tells_that_a_disk_is_too_full_for_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "can be written" in doctor._writes(tmp_path / "store")
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=int(0.4e9)))
+    with pytest.raises(StoreError, match=r"0\.4 GB are free, and `photonfarm work` takes no job below 1 GB"):
+        doctor._writes(tmp_path / "store")
 
 
 # --------------------------------------------------------------------------------------------------------------- plans

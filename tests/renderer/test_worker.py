@@ -3,13 +3,16 @@
 import importlib.util
 import json
 import os
+import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from photonfarm.renderer.heartbeat import Heart
 from photonfarm.renderer.worker import check, render_job, run_worker
 from photonfarm.renderer.worker_settings import WorkerSettings
 from photonfarm.renderer.worker_talk import Talk
@@ -166,6 +169,134 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     said = capfd.readouterr().err
     assert said.count("leaves scene") == 1
     assert "Traceback" not in said
+
+    assert queue_status(connection).held_up.left == {}, "said while it works only"
+
+
+def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
+    scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    connection = connect(server.url)
+    settings = settings_of(store=str(tmp_path / "store"), redis_url=server.url)
+    heart = Heart(settings, Store(tmp_path / "store"), None)
+    heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
+    heart.start()
+    show.status(tmp_path / "store", server.url, as_json=False)
+    said = capsys.readouterr().out
+    assert "analytic: left by 1 of 1 workers: gone.xml is not there" in said
+    assert "worker ada takes no jobs: the disk is full" in said
+    assert "stranger" not in said
+    show.status(tmp_path / "store", server.url, as_json=True)
+    assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
+    heart.end()
+    show.status(tmp_path / "store", server.url, as_json=False)
+    assert "takes no jobs" not in capsys.readouterr().out
+    queue.bury(connection, "ada")
+
+
+# ---------------------------------------------------------------------------------------------------- the wrong store
+
+
+def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    connection, store = connect(server.url), Store(tmp_path / "store")
+    queue.reconcile(store, connection)
+    other = Store(tmp_path / "typo", create=True)
+    with pytest.raises(QueueError, match=f"id {store.store_id}, and .*typo has the id {other.store_id}"):
+        run_worker(tmp_path / "typo", server.url, child=analytic.command(), **QUICK)
+    assert queue_status(connection).queued == 2
+    assert queue_status(connection).workers == 0
+
+
+@pytest.mark.parametrize("in_its_place", ["nothing", "an empty folder", "another store"])
+def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jobs(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, in_its_place: str
+) -> None:
+    root, connection = tmp_path / "store", connect(server.url)
+    queue.reconcile(Store(root), connection)
+    code = f"""
+import runpy, sys
+from pathlib import Path
+from photonfarm.renderer import jobs
+from photonfarm.shared.store import Store
+plain = jobs.ShardRenderer.render
+def render(self, *job):
+    root = Path({str(root)!r})
+    root.rename(root.with_name("away"))
+    if {in_its_place!r} == "an empty folder":
+        root.mkdir()
+    if {in_its_place!r} == "another store":
+        Store(root, create=True)
+    return plain(self, *job)
+jobs.ShardRenderer.render = render
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+    said = "now another one lies there" if in_its_place == "another store" else "photonfarm.json is missing"
+    with pytest.raises(StoreError, match=said):
+        run_worker(root, server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
+    assert queue_status(connection).failed == {}
+    assert [name.decode() for name in connection.lrange(queue.open_queue(connection).key, 0, -1)] == [
+        job_name(scene.scene_id, job) for job in range(2)
+    ]
+
+
+def test_a_store_that_is_not_there_is_not_made(analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="typo: there is no store; `photonfarm submit` makes one"):
+        run_worker(tmp_path / "typo", server.url, child=analytic.command(), **QUICK)
+    assert not (tmp_path / "typo").exists()
+
+
+def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
+    analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    log, connection = tmp_path / "log", connect(server.url)
+    with analytic.start_worker(tmp_path / "later", server.url, analytic.command(), log, name="ada") as running:
+        analytic.wait_for(lambda: queue.hosts(connection), 60)
+        time.sleep(3)  # longer than its heartbeat lasts
+        check(server.url)
+        assert not (tmp_path / "later").exists()
+        store = Store(tmp_path / "later", create=True)
+        scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=3), shard_rows=3).scene_id)
+        analytic.wait_for(lambda: scene.missing_jobs() == [], 60)
+        running.terminate()
+        assert running.wait(20) == 0
+    assert log.read_text().count(f"worker ada: waiting for a store at {tmp_path / 'later'}") == 1
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", log.read_text()), "a supervisor tells the time as well"
+
+
+def test_a_worker_that_waits_for_a_store_ends_when_told(
+    analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    with analytic.start_worker(tmp_path / "never", server.url, analytic.command(), log) as running:
+        analytic.wait_for(lambda: "waiting for a store" in log.read_text(), 60)
+        running.terminate()
+        assert running.wait(20) == 0
+    assert queue_status(connect(server.url)).workers == 0
+
+
+@pytest.mark.parametrize("named", ["analytic", "beginning"])
+def test_a_scene_goes_by_its_name_and_by_how_its_id_begins(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, named: str
+) -> None:
+    text = scene.scene_id[:6] if named == "beginning" else named
+    run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=text, **QUICK)
+    assert scene.missing_jobs() == []
+    assert not render_job(tmp_path / "store", text, 0, load=analytic.AnalyticScene.load)[0]
+
+
+def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_alone(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    connection, said = connect(server.url), []
+    queue.beat(connection, "ada", "another-machine", None, ttl_s=60, process=7)
+    run_worker(tmp_path / "store", server.url, name="ada", child=analytic.command(), say=said.append, **QUICK)
+    assert scene.missing_jobs() == []
+    assert scene.marker(0)["figures"]["worker"] == "ada-2"
+    assert said == ["worker ada: another one of this name is alive, so this one goes by ada-2"]
+    assert queue.hosts(connection) == {"another-machine"}
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:

@@ -182,6 +182,9 @@ def test_a_view_without_a_complete_pass_is_an_error_that_says_so(scene: SceneSto
 def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Path) -> None:
     samples.commit_all(scene)
     merged = merge_view(reader_of(scene), 0)
+    with pytest.raises(ValueError, match=r"view\.exr: .* a name that ends in \.npz"):
+        merged.write(tmp_path / "view.exr")
+    assert list(tmp_path.glob("view*")) == []
     merged.write(tmp_path / "view.npz")
     assert_equal(Merged.read(tmp_path / "view.npz"), merged)
     with np.load(tmp_path / "view.npz") as stored:

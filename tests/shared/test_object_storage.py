@@ -1,12 +1,15 @@
 """A store in a bucket behaves like one in a folder."""
 
+import contextlib
 import importlib.util
 import json
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +20,7 @@ import obstore
 import pytest
 import zarr
 from click.testing import CliRunner
-from obstore.exceptions import AlreadyExistsError
+from obstore.exceptions import AlreadyExistsError, GenericError
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
@@ -26,6 +29,7 @@ from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, object_cache, objects, store_status
 from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.find import Query, find_samples
 from photonfarm.shared.store.findings import Cause
 from photonfarm.shared.store.objects import ObjectStorage
 from photonfarm.shared.store.storage import open_storage
@@ -338,6 +342,15 @@ def test_a_copy_that_is_damaged_on_this_machine_is_no_damage_of_the_store(
     assert scene.storage.names("quarantine") == []
 
 
+@pytest.mark.parametrize("harm", HARMS[1:])
+def test_what_is_looked_up_is_there_though_its_copy_on_this_machine_is_damaged(
+    url: str, harmed: Callable[..., SceneStore], harm: Callable[[Path], None]
+) -> None:
+    scene = harmed(harm)
+    (sample,) = find_samples(Store(url), [scene.scene_id], Query.of(row=0)).samples
+    assert all(place.there for place in sample.places)
+
+
 def test_an_object_that_is_damaged_in_the_bucket_is_fetched_once_more_and_found(url: str) -> None:
     scene = planned(url, modifications=4)
     scene.write_base(*samples.base())
@@ -354,6 +367,20 @@ def test_an_object_that_is_damaged_in_the_bucket_is_fetched_once_more_and_found(
     assert [group.cause for group in report.scenes[0].groups] == [Cause.CHECKSUM]
     assert report.scenes[0].set_aside == ("job 0",)
     assert scene.missing_jobs() == [0]
+
+
+def test_a_damaged_plan_in_the_bucket_is_written_again_from_its_request(url: str) -> None:
+    scene = planned(url, modifications=4)
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    name = f"{scene.name}/plans/000000/view/c.0.0"
+    whole = scene.storage.read(name)
+    put(scene.storage, whole[:-1] + bytes([whole[-1] ^ 1]), name, replace=True)
+    report = check_store(Store(url), when="now", repair=True)
+    assert (report.exit_code, [group.cause for group in report.scenes[0].groups]) == (7, [Cause.PLAN_INPUTS])
+    assert scene.storage.read(name) == whole
+    assert scene.storage.exists(f"{report.quarantine}/{name}")
+    assert check_store(Store(url), when="now").exit_code == 0
 
 
 def test_a_claim_is_completed_from_the_bucket_and_not_from_a_damaged_copy(url: str) -> None:
@@ -392,9 +419,90 @@ def test_a_server_that_refuses_or_is_not_there_is_a_store_error_that_says_so(
         Store(url, create=True)
     (nobody,) = s3_server.free_ports(1)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{nobody}")
-    monkeypatch.setattr(objects, "RETRIES", 1)
+    monkeypatch.setattr(objects, "PATIENCE_S", 0.5)
     with pytest.raises(StoreError, match=f"{url}: cannot"):
         Store(url)
+
+
+# -------------------------------------------------------------------------------------------------------------- outages
+
+
+def test_a_server_that_is_away_for_a_while_is_waited_for(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed while a job is committed, and started again at the same port and folder, longer than 4 retries take."""
+    folder, ports = tmp_path_factory.mktemp("weed"), s3_server.free_ports(len(s3_server.PORTS))
+    monkeypatch.setattr(s3_server, "free_ports", lambda _: ports)
+    monkeypatch.setenv("PHOTONFARM_CACHE", str(tmp_path / "cache"))
+    url, away = "s3://photonfarm/store", 3.0
+    with contextlib.ExitStack() as server:
+        port = server.enter_context(s3_server.running(folder))
+        for name, value in s3_server.environment(port).items():
+            monkeypatch.setenv(name, value)
+        scene = planned(url, modifications=4)
+        given = samples.outputs(scene, 0)
+        assert samples.commit(scene, 1, samples.outputs(scene, 1))
+        reader = SceneReader(url, scene.scene_id)
+        assert reader.refresh().tolist() == [2, 3]
+        server.close()
+        with pytest.raises(OSError, match="refused"), socket.create_connection(("127.0.0.1", port)):
+            pass
+
+        began = time.monotonic()
+        with ThreadPoolExecutor(1) as worker:
+            committed = worker.submit(samples.commit, scene, 0, given)
+            time.sleep(away)
+            assert not committed.done()
+            server.enter_context(s3_server.running(folder))  # by this thread: it ends with the one that starts it
+            assert committed.result()
+        assert time.monotonic() - began > away
+        assert reader.refresh().tolist() == [0, 1]
+        np.testing.assert_array_equal(reader.read(0).radiance, given.radiance[0])
+
+
+def test_an_answer_that_breaks_off_is_asked_for_again(url: str, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(ObjectStorage(url), bytes(100), "object")
+    monkeypatch.setattr(objects, "RETRIES", 0)
+    faults = iter(["answer", "request"])
+    with s3_server.faulty_way(port, lambda method, _: next(faults, None) if method == "GET" else None) as way:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{way}")
+        assert ObjectStorage(url).read("object") == bytes(100)
+    assert next(faults, None) is None
+
+
+@pytest.mark.parametrize("size", [10, objects.SMALL_BYTES + 1])
+def test_a_long_transfer_that_breaks_off_is_begun_again_though_its_time_is_over(
+    url: str, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    storage = ObjectStorage(url)
+    storage.check()
+    failures, plain = iter([GenericError("the connection broke off")]), obstore.put
+
+    def breaking(*args: Any, **how: Any) -> Any:
+        if (failure := next(failures, None)) is not None:
+            raise failure
+        return plain(*args, **how)
+
+    monkeypatch.setattr(obstore, "put", breaking)
+    monkeypatch.setattr(objects, "PATIENCE_S", 0.0)
+    if size > objects.SMALL_BYTES:
+        assert put(storage, bytes(size), "object")
+    else:
+        with pytest.raises(OSError, match="broke off"):
+            put(storage, bytes(size), "object")
+
+
+def test_a_refusal_is_told_at_once(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    storage = ObjectStorage(url)
+    put(storage, b"", "object")
+    began = time.monotonic()
+    with pytest.raises(FileNotFoundError):
+        storage.read("nothing")
+    assert ObjectStorage("s3://no-such-bucket/store").names("scenes") == []
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
+    with pytest.raises(PermissionError):
+        ObjectStorage(url).read("object")
+    assert time.monotonic() - began < 10
 
 
 # ----------------------------------------------------------------------------------------------------- the command line

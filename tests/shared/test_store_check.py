@@ -1,5 +1,6 @@
 """`photonfarm store check` finds what is wrong with a store, and `--repair` has it written again, losing nothing."""
 
+import contextlib
 import errno
 import importlib.util
 import json
@@ -27,6 +28,7 @@ from photonfarm.shared.store.check import StoreReport, check_store
 from photonfarm.shared.store.job_check import JobCheck
 from photonfarm.shared.store.local import LocalStorage
 from photonfarm.shared.store.quarantine import Quarantine
+from photonfarm.shared.top_up import TopUp
 from photonfarm.shared.view import Camera
 
 _spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
@@ -429,8 +431,8 @@ def test_damaged_inputs_of_a_plan_are_found_and_what_is_rendered_is_checked_all_
     path.unlink() if gone else flip(path, path.stat().st_size - 1)
     flip(shard(scene, "depth", 1), 20)
     report = checked(store, repair=True)
-    assert found(report) == {"plan": 1, "checksum": 1}
-    assert report.exit_code == 4
+    assert found(report) == {"plan-inputs": 1, "checksum": 1}
+    assert report.exit_code == 7
     assert report.scenes[0].samples == 10
     assert not marker(scene, 1).exists()
     assert not shard_or_none(scene, "depth", 1)
@@ -504,6 +506,7 @@ def test_a_damaged_base_is_set_aside_and_the_next_job_writes_it(store: Store, sc
     report = checked(store, repair=True)
     assert report.exit_code == 7
     assert scene.missing_jobs() == [2]  # whole, but no other job is left to write the base
+    assert report.scenes[0].set_aside == ("base", "job 2 (whole; rendered again, as a job writes the base)")
     commit_all(scene)
     scene.write_base(*samples.base())
     assert data(scene) == clean
@@ -539,6 +542,99 @@ def test_a_missing_chunk_is_never_read_as_fill_values(store: Store, scene: Scene
     reader = SceneReader(store.root, scene.scene_id)
     with pytest.raises(CorruptError, match=re.escape(f"{chunk}: is missing")):
         reader.base() if chunk.startswith("base") else reader.refresh()
+
+
+# ---------------------------------------------------------------------------------------------------- plans, repaired
+
+INPUTS = ("modification", "view", "sample_modification", "sample_view", "sample_pass", "sample_key")
+
+
+@pytest.fixture
+def planned_thrice(store: Store, scene: SceneStore) -> SceneStore:
+    """A plan, one that adds to it, and a top-up."""
+    scene.plan(Request(modifications=7, views_per_modification=3))
+    scene.plan(TopUp.of("+40", ["views=first:4"]))
+    commit_all(scene)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("name", "gone", "number"),
+    [
+        *((name, number == 1, number) for number, name in enumerate(INPUTS[:3])),
+        *((name, number != 1, number) for number, name in enumerate(INPUTS[3:])),
+        ("view/zarr.json", False, 0),
+        ("sample_key/zarr.json", True, 1),
+        ("depth/zarr.json", False, 2),
+    ],
+)
+def test_a_damaged_file_of_a_plan_is_written_again_from_the_request(
+    store: Store, planned_thrice: SceneStore, name: str, gone: bool, number: int
+) -> None:
+    scene, clean = planned_thrice, data(planned_thrice)
+    (path,) = (scene.folder / f"plans/{number:06d}").glob(name if "/" in name else f"{name}/c.0*")
+    whole = path.read_bytes()
+    path.unlink() if gone else path.write_bytes(whole.replace(b'"chunk', b'"chunc') if "/" in name else flipped(whole))
+    with contextlib.suppress(CorruptError):
+        if SceneReader(store.root, scene.scene_id).refresh().size:
+            assert name == "depth/zarr.json"  # which we do not read
+    damaged = None if gone else path.read_bytes()
+    report = checked(store)
+    assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 4)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 7)
+    assert report.scenes[0].set_aside == (f"plan {number}, written again from its request",)
+    assert data(scene) == clean
+    quarantine = Path(store.root) / report.quarantine
+    aside = quarantine / path.relative_to(store.root)
+    assert (aside.read_bytes() if aside.exists() else None) == damaged
+    (record,) = [json.loads(p.read_text()) for p in quarantine.glob("plan-*.json")]
+    assert record["why"][0]["cause"] == "plan-inputs"
+    assert found(checked(store)) == {}
+    assert SceneReader(store.root, scene.scene_id).refresh().size == sum(plan.samples for plan in scene.plans())
+
+
+def flipped(content: bytes) -> bytes:
+    return content[:-1] + bytes([content[-1] ^ 1])
+
+
+def test_several_damaged_plans_are_written_again_in_their_order(store: Store, planned_thrice: SceneStore) -> None:
+    scene, clean = planned_thrice, data(planned_thrice)
+    for number in range(3):
+        for name in ("view", "sample_view", "sample_pass"):
+            (path,) = (scene.folder / f"plans/{number:06d}/{name}").glob("c.0*")
+            flip(path, 3)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code, data(scene) == clean) == ({"plan-inputs": 9}, 7, True)
+    assert len(report.scenes[0].set_aside) == 3
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (lambda plan: change(plan, seed=1), "its request gives another modification than is there"),
+        (lambda plan: change(plan, modifications=40), "its request does not give its 3 jobs"),
+        (lambda plan: change(plan, modifications=0), "its zarr.json cannot be read"),
+        (lambda plan: flip(plan / "sample_key/c.0.0", 30), "too little of it can be read"),
+    ],
+)
+def test_a_plan_is_not_written_again_where_its_request_may_be_another(
+    store: Store, scene: SceneStore, harm: Callable[[Path], None], said: str
+) -> None:
+    flip(scene.folder / "plans/000000/view/c.0.0", 30)
+    harm(scene.folder / "plans/000000")
+    before = data(scene)
+    report = checked(store, repair=True)
+    assert (report.exit_code, report.scenes[0].set_aside, data(scene) == before) == (4, (), True)
+    (group,) = [group for group in report.scenes[0].groups if group.cause.label == "plan"]
+    assert said in group.first[0].detail
+    assert "back from a copy of the store" in group.first[0].detail
+
+
+def change(plan: Path, **request: int) -> None:
+    about = json.loads((plan / "zarr.json").read_text())
+    about["attributes"]["request"].update(request)
+    (plan / "zarr.json").write_text(json.dumps(about))
 
 
 # ------------------------------------------------------------------------------------------------------------ repair

@@ -68,7 +68,7 @@ def test_the_documents_tables_are_those_of_the_schema(name: str) -> None:
 def test_the_document_is_of_this_version_and_names_the_constants() -> None:
     text = DOCUMENT.read_text()
     assert text.startswith(f"# The store's format, version {declarations.VERSION}\n")
-    assert json.dumps(declarations.stamp()) in text
+    assert json.dumps({**declarations.stamp(), "id": "…"}, ensure_ascii=False) in text
     assert f"One chunk is {schema.INPUT_ROWS_PER_CHUNK} rows" in text
 
 
@@ -126,6 +126,32 @@ def test_the_store_and_every_group_state_format_and_version(scene: SceneStore) -
     assert len(groups) == 4
     for stated in [*groups, json.loads(scene.storage.read("photonfarm.json"))]:
         assert (stated["format"], stated["version"]) == ("photonfarm store", 2)
+
+
+def test_each_store_has_an_id_of_its_own_which_it_keeps(store: Store, tmp_path: Path) -> None:
+    (stated,) = {json.loads(Path(store.root, "photonfarm.json").read_text())["id"]}
+    assert re.fullmatch("[0-9a-f]{32}", stated)
+    assert Store(store.root, create=True).store_id == store.store_id == stated
+    assert Store(tmp_path / "another", create=True).store_id != stated
+
+
+@pytest.mark.parametrize("store_id", [None, 7, "", "0" * 31, "A" * 32])
+def test_a_store_without_an_id_is_refused_by_name(store: Store, store_id: object) -> None:
+    change(Path(store.root, "photonfarm.json"), id=store_id)
+    with pytest.raises(CorruptError, match=r"photonfarm\.json: id = .*: 32 lower-case hexadecimal digits are required"):
+        Store(store.root)
+
+
+def test_a_store_that_is_gone_or_another_one_is_told_from_the_one_that_was_opened(store: Store) -> None:
+    store.check()
+    root = Path(store.root)
+    root.rename(root.with_name("away"))
+    with pytest.raises(StoreError, match=r"photonfarm\.json is missing"):
+        store.check()
+    other = Store(root, create=True)
+    said = f"was the store {store.store_id}, and now another one lies there, {other.store_id}"
+    with pytest.raises(StoreError, match=said):
+        store.check()
 
 
 def test_inputs_read_as_unused_where_nothing_is_written(scene: SceneStore) -> None:

@@ -1,15 +1,24 @@
 """The trainer tells Redis how many samples it has used; whether there is one is none of its trouble."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from photonfarm.shared.queue import connect, consumed_samples
+from photonfarm.shared.queue import connect, consumed_samples, serve
 from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import Store
 from photonfarm.trainer import service
+from photonfarm.trainer.loop import train
+from photonfarm.trainer.settings import TrainSettings
 
 SCENE_ID = "0123456789abcdef" * 2
+
+
+def made(folder: Path) -> Store:
+    return Store(folder / "store", create=True)
 
 
 def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,21 +33,54 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
                 time.sleep(0.01)
 
         connection.set(f"rq:photonfarm:consumed:{SCENE_ID}", 7)
-        with service._consumption_told(server.url, SCENE_ID) as used:
+        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
             time.sleep(0.3)
             wait_for(7)  # of the session before: this one knows nothing yet
-            used({"kind": "train", "draws": 40, "samples": 100})
+            count(40, 100)
             wait_for(40)
-            used({"kind": "end"})
             connection.flushall()
             wait_for(40)
-            used({"kind": "train", "draws": 400, "samples": 100})
+            count(400, 100)
             wait_for(100)
 
 
-@pytest.mark.parametrize("url", [None, "redis://127.0.0.1:1/0", "nonsense"])
-def test_without_a_redis_training_goes_on(url: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "TELL_S", 3600)
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
+            count(120, 48)
+        assert consumed_samples(connect(server.url), [SCENE_ID]) == 48
+
+
+def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
+    make_source: Callable[..., Any], tiny: Callable[..., TrainSettings], run: Path
+) -> None:
+    counts: list[tuple[int, int]] = []
+    settings = tiny(validate_every=100, checkpoint_every=3, max_steps=4)
+    train(make_source(20), settings, run, count=lambda *told: counts.append(told))
+    assert counts == [(0, 0), (3, 20), (6, 20), (9, 20), (12, 20)]
+    counts.clear()
+    train(make_source(20), settings, run, count=lambda *told: counts.append(told))
+    assert counts == [(12, 20)]
+
+
+def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(service, "TELL_S", 0.01)
-    with service._consumption_told(url, SCENE_ID) as used:
-        used({"kind": "train", "draws": 1, "samples": 1})
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        connection = connect(server.url)
+        serve(connection, Store(tmp_path / "other", create=True))
+        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
+            count(40, 100)
+            time.sleep(0.3)
+        assert consumed_samples(connection, [SCENE_ID]) == 0
+    assert capsys.readouterr().err.count("no worker is told what is used: this Redis serves the store") == 1
+
+
+@pytest.mark.parametrize("url", [None, "redis://127.0.0.1:1/0", "nonsense"])
+def test_without_a_redis_training_goes_on(url: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "TELL_S", 0.01)
+    with service._consumption_told(url, made(tmp_path), SCENE_ID) as count:
+        count(1, 1)
         time.sleep(0.1)

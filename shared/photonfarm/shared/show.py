@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -40,6 +41,10 @@ class Finding(Protocol):
     @property
     def exit_code(self) -> int:
         """Of the command, where this does not work; 0 if it can be done without."""
+
+
+HELD_UP_SHOWN = 10
+"""Workers that take no jobs, of which it is said why."""
 
 
 def _json(document: Any) -> None:
@@ -132,15 +137,27 @@ def submission(result: Submission, as_json: bool) -> None:
 
 
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
-    """The store's scenes, and the queue where there is one."""
-    from photonfarm.shared import queue
-    from photonfarm.shared.errors import QueueError
+    """The store's scenes, and the queue where there is one; raises StoreError at the end if a scene cannot be read."""
+    from photonfarm.shared.errors import StoreError
     from photonfarm.shared.store import Store, store_status
 
     opened = Store(store)
     scenes = [asdict(scene) for scene in store_status(opened)]
+    _status(opened, scenes, redis_url, as_json)
+    if unreadable := [s for s in scenes if s["error"]]:
+        said = "; ".join(s["error"] for s in unreadable)
+        raise StoreError(f"{len(unreadable)} of {len(scenes)} scenes cannot be read: {said}")
+
+
+def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json: bool) -> None:
+    from photonfarm.shared import queue
+    from photonfarm.shared.errors import QueueError
+
+    store = opened.root
     try:
-        found: queue.QueueStatus | None = queue.queue_status(queue.connect(redis_url))
+        connection = queue.connect(redis_url)
+        queue.check_served(connection, opened)
+        found: queue.QueueStatus | None = queue.queue_status(connection)
         absent = ""
     except QueueError as error:
         found, absent = None, str(error)
@@ -156,9 +173,13 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
                 str(s["redrawn"]),
             )
             for s in scenes
+            if not s["error"]
         ),
         ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
     )  # fmt: skip
+    for s in scenes:
+        if s["error"]:
+            click.echo(f"{s['name']} {s['scene_id']}: cannot be read: {s['error']}")
     click.echo()
     if found is None:
         click.echo(f"queue: {absent}")
@@ -168,20 +189,38 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
         f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
     )
+    names = {s["scene_id"]: s["name"] for s in scenes}
+    for line in _held_up(found, names):
+        click.echo(f"  {line}")
     for cause in causes:
         click.echo(f"  {len(cause.jobs)} × {cause.cause}")
         click.echo(f"      to repeat one: {queue.repeating_command(store, cause.example)}")
 
 
+def _held_up(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
+    """What keeps scenes of the store from being rendered, as workers say; text that strangers may have written."""
+    for scene_id, reasons in found.held_up.left.items():
+        if scene_id in names:
+            reason = next(iter(reasons.values()))
+            yield f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
+    paused = found.held_up.paused
+    for worker, reason in list(paused.items())[:HELD_UP_SHOWN]:
+        yield f"worker {worker} takes no jobs: {reason}"
+    if len(paused) > HELD_UP_SHOWN:
+        yield f"and {len(paused) - HELD_UP_SHOWN} workers more"
+
+
 def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
     """The failures of this store's jobs that nobody has committed since."""
+    from photonfarm.shared.errors import CorruptError
     from photonfarm.shared.queue import RenderArguments
 
     scene_ids, missing = set(store.scene_ids()), {}
     for name, failure in failed.items():
         job = RenderArguments.of(name)
-        if job.scene_id in scene_ids and not store.scene(job.scene_id).is_committed(job.job):
-            missing[name] = failure
+        with contextlib.suppress(CorruptError):  # of a scene whose spec is damaged
+            if job.scene_id in scene_ids and not store.scene(job.scene_id).is_committed(job.job):
+                missing[name] = failure
     return missing
 
 
@@ -192,6 +231,8 @@ def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Pa
         "queued": found.queued,
         "running": found.running,
         "workers": found.workers,
+        "left": found.held_up.left,
+        "paused": found.held_up.paused,
         "failures": [
             {
                 "cause": cause.cause,

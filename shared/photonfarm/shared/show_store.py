@@ -65,7 +65,10 @@ def check(report: StoreReport, as_json: bool) -> None:
     elif not report.repaired:
         click.echo(f"{wrong} findings; --repair sets aside what can be written again")
     elif report.exit_code == StoreError.exit_code:
-        click.echo("something is still wrong, which cannot be repaired here")
+        click.echo(
+            "something is still wrong that --repair cannot mend: see above for what helps. A plan comes back from a "
+            "copy of its folder below plans/; jobs and base need no copy, and are rendered again"
+        )
 
 
 def _wrong(scene: SceneReport) -> int:

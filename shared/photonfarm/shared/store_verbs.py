@@ -19,19 +19,20 @@ def scene_option(command: click.decorators.FC) -> click.decorators.FC:
 @click.command()
 @store_option
 @scene_option
-@click.option("--repair", is_flag=True, help="Set what is damaged aside, for the workers to write it again.")
+@click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
 @json_option
 def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> None:
-    """Read everything that is stored, and say what is wrong with it; nothing is ever deleted or changed.
+    """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
 
     Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
     that differ by more than chance, views from behind. Safe while workers and trainers are at work.
 
     --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
-    missing and render them again.
+    missing and render them again. Damaged inputs of a plan it copies there, and writes them again from the plan's
+    request. It deletes nothing.
 
-    Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside and is to be written again, 4 something is wrong
-    (also what --repair cannot repair, which the text says).
+    Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
+    4 something is wrong (also what --repair cannot repair, which the text says).
     """
     from photonfarm.shared import show_store
     from photonfarm.shared.store import Store

@@ -105,6 +105,8 @@ def top_up(
 def _queue(store: Store, redis_url: str, retry: bool) -> int:
     try:
         return queue.reconcile(store, queue.connect(redis_url), retry_failed=True, retry_set_aside=retry)
+    except queue.OtherStoreError as error:
+        raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
     except QueueError as error:
         raise QueueError(
             f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "

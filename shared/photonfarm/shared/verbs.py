@@ -16,6 +16,9 @@ import click
 
 GROUP = "photonfarm.commands"
 
+_BARE = {"store": "Look into the sample store, check it, and mend it."}
+"""The help of groups that are no verbs themselves."""
+
 
 @cache
 def _installed() -> dict[str, EntryPoint]:
@@ -48,7 +51,7 @@ class Extended(click.Group):
         runs_alone = own is not None and not isinstance(own, click.Group)
         super().__init__(
             name,
-            help=own.help if own else f"What the installed services have under `{name}`.",
+            help=own.help if own else _BARE.get(name, f"What the installed services have under `{name}`."),
             params=list(own.params) if own else None,
             commands=own.commands if isinstance(own, click.Group) else None,
             callback=_unless_below(own) if own and runs_alone else own and own.callback,

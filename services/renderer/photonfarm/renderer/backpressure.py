@@ -14,8 +14,10 @@ from pathlib import Path
 from redis import Redis
 
 from photonfarm.shared import queue
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.local import LocalStorage
+from photonfarm.shared.store.scene_store import Progress
+from photonfarm.shared.store.storage import store_errors
 
 AHEAD_MINIMUM = 256
 """Samples that may be committed before any has been used: a trainer waits for its first few, also held-out ones."""
@@ -42,10 +44,11 @@ class DiskReserve:
         self._refused_until = self._clock() + FULL_S
 
     def reason(self) -> str | None:
-        """Why no job should be taken now; None if there is none."""
+        """Why no job should be taken now; None if there is none. Raises StoreError if the store's folder is gone."""
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
-        free = _free_bytes(self._root)
+        with store_errors("ask how much of the disk is free", str(self._root)):
+            free = _free_bytes(self._root)
         if free is None or free >= self._reserve_bytes:
             return None
         return (
@@ -95,12 +98,18 @@ class TrainerPace:
             self._due = self._clock() + AHEAD_LOOK_S
         return self._reason
 
+    def _progress(self) -> dict[str, Progress]:
+        """By scene id; a scene that cannot be read holds nobody back."""
+        if self._scene_id is None:
+            return self._store.each(SceneStore.progress)[0]
+        return {self._scene_id: self._store.scene(self._scene_id).progress()}
+
     def _look(self) -> str | None:
-        scenes = self._store.scenes(self._scene_id)
-        committed = sum(scene.progress().committed_samples for scene in scenes)
+        progress = self._progress()
+        committed = sum(scene.committed_samples for scene in progress.values())
         if committed <= AHEAD_MINIMUM:
             return None
-        used = queue.consumed_samples(self._connection, [scene.scene_id for scene in scenes])
+        used = queue.consumed_samples(self._connection, list(progress))
         if committed <= self._ratio * used:
             return None
         return f"{committed} samples are committed, and the trainer has used {used} (--ahead {self._ratio:g})"

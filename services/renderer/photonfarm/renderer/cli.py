@@ -37,7 +37,8 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
 @store_option
 @redis_option
 @click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
-@click.option("--scene", "scene_id", help="Work for this scene id alone.")
+@click.option("--scene", "scene_id", metavar="ID",
+              help="Work for this scene alone: its id, how it begins, or its name.")  # fmt: skip
 @click.option("--job", type=click.IntRange(0), help="Render this one job of --scene here, without Redis, and end.")
 @click.option("--until-complete", is_flag=True, help="Stop when nothing is missing.")
 @click.option(
@@ -51,11 +52,12 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
 )
 @click.option(
     "--ahead", type=click.FloatRange(0, min_open=True), metavar="RATIO",
-    help="Take no job while more samples are committed than RATIO × those that the trainer has used.",
+    help="Take no job while more samples are committed than RATIO × those that the trainer has used. The first 256 may "
+    "always be; without a trainer it stops there.",
 )  # fmt: skip
 @click.option(
     "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
-    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is tried five times.",
+    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is started five times.",
 )  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
@@ -69,6 +71,7 @@ def work(
 ) -> None:
     """Render queued jobs into the store, on one core, until told to stop; start one per core.
 
+    A store that does not exist is waited for; --until-complete ends with exit code 4 then. One Redis serves one store.
     Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.
     """
     from photonfarm.renderer import worker

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from photonfarm.renderer.worker_settings import WorkerSettings
 from photonfarm.shared.errors import PhotonfarmError, QueueError, StoreError
 from photonfarm.shared.store.storage import open_storage, store_errors
 
@@ -75,9 +77,15 @@ def _writes(store: str | Path) -> str:
     try:
         folder = next(p for p in (store.absolute(), *store.absolute().parents) if p.exists())
         with tempfile.TemporaryDirectory(dir=folder, prefix=".doctor-"):
-            free_gb = os.statvfs(folder).f_bavail * os.statvfs(folder).f_frsize / 1e9
+            free_gb = shutil.disk_usage(folder).free / 1e9
     except OSError as error:
         raise StoreError(f"{store}: cannot be written: {error.strerror}") from error
+    reserve_gb = WorkerSettings.model_fields["reserve_bytes"].default / 1e9
+    if free_gb < reserve_gb:
+        raise StoreError(
+            f"{store}: can be written, but {free_gb:.1f} GB are free, and `photonfarm work` takes no job below "
+            f"{reserve_gb:g} GB; make room, or give it a smaller --reserve"
+        )
     return f"{store} can be written, {free_gb:.0f} GB free"
 
 

@@ -3,20 +3,51 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from types import FrameType
 
 import redis
 
-from photonfarm.renderer.worker_settings import GRACE_S, RECYCLED, WorkerSettings
+from photonfarm.renderer.worker_settings import GRACE_S, JOB_IN_HAND, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.find import scene_named
+from photonfarm.shared.store.storage import is_vacant
 
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+
+POLL_S = 1.0
+"""Between looks for a store that is not there yet."""
+
+HUNG_LINES = 8
+"""Of the stack of a job that the deadline has ended: the innermost calls, which tell where it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """What a child has told."""
+
+    last: str  # why it ended, if it said so
+    job: str | None  # the one that it began last
+    hung: str  # where the deadline has ended that; "" if it has not
+
+    @classmethod
+    def of(cls, told: str) -> Words:
+        """What was written: jobs that were begun, last words, and faulthandler's dump, the main thread at its end."""
+        said, timeout, dump = told.partition("Timeout (")
+        lines = said.splitlines()
+        jobs = [line.removeprefix(JOB_IN_HAND) for line in lines if line.startswith(JOB_IN_HAND)]
+        others = [line for line in lines if line.strip() and not line.startswith(JOB_IN_HAND)]
+        stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
+        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]))
 
 
 class Supervisor:
@@ -32,27 +63,81 @@ class Supervisor:
 
     def run(self) -> None:
         """Supervise; raises what the child cannot go on with."""
-        with self._signals():
-            failures = 0
-            while not self._stop.is_set():
-                started = time.monotonic()
-                code, message = self._run_child()
-                if code < 0 and self._stop.is_set():
-                    _free_job(self._settings)
-                if code == 0 or self._stop.is_set():
-                    return
-                _raise_final(code, message)
-                if code == RECYCLED:
-                    failures = 0
-                    continue
-                failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
-                pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
-                failures += 1
-                self._say(f"worker {self._settings.name}: {_ending(code, message)}; starting again in {pause:g} s")
-                self._stop.wait(pause)
+        vacant = is_vacant(self._settings.store)
+        if vacant and self._settings.until_complete:
+            raise StoreError(f"{self._settings.store}: there is no store; `photonfarm submit` makes one")
+        store = None if vacant else Store(self._settings.store)
+        with self._signals(), queue.connect(self._settings.redis_url) as connection:
+            if store is not None:
+                queue.serve(connection, store)
+            try:
+                with self._named(connection):
+                    store = store or self._waited_for(connection)
+                    if store is not None:
+                        queue.serve(connection, store)
+                        self._supervise(store)
+            finally:
+                with contextlib.suppress(redis.RedisError):
+                    if store is not None:
+                        queue.release(connection, store)
 
-    def _run_child(self) -> tuple[int, str]:
-        """Exit code of one child, and its last words."""
+    @contextlib.contextmanager
+    def _named(self, connection: redis.Redis) -> Iterator[None]:
+        """Have a name that no other worker alive has, until the block ends; raises QueueError if Redis fails."""
+        wanted = self._settings.name
+        try:
+            name = queue.take_name(
+                connection, wanted, socket.gethostname(), os.getpid(), ttl_s=self._settings.heartbeat_ttl_s
+            )
+        except redis.RedisError as error:
+            raise QueueError(f"Redis failed while worker {wanted} was announced: {error}") from error
+        if name != wanted:
+            self._say(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
+        self._settings = self._settings.model_copy(update={"name": name})
+        try:
+            yield
+        finally:
+            with contextlib.suppress(redis.RedisError):
+                queue.bury(connection, name)
+
+    def _waited_for(self, connection: redis.Redis) -> Store | None:
+        """The store, once somebody has made it; None if told to stop before. The worker counts as alive meanwhile."""
+        settings = self._settings
+        self._say(f"worker {settings.name}: waiting for a store at {settings.store}")
+        while is_vacant(settings.store):
+            with contextlib.suppress(redis.RedisError):
+                queue.beat(
+                    connection, settings.name, socket.gethostname(), None, ttl_s=settings.heartbeat_ttl_s,
+                    process=os.getpid(),
+                )  # fmt: skip
+            if self._stop.wait(POLL_S):
+                return None
+        return Store(settings.store)
+
+    def _supervise(self, store: Store) -> None:
+        if self._settings.scene_id is not None:
+            scene_id = scene_named(store, self._settings.scene_id)
+            self._settings = self._settings.model_copy(update={"scene_id": scene_id})
+        failures = 0
+        while not self._stop.is_set():
+            started = time.monotonic()
+            code, words = self._run_child()
+            if code < 0 and self._stop.is_set():
+                _free_job(self._settings)
+            if code == 0 or self._stop.is_set():
+                return
+            _raise_final(code, words.last)
+            if code == RECYCLED:
+                failures = 0
+                continue
+            failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
+            pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
+            failures += 1
+            self._say(f"worker {self._settings.name}: {self._ending(code, words)}; starting again in {pause:g} s")
+            self._stop.wait(pause)
+
+    def _run_child(self) -> tuple[int, Words]:
+        """Exit code of one child, and what it has told."""
         with subprocess.Popen(
             self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         ) as self._child:
@@ -63,8 +148,19 @@ class Supervisor:
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
                 self._child.stdin.flush()  # and left open: its end tells the child that we are gone
-            words = self._child.stdout.read().decode(errors="replace").strip()
-            return self._child.wait(), words.splitlines()[-1] if words else ""
+            told = self._child.stdout.read().decode(errors="replace")
+            return self._child.wait(), Words.of(told)
+
+    def _ending(self, code: int, words: Words) -> str:
+        if code < 0:
+            return f"its child was ended by {signal.Signals(-code).name}"
+        if words.hung and words.job:
+            _count_overdue(self._settings, words.job)
+            deadline = f"--deadline {self._settings.deadline_s:g} s"
+            return f"job {words.job} took longer than {deadline} and was ended, while in\n{words.hung}\n"
+        return words.last or f"its child ended with exit code {code}, for the reason above"
+
+    # ---------------------------------------------------------------------------------------------------------- signals
 
     @contextlib.contextmanager
     def _signals(self) -> Iterator[None]:
@@ -81,8 +177,9 @@ class Supervisor:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         again = self._stop.is_set()
         self._stop.set()
-        if self._child is not None:
-            self._child.send_signal(signal.SIGKILL if again else signal.SIGTERM)
+        if self._child is None:
+            return
+        self._child.send_signal(signal.SIGKILL if again else signal.SIGTERM)
         if not again:
             threading.Thread(target=self._see_off, daemon=True).start()
 
@@ -100,9 +197,15 @@ class Supervisor:
 def _free_job(settings: WorkerSettings) -> None:
     """Let others have the job that a child was killed with at once, and do not count this start of it."""
     with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
-        name = queue.bury(connection, settings.name)
+        name = queue.free_job(connection, settings.name)
         if name is not None:
-            connection.delete(queue.STARTS + name)
+            queue.forget_starts_of(connection, name)
+
+
+def _count_overdue(settings: WorkerSettings, name: str) -> None:
+    """Have it known what has ended this start of a job; a Redis that is not there need not know."""
+    with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
+        queue.count_overdue(connection, name)
 
 
 def _raise_final(code: int, message: str) -> None:
@@ -110,9 +213,3 @@ def _raise_final(code: int, message: str) -> None:
     for kind in (StoreError, BackendError, IncompleteError):
         if code == kind.exit_code:
             raise kind(message)
-
-
-def _ending(code: int, message: str) -> str:
-    if code < 0:
-        return f"its child was ended by {signal.Signals(-code).name}"
-    return message or f"its child ended with exit code {code}, for the reason above"

@@ -18,10 +18,11 @@ from typing import Any
 
 from photonfarm.renderer import jobs
 from photonfarm.renderer.supervisor import Supervisor
-from photonfarm.renderer.worker_settings import WorkerSettings
+from photonfarm.renderer.worker_settings import LOG_FORMAT, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import IncompleteError, StoreError
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.find import scene_named
 
 CHILD = (sys.executable, "-m", "photonfarm.renderer.worker_child")
 
@@ -39,26 +40,27 @@ def run_worker(
 ) -> None:
     """Render what is queued until told to stop, or with `until_complete` until nothing is missing.
 
-    SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a second one at once. Further
-    `settings` are those of WorkerSettings. Raises QueueError if there is no Redis at the start (later outages are
-    waited out), StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    A store that does not exist is waited for, but with `until_complete`. Where another worker has its name, this one
+    goes by that with a number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a
+    second one at once. Further `settings` are those of WorkerSettings; `scene_id` may also be how an id begins, or a
+    scene's name. Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves
+    another store, StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
     """
-    Store(store, create=True)
-    queue.connect(redis_url).close()
+    logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
     told = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
     Supervisor(told, tuple(child), say or log.warning).run()
 
 
 def render_job(
-    store: str | Path, scene_id: str, job: int, *, load: jobs.SceneLoader = jobs.load_scene
+    store: str | Path, scene: str, job: int, *, load: jobs.SceneLoader = jobs.load_scene
 ) -> tuple[bool, float]:
     """Render and commit one job here and now, without a queue: whether it was not committed before, and the seconds.
 
-    Whatever goes wrong in it is raised as it is; StoreError if the store has no such job.
+    `scene` is its id, how that begins, or its name. Whatever goes wrong in it is raised as it is; StoreError if the
+    store has no such job.
     """
     opened = Store(store)
-    if scene_id not in opened.scene_ids():
-        raise StoreError(f"{store}: holds no scene {scene_id}")
+    scene_id = scene_named(opened, scene)
     planned = opened.scene(scene_id).jobs()
     if not 0 <= job < planned:
         raise StoreError(f"{store}: scene {scene_id} has {planned} jobs, numbered from 0; there is no job {job}")

@@ -25,7 +25,7 @@ from rq.worker.base import StopRequested, WorkerStatus
 from photonfarm.renderer import jobs
 from photonfarm.renderer.backpressure import DiskReserve, TrainerPace, is_full
 from photonfarm.renderer.heartbeat import Heart
-from photonfarm.renderer.worker_settings import GRACE_S, RECYCLED, WorkerSettings
+from photonfarm.renderer.worker_settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.renderer.worker_talk import Talk
 from photonfarm.shared import queue
 from photonfarm.shared.errors import (
@@ -37,13 +37,11 @@ from photonfarm.shared.errors import (
     SceneNotHereError,
     StoreError,
 )
-from photonfarm.shared.queue import STARTS, RenderArguments, RenderJob
-from photonfarm.shared.store import Store
+from photonfarm.shared.queue import RenderArguments, RenderJob
+from photonfarm.shared.store import SceneStore, Store
 
 STARTS_ALLOWED = 5
 """Starts of one job without an end, after which it counts as failed: it kills its workers."""
-
-STARTS_TTL_S = 6 * 3600
 
 RQ_WORKER_TTL_S = 120
 """After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
@@ -59,12 +57,12 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     words = os.dup(1)
     os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
     settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
-    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(asctime)s %(name)s: %(message)s")
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
     threading.Thread(target=_end_with_supervisor, daemon=True).start()
     try:
         store = Store(settings.store)
         jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
-        return RenderWorker(settings, store, queue.connect(settings.redis_url)).run()
+        return RenderWorker(settings, store, queue.connect(settings.redis_url), words).run()
     except PhotonfarmError as error:
         _leave_word(words, str(error))
         return error.exit_code
@@ -91,8 +89,8 @@ def _end_with_supervisor() -> None:
 class RenderWorker(SimpleWorker):
     """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
 
-    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis) -> None:
-        """Register nothing yet."""
+    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, words: int | None = None) -> None:
+        """Register nothing yet; `words` is a file descriptor that the supervisor reads, if there is one."""
         self._queue = queue.open_queue(connection)
         super().__init__(
             [self._queue],
@@ -109,7 +107,7 @@ class RenderWorker(SimpleWorker):
         self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
         self._failed = False  # the job in hand
         self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others
-        self._heart = Heart(settings)
+        self._heart = Heart(settings, store, words)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None
@@ -161,8 +159,10 @@ class RenderWorker(SimpleWorker):
 
     def _take(self) -> RenderJob | None:
         """The next job; None if for a while there was none, or none should be taken."""
+        queue.serve(self.connection, self._store)
         held_back = self._disk.reason() or (self._pace.reason() if self._pace else None)
         self._talk.pausing(held_back)
+        self._heart.paused = held_back
         until = time.monotonic() + self._settings.idle_s
         while True:
             job, strangers = (None, 0) if held_back else self._next()
@@ -176,21 +176,23 @@ class RenderWorker(SimpleWorker):
         return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._not_here)
 
     def _fill_or_finish(self) -> bool:
-        """Look at the store, as there is no coordinator; True if there is nothing left to wait for."""
+        """Look at the store, as there is no coordinator; True if there is nothing left to wait for.
+
+        Raises StoreError if the store is gone: an empty folder in its place has nothing missing.
+        """
+        self._store.check()
         if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
             return False
         self._store.sweep()
         if not self._settings.until_complete:
             return False
-        missing = {
-            queue.job_name(scene.scene_id, job): scene.scene_id
-            for scene in self._store.scenes(self._settings.scene_id)
-            for job in scene.missing_jobs()
-        }
+        missing, unreadable = self._missing()
         failed = queue.queue_status(self.connection).failed
         not_failed = missing.keys() - failed.keys()
         if not_failed and all(missing[name] in self._not_here for name in not_failed):
             raise self._not_here[missing[min(not_failed)]]
+        if unreadable and not not_failed:  # and nothing else is left: the others were gone on with
+            raise unreadable[min(unreadable)]
         if missing and not not_failed:
             first = min(missing)
             raise IncompleteError(
@@ -199,6 +201,16 @@ class RenderWorker(SimpleWorker):
             )
         return not missing
 
+    def _missing(self) -> tuple[dict[str, str], dict[str, StoreError]]:
+        """The scene ids of the missing jobs, by their names; and why nothing is known of some scenes, by their ids."""
+        only = self._settings.scene_id
+        unreadable: dict[str, StoreError] = {}
+        if only is None:
+            found, unreadable = self._store.each(SceneStore.missing_jobs)
+        else:
+            found = {only: self._store.scene(only).missing_jobs()}
+        return {queue.job_name(scene, job): scene for scene, jobs in found.items() for job in jobs}, unreadable
+
     # ------------------------------------------------------------------------------------------------------------- jobs
 
     def execute_job(self, job: RenderJob, queue: Any) -> None:
@@ -206,17 +218,29 @@ class RenderWorker(SimpleWorker):
         self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
         self._failed = False
         with self._heart.working(job.id), self._talk.timing(job.id):
-            starts = int(self.connection.incr(STARTS + job.id))
-            self.connection.expire(STARTS + job.id, STARTS_TTL_S)
-            if starts > STARTS_ALLOWED:
-                job.refuse(f"it was started {starts - 1} times, and each time its worker died or lost Redis")
+            self._count_start(job)
             super().execute_job(job, queue)
             self._settle(job.id)
+
+    def _count_start(self, job: RenderJob) -> None:
+        """Count a start, and have a job refused that has been started too often."""
+        starts = queue.count_start(self.connection, job.id)
+        if starts > STARTS_ALLOWED:
+            job.refuse(self._given_up(job.id, starts - 1))
+
+    def _given_up(self, name: str, starts: int) -> str:
+        """Why a job is not started again."""
+        overdue = min(queue.overdue(self.connection, name), starts)
+        late = f"it took longer than --deadline {self._settings.deadline_s:g} s and was ended"
+        if overdue == starts:
+            return f"it was started {starts} times, and each time {late}"
+        died = f"it was started {starts} times, and each time its worker died or lost Redis"
+        return f"{died}, or {late} ({overdue} times)" if overdue else died
 
     def _settle(self, name: str) -> None:
         """Count nothing against a job that has ended, but its failures."""
         if self._failed:
-            self.connection.delete(STARTS + name)
+            queue.forget_starts_of(self.connection, name)
         else:
             queue.forget_failures_of(self.connection, name)
 
@@ -232,13 +256,26 @@ class RenderWorker(SimpleWorker):
         elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
             scene_id = job.id.rpartition("-")[0]
             self._not_here[scene_id] = error
+            self._heart.left[scene_id] = str(error)
             log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
-        elif isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError):
-            self._fatal = error  # the next job would fail as well
+        elif (fatal := self._fatal_of(error)) is not None:
+            self._fatal = fatal
+            with contextlib.suppress(redis.RedisError):
+                queue.put_back(self._queue, job.id)
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)
             with contextlib.suppress(redis.RedisError):
                 self._record(job.id, f"{type(error).__name__}: {error}")
+
+    def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
+        """What the next job would fail of as well; in a store that is gone, whatever the job has failed of."""
+        if isinstance(error, redis.RedisError):
+            return None
+        try:
+            self._store.check()
+        except StoreError as gone:
+            return gone
+        return error if isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError) else None
 
     def _is_committed(self, name: str) -> bool:
         with contextlib.suppress(PhotonfarmError, OSError):

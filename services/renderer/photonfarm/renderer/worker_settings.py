@@ -15,6 +15,12 @@ within the 10 s that Docker gives. A longer job is killed, and as it has no mark
 RECYCLED = 75
 """Exit code of a child that wants a successor."""
 
+JOB_IN_HAND = "job in hand: "
+"""What a child writes to its supervisor, before a job's name, when it begins the job."""
+
+LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
+"""Of what a supervisor and its child say."""
+
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 

@@ -69,15 +69,17 @@ def train(
     clock: Callable[[], float] = time.monotonic,
     script: Growth | None = None,
     listen: Callable[[dict[str, Any]], None] | None = None,
+    count: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
 ) -> Outcome:
     """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
     checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
-    metrics.jsonl as it is written. `waited` seconds have gone by already. Raises SpecError for a run of another network
-    or scene, a device that is not there or a hold-out that leaves nothing, StoreError for a folder that cannot be
-    written or that another trainer has, and IncompleteError for a loss that is not finite; the last checkpoint stays.
+    metrics.jsonl as it is written; `count`, after each step and where a run begins, how many draws there were by then
+    and how many samples have arrived. `waited` seconds have gone by already. Raises SpecError for a run of another
+    network or scene, a device that is not there or a hold-out that leaves nothing, StoreError for a folder that cannot
+    be written or that another trainer has, IncompleteError for a loss that is not finite; the last checkpoint stays.
     """
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
@@ -89,7 +91,7 @@ def train(
                 return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
         with Feed(source, settings, clock) as feed:
             log = MetricsLog(run / METRICS, listen)
-            return Session(feed, settings, run, log, stop, clock, script).run(waited=clock() - began)
+            return Session(feed, settings, run, log, stop, clock, script, count).run(waited=clock() - began)
 
 
 class Session:
@@ -104,7 +106,9 @@ class Session:
         stop: threading.Event,
         clock: Callable[[], float],
         script: Growth | None,
+        count: Callable[[int, int], None] | None,
     ) -> None:
+        self._count = count
         self._feed, self._settings, self._run, self._log = feed, settings, run, log
         self._stop, self._clock = stop, clock
         self._device = usable_device(settings.device)
@@ -147,6 +151,7 @@ class Session:
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         self._log.cut(self._step)
+        self._tell_count()
 
     def _continue(self, path: Path) -> None:
         state = checkpoint.load(path)
@@ -250,9 +255,16 @@ class Session:
             **self._counts(),
         )
 
+    def _used(self) -> tuple[int, int]:
+        """Draws so far, and samples that have arrived."""
+        return self._step * self._settings.batch, len(self._following.growth.rows)
+
+    def _tell_count(self) -> None:
+        if self._count is not None:
+            self._count(*self._used())
+
     def _counts(self) -> dict[str, Any]:
-        draws = self._step * self._settings.batch
-        samples = len(self._following.growth.rows)
+        draws, samples = self._used()
         return {"draws": draws, "samples": samples, "seconds": {k: round(v, 3) for k, v in self._seconds.items()}}
 
     def _train_step(self, batch: Batch) -> None:
@@ -273,6 +285,7 @@ class Session:
             torch.autograd.backward(loss)
             self._optimiser.step()
         self._step += 1
+        self._tell_count()
         if self._step % LOG_EVERY == 0:
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())
 

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -59,13 +59,8 @@ def run(
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
-        with _consumption_told(redis_url, scene_id) as used:
-
-            def listen(record: dict[str, Any]) -> None:
-                used(record)
-                _tell(record)
-
-            outcome = train(source, settings, folder, stop=stop, listen=listen, waited=waited)
+        with _consumption_told(redis_url, Store(store), scene_id) as count:
+            outcome = train(source, settings, folder, stop=stop, listen=_tell, count=count, waited=waited)
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 
@@ -145,37 +140,58 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _consumption_told(redis_url: str | None, scene_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """What takes the records of training; a thread tells Redis now and then how many samples have been used by them.
+def _consumption_told(redis_url: str | None, store: Store, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+    """What takes draws and samples of training; Redis is told now and then, and at the end, how many have been used.
 
-    Each counts once, and held-out ones as soon as they are seen. A Redis that is not there is none of our trouble.
+    By a thread. Each sample counts once, and held-out ones as soon as they are seen. A Redis that is not there is none
+    of our trouble; that it serves another store is said once.
     """
-    used: int | None = None  # a run that continues knows only with its first record
+    told = _Told(redis_url, store, scene_id)
     ended = threading.Event()
 
-    def take(record: dict[str, Any]) -> None:
-        nonlocal used
-        if "draws" in record:
-            used = min(record["draws"], record["samples"])
+    def keep_telling() -> None:
+        while not ended.wait(TELL_S):
+            told.tell()
 
-    def tell() -> None:
-        from photonfarm.shared import queue
-
-        connection: Redis | None = None
-        while redis_url is not None and not ended.wait(TELL_S):
-            if used is None:
-                continue
-            with suppress(QueueError, RedisError):
-                connection = connection or queue.connect(redis_url)
-                queue.tell_consumed(connection, scene_id, used)
-
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=keep_telling, daemon=True)
     thread.start()
     try:
-        yield take
+        yield told.take
     finally:
         ended.set()
         thread.join()
+        told.tell()
+
+
+class _Told:
+    """What Redis is told of a scene's samples."""
+
+    def __init__(self, redis_url: str | None, store: Store, scene_id: str) -> None:
+        self._url, self._store, self._scene_id = redis_url, store, scene_id
+        self._used: int | None = None  # a run that continues knows only once it has begun
+        self._connection: Redis | None = None
+        self._refused = False
+
+    def take(self, draws: int, samples: int) -> None:
+        """Take what there was by now."""
+        self._used = min(draws, samples)
+
+    def tell(self) -> None:
+        """Tell what was taken last, if there is anything and a Redis."""
+        if self._url is None or self._used is None:
+            return
+        from photonfarm.shared import queue
+
+        try:
+            self._connection = self._connection or queue.connect(self._url)
+            queue.check_served(self._connection, self._store)
+            queue.tell_consumed(self._connection, self._scene_id, self._used)
+        except queue.OtherStoreError as error:
+            if not self._refused:
+                click.echo(f"no worker is told what is used: {error}", err=True)
+            self._refused = True
+        except (QueueError, RedisError):
+            pass
 
 
 def _tell(record: dict[str, Any]) -> None:

@@ -7,7 +7,12 @@ write to it can delay jobs, and can neither run code in a worker nor change what
     rq:photonfarm:failed:<job name>     why a job failed; it is not queued again while this lasts
     rq:photonfarm:failures:<job name>   how often a job has failed
     rq:photonfarm:starts:<job name>     how often a job was started without an end
-    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host and the job it renders, or -
+    rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
+    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host, the job it renders, or -, and the
+                                        process of its supervisor
+    rq:photonfarm:paused:<worker name>  why a worker takes no jobs
+    rq:photonfarm:left:<scene id>:<worker name>  why a worker leaves a scene to others
+    rq:photonfarm:store                 the id of the store that this Redis serves, while somebody works with it
     rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
@@ -19,54 +24,78 @@ from photonfarm.shared.queue.failures import (
     Cause,
     Failure,
     causes,
+    count_overdue,
+    count_start,
     forget_failures,
     forget_failures_of,
+    forget_starts_of,
+    overdue,
     record_failure,
     repeating_command,
 )
-from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, hosts, job_of_worker
+from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
+from photonfarm.shared.queue.held_up import HeldUp, forget_held_up, tell_held_up
 from photonfarm.shared.queue.job import (
     FUNCTION,
+    OVERDUE,
     QUEUE,
     STARTS,
     RenderArguments,
     RenderJob,
     job_name,
     open_queue,
+    put_back,
     take,
 )
 from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
+from photonfarm.shared.queue.served import SERVED, OtherStoreError, check_served, release, serve
 
 __all__ = [
     "ALIVE",
     "FAILED",
     "FAILURES_ALLOWED",
     "FUNCTION",
+    "OVERDUE",
     "QUEUE",
     "QUEUE_LIMIT",
+    "SERVED",
     "STARTS",
     "WORKER",
     "Cause",
     "Failure",
+    "HeldUp",
+    "OtherStoreError",
     "QueueStatus",
     "RenderArguments",
     "RenderJob",
     "beat",
     "bury",
     "causes",
+    "check_served",
     "connect",
     "consumed_samples",
+    "count_overdue",
+    "count_start",
     "forget_failures",
     "forget_failures_of",
+    "forget_held_up",
+    "forget_starts_of",
+    "free_job",
     "hosts",
     "job_name",
     "job_of_worker",
     "open_queue",
+    "overdue",
+    "put_back",
     "queue_status",
     "reconcile",
     "record_failure",
+    "release",
     "repeating_command",
+    "serve",
     "take",
+    "take_name",
     "tell_consumed",
+    "tell_held_up",
     "with_password_of",
 ]

@@ -15,8 +15,8 @@ from pathlib import Path
 from redis import Redis
 
 from photonfarm.shared.errors import QueueError
-from photonfarm.shared.queue.job import FAILURE_TTL_S, STARTS, RenderArguments
-from photonfarm.shared.queue.untrusted import batches, beginnings, names_below, remove_others
+from photonfarm.shared.queue.job import FAILURE_TTL_S, OVERDUE, STARTS, RenderArguments
+from photonfarm.shared.queue.untrusted import batches, beginnings, names_below, printable, remove_others
 
 FAILED = "rq:photonfarm:failed:"
 FAILURES = "rq:photonfarm:failures:"
@@ -25,6 +25,7 @@ FAILURES_ALLOWED = 3
 """Failures of one job after which it is set aside: by then it is no accident of one worker or one hour."""
 
 FAILURES_TTL_S = 7 * 86400
+STARTS_TTL_S = 6 * 3600
 REASON_LETTERS = 2000
 
 _VARYING = re.compile(r"\b[0-9a-f]{8,}\b|[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
@@ -60,7 +61,7 @@ def record_failure(connection: Redis, name: str, reason: str) -> Failure:
     times = int(connection.incr(FAILURES + name))
     connection.expire(FAILURES + name, FAILURES_TTL_S)
     set_aside = times >= FAILURES_ALLOWED
-    said = _printable(reason)
+    said = printable(reason[:REASON_LETTERS])
     connection.set(FAILED + name, said, ex=None if set_aside else FAILURE_TTL_S)
     return Failure(said, times, set_aside)
 
@@ -70,13 +71,41 @@ def forget_failures(connection: Redis, *, set_aside: bool) -> None:
     names = sorted(failed_names(connection))
     ttls = _ttls(connection, names)
     for some in batches([name for name in names if set_aside or ttls[name] >= 0]):
-        prefixes = (FAILED, STARTS, FAILURES) if set_aside else (FAILED, STARTS)
+        prefixes = (FAILED, STARTS, OVERDUE, *([FAILURES] if set_aside else []))
         connection.delete(*(prefix + name for prefix in prefixes for name in some))
 
 
 def forget_failures_of(connection: Redis, name: str) -> None:
     """Forget what was counted against a job, which has ended well."""
-    connection.delete(STARTS + name, FAILURES + name, FAILED + name)
+    connection.delete(STARTS + name, OVERDUE + name, FAILURES + name, FAILED + name)
+
+
+def forget_starts_of(connection: Redis, name: str) -> None:
+    """Count nothing against a job that has ended, but its failures."""
+    connection.delete(STARTS + name, OVERDUE + name)
+
+
+def count_start(connection: Redis, name: str) -> int:
+    """Count a start of a job, until it ends; how many there were."""
+    return _count(connection, STARTS + name)
+
+
+def count_overdue(connection: Redis, name: str) -> int:
+    """Count a start of a job that the deadline has ended; how many there were."""
+    return _count(connection, OVERDUE + name)
+
+
+def overdue(connection: Redis, name: str) -> int:
+    """How many of a job's starts the deadline has ended."""
+    (times,) = beginnings(connection, [OVERDUE + name], 10)
+    return int(times) if times.isdecimal() and times.isascii() else 0
+
+
+def _count(connection: Redis, key: str) -> int:
+    remove_others(connection, {key: "counter"})
+    times = int(connection.incr(key))
+    connection.expire(key, STARTS_TTL_S)
+    return times
 
 
 def failed_names(connection: Redis) -> set[str]:
@@ -91,7 +120,9 @@ def read_failures(connection: Redis) -> dict[str, Failure]:
     counts = beginnings(connection, [FAILURES + name for name in names], 20)
     ttls = _ttls(connection, names)
     return {
-        name: Failure(_printable(reason), int(times) if times.isdecimal() else 1, set_aside=ttls[name] == -1)
+        name: Failure(
+            printable(reason[:REASON_LETTERS]), int(times) if times.isdecimal() else 1, set_aside=ttls[name] == -1
+        )
         for name, reason, times in zip(names, reasons, counts, strict=True)
         if ttls[name] != -2  # it has not just run out
     }
@@ -129,8 +160,3 @@ def _is_a_jobs(name: str) -> bool:
     except QueueError:
         return False
     return True
-
-
-def _printable(text: str) -> str:
-    """A line for terminals, which obey what is in it that does not print."""
-    return "".join(letter if letter.isprintable() else " " for letter in text[:REASON_LETTERS])

@@ -2,36 +2,95 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import dataclass
+from itertools import count
+
 from redis import Redis
 
-from photonfarm.shared.queue.untrusted import beginnings, names_below
+from photonfarm.shared.queue.untrusted import beginnings, names_below, remove_lasting
 
 ALIVE = "alive:"
 WORKER = "rq:photonfarm:worker:"
+
+HEARTBEAT_MOST_S = 3600
+"""What says for longer that something is alive, for good say, is no heartbeat of a worker."""
+
 _VALUE_BYTES = 1024
 
 
-def beat(connection: Redis, worker: str, host: str, name: str | None, *, ttl_s: float) -> None:
+@dataclass(frozen=True, slots=True)
+class _Heartbeat:
+    host: str
+    job: str | None
+    process: int  # of the supervisor; 0: not told
+
+
+def take_name(connection: Redis, name: str, host: str, process: int, *, ttl_s: float) -> str:
+    """The name that a worker has from now on: this one, or with a number behind it while another worker has it.
+
+    One that was killed on this host leaves its name, and its job, at once, and not when its heartbeat has run out.
+    """
+    for number in count(1):
+        own = name if number == 1 else f"{name}-{number}"
+        remove_lasting(connection, [WORKER + own], HEARTBEAT_MOST_S)
+        held = _heartbeat_of(connection, own)
+        if held is not None and held.host == host and _is_gone(held.process):
+            bury(connection, own)
+        if connection.set(WORKER + own, f"{host} - {process}", px=int(ttl_s * 1000), nx=True):
+            return own
+    raise AssertionError  # count() does not end
+
+
+def _is_gone(process: int) -> bool:
+    """Whether no process of this machine, but perhaps our own, has that number."""
+    if process == os.getpid():  # that of a predecessor in a container that was started again
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        return False
+    return False
+
+
+def beat(connection: Redis, worker: str, host: str, name: str | None, *, ttl_s: float, process: int = 0) -> None:
     """Say for a time that a worker is alive, and the job that it renders, if any."""
     ttl_ms = int(ttl_s * 1000)  # the server's clock counts it down, not a client's
     with connection.pipeline() as pipeline:
-        pipeline.set(WORKER + worker, f"{host} {name or '-'}", px=ttl_ms)
+        pipeline.set(WORKER + worker, f"{host} {name or '-'} {process}", px=ttl_ms)
         if name:
             pipeline.set(ALIVE + name, worker, px=ttl_ms)
         pipeline.execute()
 
 
 def bury(connection: Redis, worker: str) -> str | None:
-    """Free at once the job that a worker of this name died with, instead of when its heartbeat runs out; its name."""
+    """Say that a worker is gone, and free its job at once, instead of when its heartbeat runs out; the job's name."""
+    name = free_job(connection, worker)
+    connection.delete(WORKER + worker)
+    return name
+
+
+def free_job(connection: Redis, worker: str) -> str | None:
+    """Let others have the job that a worker last said to render; its name."""
     name = job_of_worker(connection, worker)
-    connection.delete(WORKER + worker, *([ALIVE + name] if name else []))
+    if name:
+        connection.delete(ALIVE + name)
     return name
 
 
 def job_of_worker(connection: Redis, worker: str) -> str | None:
     """The job that a worker last said to render."""
+    heartbeat = _heartbeat_of(connection, worker)
+    return None if heartbeat is None else heartbeat.job
+
+
+def _heartbeat_of(connection: Redis, worker: str) -> _Heartbeat | None:
     words = next(beginnings(connection, [WORKER + worker], _VALUE_BYTES)).split()
-    return words[1] if len(words) == 2 and words[1] != "-" else None
+    if len(words) != 3 or not words[2].isascii() or not words[2].isdecimal() or len(words[2]) > 9:
+        return None
+    return _Heartbeat(words[0], None if words[1] == "-" else words[1], int(words[2]))
 
 
 def hosts(connection: Redis) -> set[str]:

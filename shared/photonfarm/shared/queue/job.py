@@ -34,6 +34,7 @@ RQ_TIMEOUT_S = 7 * 86400
 """RQ's own time limit cannot interrupt native code, so it is out of the way; the worker's deadline counts."""
 
 STARTS = "rq:photonfarm:starts:"
+OVERDUE = "rq:photonfarm:overdue:"
 
 MAX_NAME = 64
 """Bytes of a job's name at most; what is longer is not even fetched."""
@@ -173,6 +174,14 @@ def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str
     except QueueError:
         queue.connection.lrem(queue.intermediate_queue_key, 1, name)
         return None, dropped + 1
+
+
+def put_back(queue: RenderQueue, name: str) -> None:
+    """Have a job that was taken be the next one to be taken, by a worker that can do it."""
+    with queue.connection.pipeline() as pipeline:
+        pipeline.lrem(queue.key, 0, name)
+        pipeline.lpush(queue.key, name)
+        pipeline.execute()
 
 
 def queued_names(queue: RenderQueue) -> list[str]:

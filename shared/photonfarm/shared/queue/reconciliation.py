@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import islice
@@ -14,10 +15,12 @@ from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
 from photonfarm.shared.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
-from photonfarm.shared.queue.heartbeat import ALIVE, WORKER
+from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, WORKER
+from photonfarm.shared.queue.held_up import HeldUp, read_held_up
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
+    OVERDUE,
     QUEUE,
     RQ_TIMEOUT_S,
     STARTS,
@@ -28,6 +31,7 @@ from photonfarm.shared.queue.job import (
     running_names,
     taken_names,
 )
+from photonfarm.shared.queue.served import serve
 from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
 from photonfarm.shared.store import SceneStore, Store
 
@@ -37,14 +41,17 @@ QUEUE_LIMIT = 10_000
 LOCK_TTL_S = 120
 _LOCK = "rq:photonfarm:reconcile"
 
-HEARTBEAT_MOST_S = 3600
-"""What says for longer that a job is being rendered, for good say, is no heartbeat of a worker."""
+log = logging.getLogger(__name__)
+
+_told: dict[str, str] = {}
+"""Why scenes were passed over, by scene id: an idle worker looks every few seconds, and says it once."""
 
 _KINDS: dict[str, Kind] = {
     "rq:job:": "hash",
     "rq:executions:": "zset",
     "rq:results:": "stream",
     STARTS: "counter",
+    OVERDUE: "counter",
     FAILURES: "counter",
 }
 """Of the keys that are written of a job, by what precedes its name."""
@@ -65,9 +72,11 @@ def reconcile(
     Of one scene, or of all. One caller at a time: 0 if another one is at it for longer than `wait_s`. At most `limit`
     jobs are queued in all; the rest follows later. Scenes share them alike, as one whose jobs nobody takes would hold
     up the others: what one has beyond its share leaves the queue again when another needs the place. `retry_failed`
-    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. Raises QueueError if Redis
-    fails, StoreError if the scene is not there.
+    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. A scene that cannot be read
+    is passed over with a warning. Raises QueueError if Redis fails or serves another store, StoreError if the
+    store or the one scene cannot be read.
     """
+    serve(connection, store)
     try:
         remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # ours ends by itself by then
         lock = connection.lock(_LOCK, timeout=LOCK_TTL_S)
@@ -76,7 +85,7 @@ def reconcile(
         try:
             if retry_failed or retry_set_aside:
                 forget_failures(connection, set_aside=retry_set_aside)
-            return _reconcile(store.scenes(scene_id), connection, limit)
+            return _reconcile(store, scene_id, connection, limit)
         finally:
             if lock.owned():
                 lock.release()
@@ -84,7 +93,7 @@ def reconcile(
         raise QueueError(f"Redis failed while the queue was filled: {error}") from error
 
 
-def _reconcile(scenes: Iterable[SceneStore], connection: Redis, limit: int) -> int:
+def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) -> int:
     queue = open_queue(connection)
     queued = list(dict.fromkeys(queued_names(queue)))
     remove_lasting(connection, [ALIVE + name for name in names_below(connection, ALIVE)], HEARTBEAT_MOST_S)
@@ -92,7 +101,7 @@ def _reconcile(scenes: Iterable[SceneStore], connection: Redis, limit: int) -> i
     _tidy(queue, alive)
     busy = {*queued, *alive, *failed_names(connection)}
     held = _by_scene(queued)
-    lacking = {scene.scene_id: _lacking(scene, busy, limit) for scene in scenes}
+    lacking = _lacking_by_scene(store, only, busy, limit)
     has = {scene_id: len(held.get(scene_id, ())) for scene_id in {**held, **lacking}}
     shares = _shares({scene_id: count + len(lacking.get(scene_id, ())) for scene_id, count in has.items()}, limit)
     wanted = [
@@ -105,6 +114,18 @@ def _reconcile(scenes: Iterable[SceneStore], connection: Redis, limit: int) -> i
         _withdraw(queue, beyond[: max(len(queued) + len(wanted) - limit, 0)])
         _enqueue(queue, wanted)
     return len(wanted)
+
+
+def _lacking_by_scene(store: Store, only: str | None, busy: Set[str], limit: int) -> dict[str, list[int]]:
+    """`_lacking` of every scene that can be read; of one alone, whose error is raised."""
+    if only is not None:
+        return {only: _lacking(store.scene(only), busy, limit)}
+    lacking, failed = store.each(lambda scene: _lacking(scene, busy, limit))
+    for scene_id, error in failed.items():
+        if _told.get(scene_id) != str(error):
+            log.warning("scene %s is passed over, and the others go on: %s", scene_id, error)
+        _told[scene_id] = str(error)
+    return lacking
 
 
 def _lacking(scene: SceneStore, busy: Set[str], limit: int) -> list[int]:
@@ -184,6 +205,7 @@ class QueueStatus:
     running: int  # jobs with a heartbeat
     workers: int  # with a heartbeat
     failed: dict[str, Failure]  # by job name
+    held_up: HeldUp
 
 
 def queue_status(connection: Redis) -> QueueStatus:
@@ -194,6 +216,7 @@ def queue_status(connection: Redis) -> QueueStatus:
             running=len(names_below(connection, ALIVE)),
             workers=len(names_below(connection, WORKER)),
             failed=read_failures(connection),
+            held_up=read_held_up(connection),
         )
     except redis.RedisError as error:
         raise QueueError(f"Redis failed while it was asked for its status: {error}") from error

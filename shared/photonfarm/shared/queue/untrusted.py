@@ -79,6 +79,11 @@ def beginnings(connection: Redis, keys: Sequence[str], size: int) -> Iterator[st
                 yield value.decode(errors="replace") if isinstance(value, bytes) else ""
 
 
+def printable(text: str) -> str:
+    """A line for terminals, which obey what is in it that does not print."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
 def remove_others(connection: Redis, kinds: Mapping[str, Kind]) -> int:
     """Remove the keys that are not of the kind they have to be, or absent; how many.
 

@@ -10,13 +10,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
-from photonfarm.shared.store import markers
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import markers, plans
 from photonfarm.shared.store.content_check import Tally
 from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, Remedy
 from photonfarm.shared.store.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.job_check import Checked, marker_files
 from photonfarm.shared.store.job_pool import JobPool
 from photonfarm.shared.store.plan_check import PlanCheck
+from photonfarm.shared.store.plan_repair import PlanRepair
 from photonfarm.shared.store.quarantine import Quarantine
 from photonfarm.shared.store.repeated_seeds import equal_samples
 from photonfarm.shared.store.scene_store import SCENES, read_spec
@@ -120,17 +122,38 @@ class _SceneChecking:
             aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
         committed = sorted(markers.jobs(self._storage, self._name))
-        plans = PlanCheck(self._storage, spec, self._name)
-        self._add(plans.check_plans())
-        self._add(plans.check_base(needed=bool(committed)))
+        inputs, rewritten = self._plans(spec, quarantine)
+        self._add(inputs.check_base(needed=bool(committed)))
         scene = None
-        if plans.shard_rows is not None:
+        if inputs.shard_rows is not None:
             scene = Checked(
-                self._storage, self._scene_id, self._name, spec, plans.plans, plans.shard_rows, frozenset(plans.lost)
+                self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
             self._jobs(scene, committed)
             self._add(strangers(scene))
-        return self._report(spec.name, self._repair(scene, quarantine) if quarantine else [])
+        return self._report(spec.name, [*rewritten, *(self._repair(scene, quarantine) if quarantine else [])])
+
+    def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
+        """The plans once they are checked, and which were written again; before the jobs, which need them."""
+        check = PlanCheck(self._storage, spec, self._name)
+        found = list(check.check_plans())
+        self._add(found)
+        damaged = [finding for finding in found if finding.cause is Cause.PLAN_INPUTS]
+        if quarantine is None or not damaged:
+            return check, []
+        rewritten = []
+        repair = PlanRepair(self._storage, spec, self._name, quarantine)
+        for number in range(plans.count(self._storage, self._name)):
+            folder = f"{plans.folder(self._name, number)}/"
+            if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
+                try:
+                    repair.run(number, why)
+                    rewritten.append(f"plan {number}, written again from its request")
+                except StoreError as error:
+                    self._add([Finding(Cause.PLAN, str(error).partition(": ")[2], self._scene_id, file=folder[:-1])])
+        check = PlanCheck(self._storage, spec, self._name)
+        self._add([finding for finding in check.check_plans() if finding not in found])
+        return check, rewritten
 
     def _jobs(self, scene: Checked, committed: list[int]) -> None:
         with JobPool(scene, self._scenes) as pool:
@@ -175,7 +198,7 @@ class _SceneChecking:
                 # nothing is missing, and only a job that is rendered writes the base
                 reason = Finding(Cause.BASE, "this job is whole: it is rendered again for the base", self._scene_id)
                 self._set_aside(scene, quarantine, jobs - 1, [reason])
-                aside.append(f"job {jobs - 1}")
+                aside.append(f"job {jobs - 1} (whole; rendered again, as a job writes the base)")
         return aside
 
     def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:

@@ -192,6 +192,7 @@ class JobWriter:
 
         None if the job is committed, or files of ours are set aside.
         """
+        self._storage.require()  # a store that is gone has none of our parts either, and they are not adopted
         left = [name for name, shard in self._shards.items() if shard.part.exists()]
         kept = [name for name in left if not self._adopt(name)]
         others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
@@ -211,6 +212,7 @@ class JobWriter:
 
     def _is_set_aside(self) -> bool:
         """Whether a file that we have named is gone: only a repair moves one."""
+        self._storage.require()
         named = [name for name, shard in self._shards.items() if not shard.part.exists()]
         return not self._are_there(named)
 

@@ -8,6 +8,8 @@ F triangles, S shapes.
 
 from __future__ import annotations
 
+import re
+import secrets
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +25,16 @@ VERSION = 2
 def stamp() -> dict[str, Any]:
     """The format and its version, as the store and every Zarr group in it state them."""
     return {"format": FORMAT, "version": VERSION}
+
+
+def new_store_id() -> str:
+    """An id for a new store: random, as two stores may hold the same scenes."""
+    return secrets.token_hex(16)
+
+
+def is_store_id(value: object) -> bool:
+    """Whether a value is written as a store's id."""
+    return isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) is not None
 
 
 def check_version(name: object, version: object, where: str) -> None:

@@ -20,6 +20,7 @@ class Remedy(Enum):
     RENDER = "render again"  # the job is set aside, and workers find it missing
     BASE = "write the base again"  # it is set aside, and the next job writes it
     SUBMIT = "submit the spec again"  # it is set aside, and written by the next submission
+    REWRITE = "write it again from the plan's request"  # by --repair, at once; what was there is set aside
     REPORT = "cannot be repaired here"
     LOOK = "may be right: worth a look"  # no error, and no exit code
 
@@ -51,8 +52,14 @@ class Cause(Enum):
     SPEC = "spec", "the scene's spec is missing or not what was stored", Remedy.SUBMIT
     PLAN = (
         "plan",
-        "a plan is not what was stored: what its rows are is lost; what is rendered stays, checked by its markers",
+        "a plan is not what was stored, and its request does not give it: put its small files back from a backup; what "
+        "is rendered stays, checked by its markers",
         Remedy.REPORT,
+    )
+    PLAN_INPUTS = (
+        "plan-inputs",
+        "an input of a plan, or the declaration of an output, is not what was stored",
+        Remedy.REWRITE,
     )
     BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
     BLACK = "black", "both halves are black: no light, or the camera is inside something", Remedy.LOOK

@@ -13,11 +13,12 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
@@ -29,8 +30,11 @@ _counter = itertools.count()
 class LocalStorage:
     """`storage.Storage` in a folder, which need not exist yet."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, mark: str | None = None) -> None:
+        """Name the folder, and the file of it without which it is taken for gone; None for one that may be made."""
         self.root = root
+        self._mark = mark
+        self._is_founding = mark is None
 
     @property
     def where(self) -> str:
@@ -56,10 +60,12 @@ class LocalStorage:
         return (self.root / name).stat().st_size
 
     def names(self, folder: str) -> list[str]:
-        """The names right below a folder; none if it does not exist."""
+        """The names right below a folder; none if it does not exist. Raises StoreError if the store is gone."""
         try:
             return [path.name for path in (self.root / folder).iterdir()]
         except FileNotFoundError:
+            if folder:  # else it is asked whether there is anything at all
+                self.require()
             return []
 
     def zarr(self, folder: str) -> LocalStore:
@@ -73,13 +79,17 @@ class LocalStorage:
     def part(self) -> Path:
         """A new path in `tmp` that says whose it is: host, process space, process, number, time."""
         tmp = self.root / TMP
-        tmp.mkdir(parents=True, exist_ok=True)
+        if not tmp.is_dir():  # of a store that is gone, which is asked again before anything is adopted
+            self.require()
+            self._make_folder(self.root)
+            tmp.mkdir(exist_ok=True)
         return tmp / f"{_owner()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
 
     def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
         """Sync a part and link it to its name; False if that was taken."""
+        self.require()
         final = self.root / name
-        _make_folder(final.parent)
+        self._make_folder(final.parent)
         sync(part, data_only=True)
         if replace:
             part.replace(final)
@@ -93,9 +103,10 @@ class LocalStorage:
 
     def adopt_folder(self, part: Path, folder: str) -> bool:
         """Sync a folder with all that is in it, and rename it; False if the name was taken."""
+        self.require()
         final = self.root / folder
         _sync_tree(part)
-        _make_folder(final.parent)
+        self._make_folder(final.parent)
         try:
             part.rename(final)  # fails on a folder that is there, since none of ours is ever empty
         except OSError:
@@ -107,8 +118,9 @@ class LocalStorage:
 
     def move(self, name: str, new_name: str) -> None:
         """Rename a file; raises FileNotFoundError."""
+        self.require()
         final = self.root / new_name
-        _make_folder(final.parent)
+        self._make_folder(final.parent)
         if final.exists():  # a rename would replace it
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(final))
         (self.root / name).rename(final)
@@ -121,6 +133,38 @@ class LocalStorage:
         """Sync the folders that the names are in."""
         for folder in sorted({(self.root / name).parent for name in names}):
             sync(folder)
+
+    def _make_folder(self, folder: Path) -> None:
+        """Make a folder, durably, if it is not there, with those above it; never the root of a store that is gone."""
+        if folder.is_dir():
+            return
+        if folder == self.root and not self._is_founding:
+            raise self._gone()
+        self._make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync(folder.parent)
+
+    # -------------------------------------------------------------------------------------------------------- its root
+
+    @contextlib.contextmanager
+    def founding(self) -> Iterator[None]:
+        """Make the folder, and write to it without the mark."""
+        was, self._is_founding = self._is_founding, True
+        try:
+            yield
+        finally:
+            self._is_founding = was
+
+    def require(self) -> None:
+        """Raise StoreError if the mark is not there: an empty mount point, a folder that was moved or deleted."""
+        if not self._is_founding and not self.exists(str(self._mark)):
+            raise self._gone()
+
+    def _gone(self) -> StoreError:
+        return StoreError(
+            f"{self.root}: the store is gone (unmounted, moved or deleted?): {self._mark} is not there any more; bring "
+            "it back, then start again: what was committed in it needs nothing else"
+        )
 
     # --------------------------------------------------------------------------------------------------------- sweeping
 
@@ -179,14 +223,6 @@ def sync(path: Path, *, data_only: bool = False) -> None:
         (os.fdatasync if data_only else os.fsync)(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _make_folder(folder: Path) -> None:
-    """Make a folder, durably, if it is not there, with those above it."""
-    if not folder.is_dir():
-        _make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
-        sync(folder.parent)
 
 
 def _sync_tree(folder: Path) -> None:

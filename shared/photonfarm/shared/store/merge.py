@@ -62,8 +62,13 @@ class Merged:
         """Of `mean`, (H, W, 3): √(M2 / (n (n − 1))); itself an estimate, rough from few passes."""
         return np.sqrt(self.m2 / (self.count * (self.count - 1)))
 
-    def write(self, file: Path) -> None:
-        """Store it as a NumPy archive of its fields, with `standard_error`."""
+    def write(self, file: str | Path) -> None:
+        """Store it as a NumPy archive of its fields, with `standard_error`; raises ValueError for a name without .npz.
+
+        NumPy would add it to any other name, and no picture format holds all of this.
+        """
+        if Path(file).suffix != ".npz":
+            raise ValueError(f"{file}: a merged view is written as a NumPy archive; give it a name that ends in .npz")
         np.savez(
             file,
             passes=self.passes,

@@ -20,14 +20,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
+import re
 import time
 import uuid
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import obstore
 from obstore.exceptions import (
@@ -50,8 +52,11 @@ from photonfarm.shared.store.storage import STRAY_AGE_S, TMP
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion
 
-PAUSES_S = (0.0, 0.3, 1.0, 3.0)
-"""Before each attempt at a put: beyond the library's own retries, which leave out what may have worked already."""
+PATIENCE_S = 60.0
+"""How long a server that fails, or cannot be reached, is asked again: it may be restarted meanwhile."""
+
+PAUSES_S = (0.3, 1.0, 3.0, 5.0)
+"""Before each new attempt of ours, the last one again and again; the library has its own, within an attempt."""
 
 SMALL_BYTES = 4 << 20
 TIMEOUT_S = 30.0
@@ -59,11 +64,20 @@ TIMEOUT_S = 30.0
 TRANSFER_TIMEOUT_S = 300.0
 """…and for larger ones: a shard of 256 MB at 1 MB/s."""
 
-RETRIES = 4
-RETRY_TIMEOUT_S = 60.0
+RETRIES = 1000
+"""Of the library within a request; PATIENCE_S ends them. It leaves out what may have worked already, and what breaks
+off in the middle of an answer."""
+
+LONGEST_PAUSE_S = 5.0
 
 PUTS_AT_ONCE = 8
 """Of the files of a folder: they are many and small, and each would wait for its answer."""
+
+TRANSFER_TIMES = 2
+REPLACED_TIMES = 4
+"""An object that is replaced while it is fetched is fetched again."""
+
+T = TypeVar("T")
 
 WRITER = "writer"
 """The metadata field with a put's id; letters alone, as not every service takes more."""
@@ -100,18 +114,21 @@ class ObjectStorage:
 
     def _copy(self, name: str, *, anew: bool = False) -> Path:
         with os_errors(name):
-            for _ in PAUSES_S:
+            for _ in range(REPLACED_TIMES):
                 try:
-                    about = obstore.head(self._objects, name)
-                    copy = self._cache.path(name, _version(about))
-                    if anew or not self._cache.has(copy, about["size"]):
-                        self._fetch(name, about, copy)
+                    return patiently(lambda: self._copied(name, anew=anew), times=TRANSFER_TIMES)
                 except FileNotFoundError:
                     return self._cache.path(name, None)
                 except PreconditionError:  # replaced in the meantime
                     continue
-                return copy
         raise OSError(errno.EAGAIN, "is being replaced again and again", name)
+
+    def _copied(self, name: str, *, anew: bool) -> Path:
+        about = obstore.head(self._objects, name)
+        copy = self._cache.path(name, _version(about))
+        if anew or not self._cache.has(copy, about["size"]):
+            self._fetch(name, about, copy)
+        return copy
 
     def _fetch(self, name: str, about: ObjectMeta, copy: Path) -> None:
         with self._cache.filling(copy) as file:
@@ -124,7 +141,7 @@ class ObjectStorage:
     def read(self, name: str) -> bytes:
         """The bytes of a name; raises FileNotFoundError."""
         with os_errors(name):
-            return bytes(obstore.get(self._objects, name).bytes())
+            return patiently(lambda: bytes(obstore.get(self._objects, name).bytes()))
 
     def exists(self, name: str) -> bool:
         """Whether a name has bytes."""
@@ -137,13 +154,13 @@ class ObjectStorage:
     def size(self, name: str) -> int:
         """How many bytes a name has; raises FileNotFoundError."""
         with os_errors(name):
-            return obstore.head(self._objects, name)["size"]
+            return patiently(lambda: obstore.head(self._objects, name)["size"])
 
     def names(self, folder: str) -> list[str]:
         """The names right below a folder; none if it does not exist. A request per thousand of them."""
         try:
             with os_errors(folder):
-                found = obstore.list_with_delimiter(self._objects, folder or None)
+                found = patiently(lambda: obstore.list_with_delimiter(self._objects, folder or None))
         except FileNotFoundError:  # not even a bucket
             return []
         paths = [*found["common_prefixes"], *(about["path"] for about in found["objects"])]
@@ -201,8 +218,8 @@ class ObjectStorage:
         if self.exists(new_name):
             raise FileExistsError(errno.EEXIST, "is there already", new_name)
         with os_errors(name):
-            obstore.copy(self._objects, name, new_name)
-            obstore.delete(self._objects, name)
+            patiently(lambda: obstore.copy(self._objects, name, new_name))
+            patiently(lambda: obstore.delete(self._objects, name))
 
     def move_folder(self, folder: str, new_folder: str) -> None:
         """Move all objects below a folder, its own `zarr.json` first, and its claim last, so that it can be claimed.
@@ -212,7 +229,9 @@ class ObjectStorage:
         """
         self.move(f"{folder}/{ROOT}", f"{new_folder}/{ROOT}")
         with os_errors(folder):
-            found = [about["path"] for batch in obstore.list(self._objects, folder) for about in batch]
+            found = patiently(
+                lambda: [about["path"] for batch in obstore.list(self._objects, folder) for about in batch]
+            )
         for name in found:
             self.move(name, new_folder + name.removeprefix(folder))
         if self.exists(claim_of(folder)):
@@ -234,28 +253,29 @@ class ObjectStorage:
     def _put(self, content: Path | bytes, name: str, *, replace: bool = False) -> bool:
         """Put an object where there is none, or with `replace` where the one is that is there; False if it is refused.
 
-        The replaced one is named by its tag, so that a put that arrives late cannot undo what came after it.
+        Tried for PATIENCE_S while the server fails, or refuses for another put that may fail. The replaced one is named
+        by its tag, so that a put that arrives late cannot undo what came after it.
         """
         writer = uuid.uuid4().hex
         size = content.stat().st_size if isinstance(content, Path) else len(content)
         objects = self._transfers if size > SMALL_BYTES else self._objects
-        problem: Exception = OSError(errno.EIO, "was not tried", name)
-        with os_errors(name):
-            for pause_s in PAUSES_S:
-                time.sleep(pause_s)
-                mode: PutMode = self._mode(name) if replace else "create"
-                try:
-                    obstore.put(objects, name, content, mode=mode, attributes={WRITER: writer}, use_multipart=False)
+
+        def attempt() -> bool:
+            mode: PutMode = self._mode(name) if replace else "create"
+            try:
+                obstore.put(objects, name, content, mode=mode, attributes={WRITER: writer}, use_multipart=False)
+            except (AlreadyExistsError, PreconditionError):
+                found = self._writer(name)
+                if found == writer:
                     return True
-                except (AlreadyExistsError, PreconditionError) as error:
-                    found, problem = self._writer(name), error
-                    if found == writer:
-                        return True
-                    if found is not None and not replace:
-                        return False
-                except GenericError as error:  # whether it worked is not known
-                    problem = error
-            raise problem
+                if found is not None and not replace:
+                    return False
+                raise
+            return True
+
+        with os_errors(name):
+            times = TRANSFER_TIMES if size > SMALL_BYTES else 1
+            return patiently(attempt, AlreadyExistsError, PreconditionError, times=times)
 
     def _mode(self, name: str) -> PutMode:
         """The put mode that replaces what is there now."""
@@ -280,6 +300,15 @@ class ObjectStorage:
         """Remove parts that dead writers left on this machine; how many. In the bucket there are none."""
         return self._cache.sweep(stray_age_s=stray_age_s)
 
+    # -------------------------------------------------------------------------------------------------------- its root
+
+    def founding(self) -> contextlib.AbstractContextManager[None]:
+        """Nothing: a bucket is there, or refuses every put."""
+        return contextlib.nullcontext()
+
+    def require(self) -> None:
+        """Nothing: a bucket that cannot be reached is told from one without an object by every request."""
+
 
 class _Group(ObjectStore[Any]):
     """zarr-python's store of objects, with the errors of a file system."""
@@ -291,6 +320,29 @@ class _Group(ObjectStore[Any]):
     async def exists(self, key: str) -> bool:
         with os_errors(key):
             return await super().exists(key)
+
+
+def patiently(action: Callable[[], T], *passing: type[Exception], times: int = 1) -> T:
+    """What an action returns, tried again for PATIENCE_S while the server fails, or with one of the `passing` errors.
+
+    At least `times` times, however long each takes: a transfer may break off after minutes. Whether a put that failed
+    has worked is not known; whoever tries it must find out.
+    """
+    failures: tuple[type[Exception], ...] = (GenericError, *passing)
+    deadline = time.monotonic() + PATIENCE_S
+    for tried, pause_s in enumerate(itertools.chain(PAUSES_S, itertools.repeat(PAUSES_S[-1])), 1):
+        try:
+            return action()
+        except failures as error:
+            if (tried >= times and time.monotonic() + pause_s > deadline) or _is_refusal(error):
+                raise
+        time.sleep(pause_s)
+    raise AssertionError("pauses without end have ended")
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether the server has refused, as it will the next time (all but "too slow" and "too many requests")."""
+    return isinstance(error, GenericError) and re.search(r"\b4(?!08|29)\d\d [A-Z]", _first_line(error)) is not None
 
 
 def claim_of(folder: str) -> str:
@@ -316,7 +368,15 @@ def _connect(url: str, timeout_s: float) -> Any:
                 "allow_http": True,  # where the endpoint's URL says so, as within a cluster
                 "timeout": timedelta(seconds=timeout_s),
             },
-            retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_TIMEOUT_S)},
+            retry_config={
+                "max_retries": RETRIES,
+                "retry_timeout": timedelta(seconds=PATIENCE_S),
+                "backoff": {
+                    "init_backoff": timedelta(seconds=PAUSES_S[0]),
+                    "max_backoff": timedelta(seconds=LONGEST_PAUSE_S),
+                    "base": 2,
+                },
+            },
         )
     except (BaseError, ValueError) as error:
         raise StoreError(f"{url}: cannot be used as a store: {_first_line(error)}") from error

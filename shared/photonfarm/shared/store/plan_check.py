@@ -81,15 +81,16 @@ class PlanCheck:
             group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
             jobs, shard_rows = (int(str(group.attrs[name])) for name in ("jobs", "shard_rows"))
         except _UNREADABLE as error:
-            yield Finding(Cause.PLAN, f"cannot be read: {error}", self._id, file=f"{folder}/zarr.json")
+            detail = f"cannot be read: {error}; {plans.RESTORE}"
+            yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/zarr.json")
             return
         self.shard_rows = self.shard_rows or shard_rows
         for name in _INPUTS:
             if detail := self._array(group, folder, name, jobs * shard_rows):
-                yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/{name}")
+                yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{name}")
         for array in schema.output_arrays(self._spec).values():
             if detail := _declaration(group, array, jobs, shard_rows):
-                yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
+                yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
 
     def _array(self, group: Any, folder: str, name: str, rows: int | None = None) -> str:
         """What is wrong with an array of inputs or of the base; empty if nothing is."""

@@ -16,11 +16,11 @@ from pydantic import TypeAdapter
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.plan import UNUSED, PlannedRows, Request
+from photonfarm.shared.plan import UNUSED, Expansion, Known, PlannedRows, Request, expand
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations, schema
 from photonfarm.shared.store.storage import Storage, store_errors
-from photonfarm.shared.top_up import AnyRequest, TopUp
+from photonfarm.shared.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.view import View
 
 NAME_DIGITS = 6
@@ -30,6 +30,12 @@ MISSING = (
     "folder back from a copy of the store"
 )
 """Of a plan."""
+
+RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a copy of the store"
+"""What helps a plan whose request cannot be read."""
+
+REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
+"""What helps against most damage of a plan."""
 
 _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
@@ -72,6 +78,16 @@ class StoredPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class About:
+    """What the attributes of a plan's group tell."""
+
+    request: Request | TopUp
+    first_job: int
+    jobs: int
+    shard_rows: int
+
+
+@dataclass(frozen=True, slots=True)
 class SampleRow:
     """The inputs of one sample."""
 
@@ -102,6 +118,16 @@ def folder(scene: str, number: int) -> str:
     return f"{scene}/plans/{number:0{NAME_DIGITS}d}"
 
 
+def expanded(
+    spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
+) -> Expansion:
+    """The rows of a request that the plans before it do not have: a function of these, the same each time."""
+    known = Known((plan.first_row, plan.rows) for plan in before)
+    if isinstance(request, TopUp):
+        return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
+    return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
+
+
 def build(
     part: Path, spec: SceneSpec, request: Request | TopUp, rows: PlannedRows, *, first_job: int, shard_rows: int
 ) -> None:
@@ -124,14 +150,15 @@ def build(
     schema.create_outputs(group, spec, count, shard_rows)
 
 
-def load_all(storage: Storage, scene: str, loaded: list[StoredPlan]) -> list[StoredPlan]:
-    """The plans of a scene in order, those already loaded taken over.
+def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
+    """The plans of a scene in order, those already loaded taken over; all, or those before number `until`.
 
     Raises CorruptError if one of them is missing or is not as it was written: later rows refer to its rows, and a plan
     that is left out would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
-        return loaded + [_load(storage, scene, n) for n in range(len(loaded), count(storage, scene, len(loaded)))]
+        end = count(storage, scene, len(loaded)) if until is None else until
+        return loaded + [_load(storage, scene, n) for n in range(len(loaded), end)]
 
 
 def count(storage: Storage, scene: str, loaded: int = 0) -> int:
@@ -158,14 +185,18 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
         group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
         names = [field.name for field in fields(PlannedRows)]
         rows = PlannedRows(**{each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in names})
-        about: dict[str, Any] = dict(group.attrs)
-        request = _REQUEST.validate_python(about["request"], extra="ignore")  # of a later program
-        first_job, jobs, shard_rows = (int(about[name]) for name in ("first_job", "jobs", "shard_rows"))
+        about = about_plan(dict(group.attrs))
     except FileNotFoundError as error:
         raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
     except (ValueError, KeyError, RuntimeError) as error:
-        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}") from error
-    return StoredPlan(number, name, request, first_job, jobs, shard_rows, rows)
+        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}; {REWRITE}") from error
+    return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+
+
+def about_plan(attributes: dict[str, Any]) -> About:
+    """The attributes of a plan's group; raises ValueError or KeyError."""
+    request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # of a later program
+    return About(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

@@ -1,7 +1,8 @@
 """What is damaged is set aside, never deleted: moved to a folder of its own, with a record of what and why.
 
     STORE/quarantine/000000/repair.json                  a repair: when; its number is claimed by placing this file
-    STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job and why; base-… and spec-… alike
+    STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job and why; base-…, spec-…, plan-…
+                                                         alike
     STORE/quarantine/000000/scenes/<scene id>/…          the files, under the names that they had
 
 The marker goes first: from then on readers do not see the job and workers find it missing, and what has become of its
@@ -12,7 +13,8 @@ otherwise, and the next check finds whatever is still wrong.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from photonfarm.shared.errors import CorruptError
@@ -77,7 +79,33 @@ class Quarantine:
             self._record(f"spec-{_id(scene)}", why, [name], "`photonfarm submit` of the same spec writes it")
             return bool(self._move([name]))
 
+    def rewrite(self, scene: str, plan: int, files: Mapping[str, Path], why: Sequence[Finding]) -> None:
+        """Put new files (parts) in the place of damaged ones of a plan, of which copies are set aside first.
+
+        No name is ever without bytes, so that nobody who reads the plan meanwhile takes it for another one.
+        """
+        with store_errors(f"write plan {plan} again", self._storage.where):
+            held = {name: self._content(name) for name in files}
+            there = [name for name, content in held.items() if content is not None]
+            self._record(f"plan-{_id(scene)}-{plan}", why, there, "written again from the plan's request")
+            for name, part in files.items():
+                content, copy = held[name], f"{self._claimed()}/{name}"
+                if content is not None:
+                    self._keep(content, copy)
+                    self._storage.settle([copy])
+                self._storage.adopt(part, name, replace=True)
+            self._storage.settle(files)
+
     # -----------------------------------------------------------------------------------------------------------------
+
+    def _keep(self, content: bytes, name: str) -> None:
+        """Store a copy of damaged bytes."""
+        part = self._storage.part()
+        try:
+            part.write_bytes(content)
+            self._storage.adopt(part, name)
+        finally:
+            part.unlink(missing_ok=True)
 
     def _claimed(self) -> str:
         """The folder of this repair; two repairs at once get two."""

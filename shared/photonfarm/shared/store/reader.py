@@ -28,8 +28,8 @@ from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
 from photonfarm.shared.store.shards import Shard
-from photonfarm.shared.store.storage import open_storage, renew_copy, store_errors
-from photonfarm.shared.store.store import FORMAT_FILE, check_format
+from photonfarm.shared.store.storage import FORMAT_FILE, open_storage, renew_copy, store_errors
+from photonfarm.shared.store.store import check_format
 from photonfarm.shared.view import View
 
 
@@ -230,6 +230,7 @@ class SceneReader:
         shard, within = self._shard(name, row)
         if shard is None or within not in shard:
             file = self._file(name, row // self._plans[0].shard_rows)
+            self._storage.require()
             raise CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
         self._read_from(shard, name, row, values)
 
@@ -270,6 +271,7 @@ class SceneReader:
         try:
             return Shard(self._storage.local(file), array, shard_rows)
         except CorruptError:
+            self._storage.require()
             if not renew_copy(self._storage, file):
                 raise
         return Shard(self._storage.local(file), array, shard_rows)

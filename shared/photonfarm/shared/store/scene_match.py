@@ -22,6 +22,7 @@ from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.query import Query
 from photonfarm.shared.store.scene_store import SceneStore
 from photonfarm.shared.store.shards import Shard
+from photonfarm.shared.store.storage import renew_copy
 
 F64 = NDArray[np.float64]
 
@@ -177,10 +178,16 @@ class SceneMatch:
         return found
 
     def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
-        if not self._scene.storage.exists(file):
+        storage = self._scene.storage
+        if not storage.exists(file):
             return False
         try:
-            return chunk in Shard(self._scene.storage.local(file), array, shard_rows)
+            return chunk in Shard(storage.local(file), array, shard_rows)
+        except CorruptError:
+            if not renew_copy(storage, file):
+                return False
+        try:
+            return chunk in Shard(storage.local(file), array, shard_rows)
         except CorruptError:
             return False
 

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.shared.errors import CorruptError, SpecError, StoreError
-from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Known, Request, expand
+from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Request
 from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations, markers, plans, schema
 from photonfarm.shared.store.commit import JobWriter
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.storage import Storage, store_errors
-from photonfarm.shared.top_up import TopUp, expand_top_up
+from photonfarm.shared.top_up import TopUp
 
 SCENES = "scenes"
 
@@ -90,11 +90,7 @@ class SceneStore:
                     f"{self.storage.where}/{markers.name_of(self.name, job)}: no plan has this job, and a new one "
                     "would: `photonfarm store check` tells whether the last plan is missing"
                 )
-            known = Known((plan.first_row, plan.rows) for plan in found)
-            if isinstance(request, TopUp):
-                expansion = expand_top_up(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
-            else:
-                expansion = expand(self.spec, request, known, first_job=first_job, shard_rows=rows_per_job)
+            expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0)
             with store_errors("write a plan", self.storage.where):
@@ -105,7 +101,7 @@ class SceneStore:
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         return PlanResult(self.scene_id, len(found), expansion.new, expansion.known, jobs)
                 finally:
-                    _remove(built)
+                    remove_built(built)
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -177,7 +173,7 @@ class SceneStore:
                 _build_base(built, {"geometry": geometry, "cloud": cloud})
                 self.storage.adopt_folder(built, f"{self.name}/base")
             finally:
-                _remove(built)
+                remove_built(built)
 
 
 def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
@@ -196,7 +192,7 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
     return spec
 
 
-def _remove(built: Path) -> None:
+def remove_built(built: Path) -> None:
     """Remove what was built of a folder, if it is still there.
 
     Where the disk refuses one of several files, zarr-python raises at once and goes on with the others: these are

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
+from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store.scene_store import SceneStore
 from photonfarm.shared.store.store import Store
 
@@ -23,6 +24,7 @@ class SceneStatus:
     size_bytes: int  # of the committed outputs
     core_s: float  # processor time of the committed jobs
     redrawn: int  # renders thrown away for a non-finite value
+    error: str | None = None  # why nothing is known of it; all numbers are 0 then
 
 
 _READERS = 8
@@ -33,8 +35,22 @@ _BLOCK = 256
 
 
 def store_status(store: Store) -> list[SceneStatus]:
-    """The status of every scene; reads every marker, and holds few of them at a time."""
-    return [_scene_status(scene) for scene in store.scenes()]
+    """The status of every scene; reads every marker, and holds few of them at a time.
+
+    A scene that cannot be read says why, by its `error`. Raises StoreError if the store cannot be read.
+    """
+    known, failed = store.each(_scene_status)
+    for scene_id, error in failed.items():
+        known[scene_id] = SceneStatus(scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, str(error))
+    return [known[scene_id] for scene_id in sorted(known)]
+
+
+def _name(store: Store, scene_id: str) -> str:
+    """A scene's name, if its spec can be read."""
+    try:
+        return store.scene(scene_id).spec.name
+    except StoreError:
+        return "unreadable"
 
 
 def _scene_status(scene: SceneStore) -> SceneStatus:

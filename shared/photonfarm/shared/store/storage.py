@@ -18,6 +18,9 @@ from photonfarm.shared.errors import StoreError
 if TYPE_CHECKING:
     import zarr.abc.store
 
+FORMAT_FILE = "photonfarm.json"
+"""What a store has at its root, and nothing else has."""
+
 TMP = "tmp"
 """The folder of what is not adopted yet."""
 
@@ -83,6 +86,12 @@ class Storage(Protocol):
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove parts that dead writers left; how many."""
 
+    def founding(self) -> contextlib.AbstractContextManager[None]:
+        """While a store is being made here: without its format file nothing is written otherwise."""
+
+    def require(self) -> None:
+        """Raise StoreError if the store's place is there no more, so that nothing in it is taken for missing."""
+
 
 @runtime_checkable
 class Copying(Protocol):
@@ -114,7 +123,7 @@ def open_storage(root: str | Path) -> Storage:
     if not is_url(root):
         from photonfarm.shared.store.local import LocalStorage
 
-        return LocalStorage(Path(root))
+        return LocalStorage(Path(root), FORMAT_FILE)
     if str(root).partition("://")[0] not in SCHEMES:
         raise StoreError(f"{root}: is no URL of a bucket; they begin with {'://, '.join(SCHEMES)}://")
     try:

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import SHARD_ROWS, Known, Request, expand
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations
 from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore
-from photonfarm.shared.store.storage import STRAY_AGE_S, TMP, Storage, open_storage, put_json, store_errors
+from photonfarm.shared.store.storage import (
+    FORMAT_FILE,
+    STRAY_AGE_S,
+    TMP,
+    Storage,
+    open_storage,
+    put_json,
+    store_errors,
+)
 
-FORMAT_FILE = "photonfarm.json"
+T = TypeVar("T")
 
 
 class Store:
@@ -25,7 +35,7 @@ class Store:
         self._opened: dict[str, SceneStore] = {}
         if create:
             self._create()
-        check_format(self.storage)
+        self.store_id = check_format(self.storage)
 
     def _create(self) -> None:
         with store_errors("make a store here", self.storage.where):
@@ -34,7 +44,16 @@ class Store:
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
             if foreign and not self.storage.exists(FORMAT_FILE):  # nobody made one in the meantime
                 raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
-            put_json(self.storage, declarations.stamp(), FORMAT_FILE)
+            with self.storage.founding():
+                put_json(self.storage, _new_document(), FORMAT_FILE)
+
+    def check(self) -> None:
+        """Return if the store is still there; raises StoreError if it is gone, or another one lies in its place."""
+        store_id = check_format(self.storage)
+        if store_id != self.store_id:
+            raise StoreError(
+                f"{self.storage.where}: was the store {self.store_id}, and now another one lies there, {store_id}"
+            )
 
     def scene_ids(self) -> list[str]:
         """The scenes that are there, in order of their ids."""
@@ -51,6 +70,22 @@ class Store:
     def scenes(self, only: str | None = None) -> list[SceneStore]:
         """Every scene of the store, or the one that is named; raises StoreError if that is not there."""
         return [self.scene(scene_id) for scene_id in (self.scene_ids() if only is None else [only])]
+
+    def each(self, what: Callable[[SceneStore], T]) -> tuple[dict[str, T], dict[str, StoreError]]:
+        """What a function gives of every scene, and why it gives nothing of some: damage of one concerns no other.
+
+        Raises StoreError if it is the store that cannot be read.
+        """
+        given: dict[str, T] = {}
+        failed: dict[str, StoreError] = {}
+        for scene_id in self.scene_ids():
+            try:
+                given[scene_id] = what(self.scene(scene_id))
+            except StoreError as error:
+                failed[scene_id] = error
+        if any(not isinstance(error, CorruptError) for error in failed.values()):
+            check_format(self.storage)
+        return given, failed
 
     def add(self, spec: SceneSpec) -> SceneStore:
         """The scene of a spec, made if it is new; the first spec written for a scene id stays."""
@@ -75,8 +110,13 @@ class Store:
             return self.storage.sweep(stray_age_s=stray_age_s)
 
 
-def check_format(storage: Storage) -> None:
-    """Return for a store of this program's format and version; raises StoreError, with a sentence, for any other."""
+def _new_document() -> dict[str, Any]:
+    """What a store made now says of itself."""
+    return {**declarations.stamp(), "id": declarations.new_store_id()}
+
+
+def check_format(storage: Storage) -> str:
+    """The id of a store of this program's format and version; raises StoreError, with a sentence, for any other."""
     file = f"{storage.where}/{FORMAT_FILE}"
     try:
         document = json.loads(storage.read(FORMAT_FILE))
@@ -86,5 +126,11 @@ def check_format(storage: Storage) -> None:
     except OSError as error:
         raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise CorruptError(f"{file}: is not the document of a store: {error}") from error
+        raise CorruptError(
+            f"{file}: is not the document of a store: {error}; put it back from a copy. A new store's would be "
+            f"{json.dumps(_new_document())}: without a copy, write that, if a photonfarm of this version made the store"
+        ) from error
     declarations.check_version(name, version, storage.where)
+    if not declarations.is_store_id(store_id := document.get("id")):
+        raise CorruptError(f"{file}: id = {store_id!r}: 32 lower-case hexadecimal digits are required")
+    return str(store_id)

@@ -1,0 +1,61 @@
+"""What holds workers up, by their own account: that they take no jobs, or leave a scene to others.
+
+It is said with every heartbeat and gone with it, and is text for people: nothing is decided by it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from redis import Redis
+
+from photonfarm.shared.queue.untrusted import beginnings, names_below, printable
+
+PAUSED = "rq:photonfarm:paused:"
+LEFT = "rq:photonfarm:left:"
+REASON_LETTERS = 500
+
+_SCENE_AND_WORKER = re.compile("([0-9a-f]{32}):(.+)", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldUp:
+    """What workers say, by name; printable."""
+
+    paused: dict[str, str]  # why a worker takes no jobs
+    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it leaves the scene to others
+
+
+def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
+    """Say for a time why a worker takes no jobs, if it takes none, and which scenes it leaves to others."""
+    ttl_ms = int(ttl_s * 1000)
+    with connection.pipeline(transaction=False) as pipeline:
+        if paused is None:
+            pipeline.delete(PAUSED + worker)
+        else:
+            pipeline.set(PAUSED + worker, paused[:REASON_LETTERS], px=ttl_ms)
+        for scene_id, reason in left.items():
+            pipeline.set(f"{LEFT}{scene_id}:{worker}", reason[:REASON_LETTERS], px=ttl_ms)
+        pipeline.execute()
+
+
+def forget_held_up(connection: Redis, worker: str, left: Mapping[str, str]) -> None:
+    """A worker that has ended is held up by nothing."""
+    connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
+
+
+def read_held_up(connection: Redis) -> HeldUp:
+    """What workers say now."""
+    left: dict[str, dict[str, str]] = {}
+    for name, reason in _said(connection, LEFT).items():
+        if found := _SCENE_AND_WORKER.fullmatch(name):
+            left.setdefault(found[1], {})[printable(found[2])] = reason
+    return HeldUp({printable(name): reason for name, reason in _said(connection, PAUSED).items()}, left)
+
+
+def _said(connection: Redis, prefix: str) -> dict[str, str]:
+    names = sorted(names_below(connection, prefix))
+    told = beginnings(connection, [prefix + name for name in names], 4 * REASON_LETTERS)
+    return {name: printable(reason)[:REASON_LETTERS] for name, reason in zip(names, told, strict=True) if reason}

@@ -1,0 +1,68 @@
+"""A scene that is damaged holds up no other, whoever looks at it."""
+
+import json
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from click.testing import CliRunner
+
+from photonfarm.renderer.backpressure import TrainerPace
+from photonfarm.shared import cli
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.queue import connect
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import SceneStore, Store
+
+
+@pytest.fixture
+def scenes(analytic: ModuleType, tmp_path: Path) -> tuple[SceneStore, SceneStore]:
+    """One with a bit of its plan flipped, and a whole one; of two jobs each."""
+    store = Store(tmp_path / "store", create=True)
+    specs = (analytic.small_spec(), analytic.small_spec(points=17))
+    ids = [store.plan(spec, Request(modifications=4), shard_rows=2).scene_id for spec in specs]
+    damaged, whole = (store.scene(scene_id) for scene_id in ids)
+    path = damaged.folder / "plans/000000/view/c.0.0"
+    path.write_bytes(bytes([path.read_bytes()[0] ^ 1]) + path.read_bytes()[1:])
+    return damaged, whole
+
+
+def test_a_worker_renders_what_is_whole_and_then_ends_with_the_error_of_what_is_not(
+    analytic: ModuleType, scenes: tuple[SceneStore, SceneStore], redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    damaged, whole = scenes
+    log = tmp_path / "log"
+    worker = analytic.start_worker(
+        tmp_path / "store", redis_server.url, analytic.command(0.0), log, until_complete=True, name="a"
+    )
+    try:
+        assert worker.wait(60) == StoreError.exit_code
+    finally:
+        worker.kill()
+    assert whole.missing_jobs() == []
+    assert f"scene {damaged.scene_id} is passed over" in log.read_text()
+
+
+def test_the_pace_of_the_trainer_is_that_of_the_scenes_that_can_be_read(
+    scenes: tuple[SceneStore, SceneStore], redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    assert TrainerPace(Store(tmp_path / "store"), connect(redis_server.url), 4.0).reason() is None
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_the_status_tells_the_damaged_scene_and_goes_on(
+    scenes: tuple[SceneStore, SceneStore], tmp_path: Path, as_json: bool
+) -> None:
+    damaged, whole = scenes
+    words = ["status", "--store", str(tmp_path / "store"), "--redis", "redis://127.0.0.1:1/0"]
+    result = CliRunner().invoke(cli.umbrella, [*words, *(["--json"] if as_json else [])])
+    assert isinstance(result.exception, StoreError)
+    assert "1 of 2 scenes cannot be read" in str(result.exception)
+    if as_json:
+        errors = {scene["scene_id"]: scene["error"] for scene in json.loads(result.stdout)["scenes"]}
+        assert errors[whole.scene_id] is None
+        assert "is not a readable plan" in errors[damaged.scene_id]
+    else:
+        assert f"{damaged.scene_id}: cannot be read" in result.stdout
+        assert f"{whole.scene_id}  0/4" in result.stdout

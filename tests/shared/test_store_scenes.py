@@ -1,0 +1,188 @@
+"""What is wrong with one scene of a store stays with it, and what is wrong with the store is told as that."""
+
+import importlib.util
+import logging
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.queue import connect, queue_status, reconcile
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.shared.store.local import LocalStorage
+
+_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
+samples = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(samples)
+
+
+@pytest.fixture(scope="module")
+def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedRedis]:
+    with EmbeddedRedis(tmp_path_factory.mktemp("redis")) as server:
+        yield server
+
+
+@pytest.fixture
+def redis_url(redis_server: EmbeddedRedis) -> str:
+    """Of an empty Redis."""
+    connect(redis_server.url).flushall()
+    return redis_server.url
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store", create=True)
+
+
+def planned(store: Store, points: int = 16) -> SceneStore:
+    """Two jobs of two samples, the first of them committed."""
+    spec = samples.small_spec(points=points)
+    scene = store.scene(store.plan(spec, Request(modifications=4), shard_rows=2).scene_id)
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    return scene
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+HARMS: dict[str, Callable[[Path], None]] = {
+    "a bit of a plan": lambda scene: flip(scene / "plans/000000/view/c.0.0"),
+    "a plan's zarr.json": lambda scene: (scene / "plans/000000/zarr.json").unlink(),
+    "the spec": lambda scene: (scene / "spec.json").write_text(""),
+}
+
+
+@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
+def test_a_damaged_scene_holds_up_no_other(
+    store: Store, redis_url: str, harm: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    damaged, whole = planned(store, 16), planned(store, 17)
+    harm(damaged.folder)
+    again = Store(store.root)
+    statuses = {status.scene_id: status for status in store_status(again)}
+    assert statuses[whole.scene_id].error is None
+    assert (statuses[whole.scene_id].jobs_planned, statuses[whole.scene_id].jobs_committed) == (2, 1)
+    about = statuses[damaged.scene_id]
+    assert (about.jobs_planned, about.size_bytes) == (0, 0)
+    assert damaged.scene_id in str(about.error)
+
+    connection = connect(redis_url)
+    caplog.clear()
+    caplog.set_level(logging.WARNING)
+    assert reconcile(again, connection) == 1
+    assert reconcile(again, connection) == 0
+    assert queue_status(connection).queued == 1
+    (told,) = [record.getMessage() for record in caplog.records if "passed over" in record.getMessage()]
+    assert damaged.scene_id in told
+    with pytest.raises(CorruptError):
+        reconcile(again, connection, scene_id=damaged.scene_id)
+
+
+def test_a_damaged_plan_s_error_says_what_mends_it(store: Store) -> None:
+    scene = planned(store)
+    flip(scene.folder / "plans/000000/view/c.0.0")
+    with pytest.raises(CorruptError, match="`photonfarm store check --repair` writes the inputs of a plan again"):
+        Store(store.root).scene(scene.scene_id).plans()
+
+
+def test_a_store_that_cannot_be_read_is_no_error_of_its_scenes(
+    store: Store, redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned(store)
+    again = Store(store.root)
+
+    def refused(self: LocalStorage, name: str) -> bytes:
+        raise PermissionError(13, "Permission denied", name)
+
+    monkeypatch.setattr(LocalStorage, "read", refused)
+    with pytest.raises(StoreError, match="cannot be read: Permission denied"):
+        store_status(again)
+    with pytest.raises(StoreError, match="cannot be read: Permission denied"):
+        reconcile(again, connect(redis_url))
+
+
+# ---------------------------------------------------------------------------------------------------- a store that goes
+
+
+def removed(root: Path) -> None:
+    shutil.rmtree(root)
+
+
+def unmounted(root: Path) -> None:
+    """The mount point stays, empty."""
+    shutil.rmtree(root)
+    root.mkdir()
+
+
+@pytest.mark.parametrize("go", [removed, unmounted])
+@pytest.mark.parametrize("when", ["before a row", "before the commit"])
+def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
+    store: Store, go: Callable[[Path], None], when: str
+) -> None:
+    scene = planned(store)
+    given = samples.outputs(scene, 1)
+
+    def work() -> None:
+        with scene.job_writer(1) as out:
+            if when == "before a row":
+                go(store.root)
+            for row, photons in given.photons.items():
+                out.photons(row, photons)
+            for row, buffers in given.buffers.items():
+                out.buffers(row, buffers)
+            for row, halves in given.radiance.items():
+                out.radiance(row, halves)
+            out._join()
+            if when == "before the commit":
+                go(store.root)
+            out.commit(samples.FIGURES)
+
+    with pytest.raises(StoreError, match="the store is gone") as caught:
+        work()
+    assert not isinstance(caught.value, CorruptError)
+    assert not store.root.exists() if go is removed else not list(store.root.iterdir())
+
+
+@pytest.mark.parametrize("go", [removed, unmounted])
+def test_nothing_of_a_store_that_is_gone_is_taken_for_missing(
+    store: Store, redis_url: str, go: Callable[[Path], None]
+) -> None:
+    scene = planned(store)
+    reader = SceneReader(store.root, scene.scene_id)
+    assert reader.refresh().tolist() == [0, 1]
+    go(store.root)
+    for look in (
+        store.scene_ids,
+        scene.missing_jobs,
+        lambda: reconcile(store, connect(redis_url)),
+        reader.refresh,
+        lambda: reader.read(0),
+        lambda: scene.write_base(*samples.base()),
+        lambda: scene.plan(Request(modifications=9)),
+        store.sweep,
+    ):
+        with pytest.raises(StoreError, match="the store is gone") as caught:
+            look()
+        assert not isinstance(caught.value, CorruptError)
+    assert not store.root.exists() if go is removed else not list(store.root.iterdir())
+
+
+def test_a_store_without_scenes_or_temporary_files_is_there(store: Store) -> None:
+    shutil.rmtree(store.root / "tmp", ignore_errors=True)
+    assert (Store(store.root).scene_ids(), store_status(store), store.sweep()) == ([], [], 0)
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]"])
+def test_a_format_file_that_is_empty_says_what_it_should_hold(store: Store, content: str) -> None:
+    (store.root / "photonfarm.json").write_text(content)
+    said = re.escape('{"format": "photonfarm store", "version": 2')
+    with pytest.raises(CorruptError, match=f"is not the document of a store: .* {said}"):
+        Store(store.root)

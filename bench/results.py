@@ -37,7 +37,7 @@ def command(name: str) -> str:
     """How to make the table again."""
     given = iter(sys.argv[1:])
     told = [argument for argument in given if not (argument == "--out" and next(given))]
-    return shlex.join(["python", f"bench/{name}.py", *told]) if told else f"make bench-{name}"
+    return shlex.join(["python", f"bench/{name}.py", *told]) if told else f"make bench-{name.replace('_', '-')}"
 
 
 def machine() -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-EPSILON = 1e-2  # as in photonfarm.shared.statistics.relative_mse
+EPSILON = 1e-2  # so that dark pixels do not count without bound; as in the pilot (renderer/strategy/noise.py)
 TRIM = 0.01
 
 

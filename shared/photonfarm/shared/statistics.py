@@ -104,14 +104,3 @@ def student_to_normal(t: Array, freedom: Array) -> npt.NDArray[np.float64]:
     t, freedom = np.asarray(t, dtype=np.float64), np.asarray(freedom, dtype=np.float64)
     magnitude = (8 * freedom + 1) / (8 * freedom + 3) * np.sqrt(freedom * np.log1p(t**2 / freedom))
     return np.sign(t) * magnitude
-
-
-def relative_mse(images: Array, reference: Array, epsilon: float = 1e-2, trim: float = 0.0) -> float:
-    """Mean of (f − r)²/(r² + ε·mean(r)²) over renders, pixels and channels.
-
-    ``trim``: share of the worst pixels left out.
-    """
-    f, r = np.asarray(images, dtype=np.float64), np.asarray(reference, dtype=np.float64)
-    error = ((f - r) ** 2 / (r**2 + epsilon * np.mean(r) ** 2)).mean(axis=(0, -1)).ravel()
-    kept = np.sort(error)[: max(1, round(error.size * (1 - trim)))]
-    return float(kept.mean())

@@ -6,7 +6,7 @@ have at equal seeds do not count. The rest of this text says how much is signifi
 
 Shape letters: H W image, B × B blocks. All is measured in images of the pilot, whatever their samples per pixel. Seen
 from a pixel, x is its value, r the reference of the view, and y = x/√(r² + ε·mean(r)²) its weighted value; so that the
-mean variance of y is the relative mean squared error (relMSE) of one image. ε = 0.01, as in `statistics.relative_mse`.
+mean variance of y is the relative mean squared error (relMSE) of one image. ε = 0.01.
 
 **Noise that is seen.** Two independent images a, b of one view give mean (y_a − y_b)²/2.
 

@@ -63,6 +63,28 @@ def test_batches_in_any_order_and_with_repeats_are_the_samples_read_one_by_one(s
         check(source.read_batch(np.array(rows)), source, rows)
 
 
+def test_a_batch_that_several_threads_read_is_the_same(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_PART", 2)
+    memory = Batch.empty(source.spec, 7)
+    with ThreadPoolExecutor(3) as threads:
+        for rows in ([0, 1, 2, 3, 4, 5, 6], [5, 5, 7], [3], []):  # 5 and 6 are wide
+            for _ in range(3):
+                check(source.read_batch(rows, memory, threads), source, rows)
+
+
+def test_an_error_of_one_thread_is_raised_once_all_have_ended(
+    scene: SceneStore, source: SceneReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "_PART", 1)
+    (scene.folder / "plans/000000/depth/c.0.0.0").unlink()
+    memory = Batch.empty(source.spec, 8)
+    with ThreadPoolExecutor(4) as threads:
+        with pytest.raises(CorruptError, match="depth"):
+            source.read_batch(range(8), memory, threads)
+        memory.radiance[:] = 7
+    assert (memory.radiance == 7).all()
+
+
 def test_a_batch_is_in_the_memory_that_was_given_and_in_the_types_that_are_stored(source: SceneReader) -> None:
     memory = Batch.empty(source.spec, 4)
     batch = source.read_batch([3, 1], memory)

@@ -252,11 +252,12 @@ def test_a_job_that_is_given_up_after_its_last_deadline_has_the_deadline_as_its_
     overdue: int,
     reason: str,
 ) -> None:
-    """It has been started four times before."""
+    """Each has been started four times before."""
     scene = planned(1)
     connection, name = connect(redis_server.url), f"{scene.scene_id}-0"
-    connection.set(f"{STARTS}{name}", 4)
-    connection.set(f"{OVERDUE}{name}", overdue)
+    for job in scene.missing_jobs():
+        connection.set(f"{STARTS}{scene.scene_id}-{job}", 4)
+        connection.set(f"{OVERDUE}{scene.scene_id}-{job}", overdue)
     running = start(
         scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=2.0, until_complete=True
     )

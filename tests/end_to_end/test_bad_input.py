@@ -16,7 +16,7 @@ from photonfarm.shared.hold_out import check_hold_out
 from photonfarm.shared.scene import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.submission import request_of, submit
-from photonfarm.trainer.dataset import is_row_held_out
+from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.store_source import StoreSource
 
 
@@ -158,7 +158,7 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
     assert len(rows) == 6
     found = set()
     for share in np.linspace(0.02, 0.998, 49):
-        sides = {is_row_held_out(source, int(row), share) for row in rows}
+        sides = set(rows_held_out(source, rows.tolist(), share))
         for store in (root, tmp_path / "none"):
             if len(sides) == 2:
                 check_hold_out(load_spec(spec), store, share, request_of(**request))

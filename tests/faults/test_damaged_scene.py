@@ -1,6 +1,8 @@
 """A scene that is damaged holds up no other, whoever looks at it."""
 
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -8,12 +10,13 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.renderer.backpressure import TrainerPace
+from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared import cli
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import connect
 from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store import SceneStore, Store, store_status
 
 
 @pytest.fixture
@@ -48,6 +51,53 @@ def test_the_pace_of_the_trainer_is_that_of_the_scenes_that_can_be_read(
     scenes: tuple[SceneStore, SceneStore], redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     assert TrainerPace(Store(tmp_path / "store"), connect(redis_server.url), 4.0).reason() is None
+
+
+def empty(marker: Path) -> None:
+    marker.write_text("")
+
+
+def become_a_folder(marker: Path) -> None:
+    """A marker that cannot be read, whoever asks."""
+    marker.unlink()
+    marker.mkdir()
+
+
+@pytest.mark.parametrize("harm", [empty, become_a_folder])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_the_status_counts_markers_that_cannot_be_read_names_one_and_shows_the_rest(
+    analytic: ModuleType, planned: Callable[..., SceneStore], harm: Callable[[Path], None], as_json: bool
+) -> None:
+    scene = planned(3)
+    root = scene.folder.parent.parent
+    for job in range(3):
+        ShardRenderer(Store(root), worker="test", load=analytic.AnalyticScene.load).render(scene.scene_id, job)
+    sizes = [sum(file["size"] for file in scene.marker(job)["files"].values()) for job in range(3)]
+    for job in (0, 1):
+        harm(scene.folder / f"committed/{job:012d}.json")
+    words = ["status", "--store", str(root), "--redis", "redis://127.0.0.1:1/0", *(["--json"] if as_json else [])]
+    result = CliRunner().invoke(cli.umbrella, words)
+    assert isinstance(result.exception, StoreError)
+    for said in (str(result.exception), *([] if as_json else [result.stdout])):
+        assert re.search(r"2 of 3 markers cannot be read, .*committed/000000000000\.json", said)
+    if as_json:
+        (about,) = json.loads(result.stdout)["scenes"]
+        assert (about["error"], about["jobs_committed"], about["samples_complete"]) == (None, 3, 6)
+        assert (about["size_bytes"], about["markers_unreadable"]) == (sizes[2], 2)
+        assert "committed/000000000000.json" in about["marker_error"]
+    else:
+        assert re.search(rf"{scene.scene_id} +6/8 +3/4", result.stdout)
+
+
+def test_a_marker_that_a_repair_takes_back_during_status_is_no_damage(
+    scenes: tuple[SceneStore, SceneStore], analytic: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, whole = scenes
+    ShardRenderer(Store(tmp_path / "store"), worker="test", load=analytic.AnalyticScene.load).render(whole.scene_id, 0)
+    monkeypatch.setattr(SceneStore, "committed_jobs", lambda _: {0, 1})
+    (about,) = [status for status in store_status(Store(tmp_path / "store")) if status.scene_id == whole.scene_id]
+    assert (about.error, about.markers_unreadable, about.marker_error) == (None, 0, None)
+    assert about.size_bytes > 0
 
 
 @pytest.mark.parametrize("as_json", [False, True])

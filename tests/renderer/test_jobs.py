@@ -14,7 +14,8 @@ from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError
 from photonfarm.shared.keys import seed_of
 from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
+from photonfarm.shared.store.check import check_store
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +169,31 @@ def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, 
     assert not ShardRenderer(store, worker="late", load=recorded.load).render(scene.scene_id, 0)
     assert recorded.calls == []
     assert scene.marker(0)["figures"]["worker"] == "test"
+
+
+@pytest.mark.parametrize("other", ["worker", "repair"])
+def test_a_job_that_is_not_committed_says_who_came_between(
+    scene: SceneStore, store: Store, recorded: type, other: str, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """Another commits it before we do; a repair then sets that aside, whose files are ours as well."""
+    place = markers.place
+
+    def meanwhile(*about: Any) -> bool:
+        monkeypatch.setattr(markers, "place", place)
+        assert ShardRenderer(Store(store.root), worker="other", load=recorded.load).render(scene.scene_id, 0)
+        if other == "repair":
+            (file,) = (scene.folder / "plans/000000/radiance").glob("c.0.*")
+            file.write_bytes(file.read_bytes()[:-1])
+            assert check_store(Store(store.root), when="now", repair=True).scenes[0].set_aside == ("job 0",)
+        return place(*about)
+
+    monkeypatch.setattr(markers, "place", meanwhile)
+    assert not ShardRenderer(store, worker="test", load=recorded.load).render(scene.scene_id, 0)
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert scene.is_committed(0) == (other == "worker")
+    assert ("was committed by another worker" in said) == (other == "worker")
+    assert ("set aside by a repair" in said) == (other == "repair")
 
 
 def test_the_marker_tells_what_the_job_cost_and_which_versions_rendered_it(

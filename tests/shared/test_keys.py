@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from photonfarm.shared.keys import Stream, make_key, seed_of
+from photonfarm.shared import sampling
+from photonfarm.shared.keys import Stream, make_key, seed_of, view_key
 
 
 def test_a_key_is_the_same_on_every_machine_and_in_every_version() -> None:
@@ -18,6 +19,14 @@ def test_keys_tell_types_and_boundaries_of_their_parts_apart() -> None:
 def test_byte_order_of_an_array_does_not_enter_its_key() -> None:
     array = np.arange(4, dtype="<f4")
     assert make_key(array) == make_key(array.astype(">f4"))
+
+
+def test_the_key_of_a_view_is_the_documented_one_also_of_many_at_once() -> None:
+    keys = [make_key(i) for i in range(3)]
+    views = np.arange(18, dtype=np.float32).reshape(3, 6)
+    wanted = [make_key("view", key, view) for key, view in zip(keys, views, strict=True)]
+    assert [view_key(key, view) for key, view in zip(keys, views, strict=True)] == wanted
+    assert sampling.view_keys(keys, views) == wanted
 
 
 def test_seed_zero_is_a_seed_like_any_other() -> None:

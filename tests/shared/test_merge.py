@@ -1,15 +1,18 @@
 """Passes merge exactly: the truth is Python's fractions, and neither order nor grouping leaves a trace."""
 
 import importlib.util
+import json
 from dataclasses import fields
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from photonfarm.shared.cli import umbrella
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.estimate import clean_error
 from photonfarm.shared.plan import Request
@@ -192,3 +195,28 @@ def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Pat
     (tmp_path / "other.npz").write_bytes(b"nothing")
     with pytest.raises(StoreError, match=r"other\.npz: is not a merged view"):
         Merged.read(tmp_path / "other.npz")
+
+
+def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is(
+    scene: SceneStore, tmp_path: Path
+) -> None:
+    store, out = scene.storage.where, tmp_path / "references"
+    arguments = ["store", "merge", "--store", store, "--out", str(out)]
+    nothing = CliRunner().invoke(umbrella, arguments)
+    assert isinstance(nothing.exception, StoreError)
+    assert "no complete sample fits" in str(nothing.exception)
+
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    one = CliRunner().invoke(umbrella, [*arguments, "--row", "0", "--json"], catch_exceptions=False)
+    (told,) = json.loads(one.stdout)
+    reader = reader_of(scene)
+    assert (told["view"], told["passes"]) == (reader.view_key(0).hex(), 1)
+    assert_equal(Merged.read(Path(told["file"])), merge_view(reader, 0))
+
+    samples.commit_all(scene)
+    reader.refresh()
+    result = CliRunner().invoke(umbrella, arguments, catch_exceptions=False)
+    views = {reader.view_row(int(row)): int(row) for row in reader.rows}
+    assert len(result.stdout.splitlines()) == len(views) == len(list(out.iterdir()))
+    for view_row, row in views.items():
+        assert_equal(Merged.read(out / f"{reader.view_key(row).hex()}.npz"), merge_view(reader, view_row))

@@ -498,7 +498,9 @@ def test_a_refusal_is_told_at_once(url: str, monkeypatch: pytest.MonkeyPatch) ->
     began = time.monotonic()
     with pytest.raises(FileNotFoundError):
         storage.read("nothing")
-    assert ObjectStorage("s3://no-such-bucket/store").names("scenes") == []
+    assert ObjectStorage("s3://no-such-bucket/store").names("") == []
+    with pytest.raises(StoreError, match="the store is gone"):
+        ObjectStorage("s3://no-such-bucket/store").names("scenes")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
     with pytest.raises(PermissionError):
         ObjectStorage(url).read("object")

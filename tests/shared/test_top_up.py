@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.shared.cli import umbrella
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.hold_out import is_held_out
+from photonfarm.shared.hold_out import are_held_out
 from photonfarm.shared.plan import MAX_SAMPLES, Request, sample_key
 from photonfarm.shared.scene import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -214,7 +214,11 @@ def test_held_out_selects_what_training_keeps(tmp_path: Path, objects: list | No
     view_of = {s.row: s.view_row for s in all_samples(scene)}
     for condition, share in (("held-out", 0.125), ("held-out=0.4", 0.4)):
         reader.refresh()
-        expected = {view_of[row] for row in reader.rows.tolist() if is_held_out(unit(row), share)}
+        rows = reader.rows.tolist()
+        keys = reader.modification_keys(rows) if spec.groups else reader.view_keys(rows)
+        assert keys == [unit(row) for row in rows]
+        held_out = are_held_out(keys, share)
+        expected = {view_of[row] for row, held in zip(rows, held_out, strict=True) if held}
         assert 0 < len(expected) < len(reader.rows)
         assert topped_up(scene, condition) == expected
 

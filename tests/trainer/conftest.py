@@ -6,7 +6,7 @@ diffuse, light is direct only. Half-estimates are the clean image times gamma no
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -192,6 +192,12 @@ class AnalyticSource:
 
     def view_key(self, row: int) -> Key:
         return make_key(self.modification_key(row), self.view(row).vector)
+
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        return [self.modification_key(row) for row in rows]
+
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        return [self.view_key(row) for row in rows]
 
     def cloud_at(self, row: int) -> tuple[F32, NDArray[np.bool_]]:
         """The cloud of a row's configuration: positions and visibility flags."""

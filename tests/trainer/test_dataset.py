@@ -13,7 +13,7 @@ from photonfarm.shared.store import Store
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.view import Camera
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import Compact, is_row_held_out
+from photonfarm.trainer.dataset import Compact, rows_held_out
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import train
 from photonfarm.trainer.store_source import StoreSource
@@ -21,7 +21,7 @@ from photonfarm.trainer.store_source import StoreSource
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
     source = make_source(800, views=4)
-    held = [is_row_held_out(source, row, 1 / 8) for row in range(800)]
+    held = rows_held_out(source, range(800), 1 / 8)
     sides = {side: {source.modification_key(r) for r in range(800) if held[r] is side} for side in (True, False)}
     assert not sides[True] & sides[False]
     assert abs(len(sides[True]) - 25) <= 3 * np.sqrt(200 / 8 * 7 / 8), "binomial, 3 σ"
@@ -29,13 +29,13 @@ def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
 
 def test_what_is_held_out_for_a_small_share_is_held_out_for_a_larger_one(make_source) -> None:
     source = make_source(200)
-    small, large = ({r for r in range(200) if is_row_held_out(source, r, share)} for share in (1 / 16, 1 / 4))
+    small, large = (set(np.flatnonzero(rows_held_out(source, range(200), share))) for share in (1 / 16, 1 / 4))
     assert small < large
 
 
 def test_a_static_scene_is_split_by_views(make_source) -> None:
     source = make_source(200, moving=False)
-    held = sum(is_row_held_out(source, row, 1 / 4) for row in range(200))
+    held = sum(rows_held_out(source, range(200), 1 / 4))
     assert abs(held - 50) <= 3 * np.sqrt(200 * 3 / 16), "binomial, 3 σ"
 
 

@@ -12,7 +12,7 @@ import pytest
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.trainer.curve import Level, learning_curve
-from photonfarm.trainer.dataset import is_row_held_out
+from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.loop import SETTINGS, train
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.store_source import StoreSource
@@ -61,10 +61,11 @@ def test_the_samples_of_a_store_reach_the_trainer(scene, commit) -> None:
     one, other = source.read(int(rows[0])), source.read(int(rows[1]))
     assert one.radiance.shape == (2, 16, 16, 3)
     assert not np.array_equal(one.radiance[0], one.radiance[1])
-    assert source.view_key(int(rows[0])) == source.view_key(int(rows[1])), "two passes of one view"
-    assert source.view_key(int(rows[0])) != source.view_key(int(rows[2]))
+    keys = source.view_keys(rows.tolist())
+    assert keys[0] == keys[1], "two passes of one view"
+    assert keys[0] != keys[2]
     np.testing.assert_array_equal(one.buffers.depth, other.buffers.depth)
-    assert len({is_row_held_out(source, int(row), 0.5) for row in rows[:4]}) == 1
+    assert len(set(rows_held_out(source, rows[:4].tolist(), 0.5))) == 1
 
 
 def test_a_store_without_the_scene_is_not_ready(tmp_path) -> None:
@@ -92,7 +93,7 @@ def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene,
     source = StoreSource(scene.folder.parent.parent, scene.scene_id)
     shares = np.linspace(0.01, 0.9, 90)
     rows = source.refresh()
-    share = next(s for s in shares if sum(is_row_held_out(source, int(row), s) for row in rows) == 2)
+    share = next(s for s in shares if sum(rows_held_out(source, rows.tolist(), s)) == 2)
     store = scene.folder.parent.parent
     train(StoreSource(store, scene.scene_id), tiny(max_steps=1, hold_out=share, minimum_samples=1), run)
     settings = json.loads((run / SETTINGS).read_text())

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.keys import Key, make_key
-from photonfarm.shared.modification import Modification, rest
+from photonfarm.shared.keys import Key, encoded, key_of
+from photonfarm.shared.modification import rest
 from photonfarm.shared.plan import SHARD_ROWS, Known, PlannedRows, Request, expand
+from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.scene import SceneSpec
 
 
@@ -23,7 +24,7 @@ def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Re
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
     keys = {key for rows in _planned(spec, store, wanted) for key in _units(spec, rows)}
-    held_out = sum(is_held_out(key, share) for key in keys)
+    held_out = sum(are_held_out(keys, share))
     found = f"hold_out = {share:g}: of the {len(keys)} {'configurations' if spec.groups else 'views'} planned"
     if not held_out:
         raise SpecError(f"{found} none is held out, and one is needed to validate on; raise it, or plan more")
@@ -31,9 +32,13 @@ def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Re
         raise SpecError(f"{found} all are held out, and none is left to train on; lower it, or plan more")
 
 
-def is_held_out(unit: Key, share: float) -> bool:
-    """Whether what has this key is kept from training: a configuration or, of a static scene, a view."""
-    return int.from_bytes(make_key("hold out", unit)[:8], "little") < share * 2.0**64
+def are_held_out(units: Iterable[Key], share: float) -> list[bool]:
+    """Whether what has these keys is kept from training: configurations or, of a static scene, views.
+
+    That is, whether the first 8 bytes of the content key ("hold out", unit) are below the share.
+    """
+    begin, limit = encoded("hold out"), share * 2.0**64
+    return [int.from_bytes(key_of(begin + encoded(unit))[:8], "little") < limit for unit in units]
 
 
 def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> Iterator[PlannedRows]:
@@ -48,10 +53,10 @@ def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> Iterator[Pl
         yield new
 
 
-def _units(spec: SceneSpec, rows: PlannedRows) -> Iterator[Key]:
+def _units(spec: SceneSpec, rows: PlannedRows) -> list[Key]:
     """The keys of the configurations in these rows; of a static scene, those of its views."""
     if spec.groups:
         vectors = rows.modification[~np.isnan(rows.modification).any(axis=(1, 2))]
-        return (Modification.from_vector(vector).key(spec.scene_id) for vector in vectors)
-    configuration = rest(spec).key(spec.scene_id)
-    return (make_key("view", configuration, view) for view in rows.view[~np.isnan(rows.view).any(axis=1)])
+        return modification_keys(spec, vectors)
+    views = rows.view[~np.isnan(rows.view).any(axis=1)]
+    return view_keys([rest(spec).key(spec.scene_id)] * len(views), views)

@@ -36,6 +36,11 @@ def key_of(encoded_parts: bytes) -> Key:
     return hashlib.blake2b(encoded_parts, digest_size=KEY_BYTES).digest()
 
 
+def view_key(modification_key: Key, view: NDArray[np.float32]) -> Key:
+    """The content key of a view of a configuration; `view` is the view's vector (6,)."""
+    return make_key("view", modification_key, view)
+
+
 def _encode(part: Part) -> tuple[bytes, bytes]:
     match part:
         case str():

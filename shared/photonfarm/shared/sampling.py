@@ -48,6 +48,13 @@ def modification_keys(spec: SceneSpec, vectors: F32) -> list[Key]:
     return [key_of(begin + vector) for vector in encoded_rows(vectors)]
 
 
+def view_keys(modification_keys: list[Key], vectors: F32) -> list[Key]:
+    """The content keys of views (N, 6), as `keys.view_key` makes them, of N configurations."""
+    begin = encoded("view")
+    views = zip(modification_keys, encoded_rows(vectors), strict=True)
+    return [key_of(begin + encoded(key) + vector) for key, vector in views]
+
+
 def view_vectors(spec: SceneSpec, modification_keys: list[Key], seed: int, indices: NDArray[np.int64]) -> F32:
     """The vectors of views of configurations, (N, 6): `indices` has the number of each view within its own."""
     vectors = np.empty((len(indices), 6), np.float32)

@@ -137,16 +137,30 @@ def submission(result: Submission, as_json: bool) -> None:
 
 
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
-    """The store's scenes, and the queue where there is one; raises StoreError at the end if a scene cannot be read."""
+    """The store's scenes, and the queue where there is one.
+
+    Raises StoreError at the end if a scene or a marker cannot be read.
+    """
     from photonfarm.shared.errors import StoreError
     from photonfarm.shared.store import Store, store_status
 
     opened = Store(store)
     scenes = [asdict(scene) for scene in store_status(opened)]
     _status(opened, scenes, redis_url, as_json)
-    if unreadable := [s for s in scenes if s["error"]]:
-        said = "; ".join(s["error"] for s in unreadable)
-        raise StoreError(f"{len(unreadable)} of {len(scenes)} scenes cannot be read: {said}")
+    unread = []
+    if unreadable := [s["error"] for s in scenes if s["error"]]:
+        unread.append(f"{len(unreadable)} of {len(scenes)} scenes cannot be read: {'; '.join(unreadable)}")
+    unread += [f"scene {s['scene_id']}: {_unread_markers(s)}" for s in scenes if s["markers_unreadable"]]
+    if unread:
+        raise StoreError("; ".join(unread))
+
+
+def _unread_markers(scene: Mapping[str, Any]) -> str:
+    """What is said of a scene with markers that cannot be read."""
+    return (
+        f"{scene['markers_unreadable']} of {scene['jobs_committed']} markers cannot be read, and size, core time and "
+        f"redrawn leave them out: {scene['marker_error']}; `photonfarm store check` names each"
+    )
 
 
 def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json: bool) -> None:
@@ -180,6 +194,8 @@ def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json
     for s in scenes:
         if s["error"]:
             click.echo(f"{s['name']} {s['scene_id']}: cannot be read: {s['error']}")
+        if s["markers_unreadable"]:
+            click.echo(f"{s['name']} {s['scene_id']}: {_unread_markers(s)}")
     click.echo()
     if found is None:
         click.echo(f"queue: {absent}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from photonfarm.shared.store.check import Progress as Tell
 from photonfarm.shared.store.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.find import FoundSample, Matches
 from photonfarm.shared.store.findings import Finding, Group, Remedy
+from photonfarm.shared.store.merge import Merged
 
 
 @contextlib.contextmanager
@@ -133,6 +134,22 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
     if not matches.count:
         near = "" if matches.nearest is None else f"; the nearest is {matches.nearest:g} scene units away"
         click.echo(f"no sample fits{near}", err=True)
+
+
+def merged(views: Iterable[tuple[str, Merged]], folder: Path, as_json: bool) -> None:
+    """Write merged views into a folder, and tell of each; raises StoreError if there is none."""
+    written = []
+    for key, view in views:
+        file = folder / f"{key}.npz"
+        view.write(file)
+        mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
+        written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})
+        if not as_json:
+            click.echo(f"{file}: {view.passes} passes, mean {mean:.4g}, standard error of a value {error:.2g} (RMS)")
+    if as_json:
+        click.echo(json.dumps(written, indent=2))
+    if not written:
+        raise StoreError("no complete sample fits; `photonfarm store find` shows what there is")
 
 
 def _sample(sample: FoundSample, store: str | Path) -> None:

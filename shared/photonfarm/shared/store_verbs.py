@@ -86,3 +86,40 @@ def find(
     query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     show_store.found(find_samples(opened, ids, query, limit=limit), store, as_json)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
+@click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
+@click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="A folder.")
+@json_option
+def merge(
+    store: str | Path,
+    scene: str | None,
+    modification: str | None,
+    view: str | None,
+    row: int | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Merge all complete passes of views into reference images: FOLDER/<view key>.npz.
+
+    Each is a NumPy archive of `mean`, `m2`, `half_a`, `half_b` and `standard_error`, (H, W, 3) float64 linear radiance,
+    and the number of `passes`, of two independent halves each. Exact, and the same in any order; merge again when more
+    passes have arrived. Without conditions all views are merged.
+    """
+    from photonfarm.shared import show_store
+    from photonfarm.shared.store import Store, store_errors
+    from photonfarm.shared.store.find import Query, scene_named
+    from photonfarm.shared.store.merge import merge_views
+
+    opened = Store(store)
+    query = Query.of(modification=modification, view=view, row=row)
+    with store_errors("make the folder", out):
+        out.mkdir(parents=True, exist_ok=True)
+    ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
+    merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query))
+    show_store.merged(merged, out, as_json)

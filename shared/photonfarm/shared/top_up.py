@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.hold_out import is_held_out
-from photonfarm.shared.keys import KEY_BYTES, Key, make_key
+from photonfarm.shared.hold_out import are_held_out
+from photonfarm.shared.keys import KEY_BYTES, Key
 from photonfarm.shared.plan import MAX_SAMPLES, UNUSED, Candidates, Expansion, Known, PlannedRows, Request, pack
-from photonfarm.shared.sampling import modification_keys, sample_keys
+from photonfarm.shared.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene import Frozen, SceneSpec, sentences
 
 HELD_OUT = 0.125
@@ -179,7 +179,7 @@ def _with_view(spec: SceneSpec, planned: _Planned, begin: str, selected: Mask) -
 
 def _held_out(spec: SceneSpec, planned: _Planned, share: float, selected: Mask) -> Mask:
     units = (_modification_keys if spec.groups else _view_keys)(spec, planned, selected)
-    return _where(selected, [is_held_out(unit, share) for unit in units])
+    return _where(selected, are_held_out(units, share))
 
 
 def _where(selected: Mask, found: list[bool]) -> Mask:
@@ -195,10 +195,8 @@ def _modification_keys(spec: SceneSpec, planned: _Planned, selected: Mask) -> li
 
 
 def _view_keys(spec: SceneSpec, planned: _Planned, selected: Mask) -> list[Key]:
-    """The content keys of views, as `SceneReader.view_key` makes them."""
     views = planned.vectors("view", planned.view_row[selected])
-    of_view = _modification_keys(spec, planned, selected)
-    return [make_key("view", key, view) for key, view in zip(of_view, views, strict=True)]
+    return view_keys(_modification_keys(spec, planned, selected), views)
 
 
 Condition = tuple[Callable[[SceneSpec, _Planned, Any, Mask], Mask], Any]

@@ -98,12 +98,13 @@ class ShardRenderer:
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit one job; False if it was committed already, or by another worker meanwhile.
 
+        False too if a repair took its files meanwhile: it is missing then, and comes again.
+
         Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
         the planned one, IncompleteError if renders stay non-finite or buffers are.
         """
-        if scene_id not in self._store.scene_ids() or job >= self._store.scene(scene_id).jobs():
+        if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
-        stored = self._store.scene(scene_id)
         if stored.is_committed(job):
             return False
         stored, scene = self._scene(scene_id)
@@ -121,11 +122,10 @@ class ShardRenderer:
             )
             committed = out.commit(figures)
         if not committed:
-            log.warning(
-                "scene %s, job %d: was committed by another worker while it was rendered here; that one stays",
-                scene_id,
-                job,
-            )
+            what = "was committed by another worker while it was rendered here; that one stays"
+            if not stored.is_committed(job):
+                what = "its files were set aside by a repair while it was committed here; it will be rendered again"
+            log.warning("scene %s, job %d: %s", scene_id, job, what)
         return committed
 
     def _scene(self, scene_id: str) -> tuple[SceneStore, SceneRenderer]:
@@ -133,10 +133,11 @@ class ShardRenderer:
             self._scenes[scene_id] = self._scenes.pop(scene_id)
         else:
             stored = self._store.scene(scene_id)
+            spec = located(stored.spec)  # before another scene is let go for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
             gc.collect()  # Dr.Jit finds no kernel in its cache while an older scene is still half alive
-            self._scenes[scene_id] = stored, self._load(located(stored.spec))
+            self._scenes[scene_id] = stored, self._load(spec)
         return self._scenes[scene_id]
 
 

@@ -5,6 +5,7 @@ Shape letters: B batch, P points, H W image.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.shared.hold_out import is_held_out
+from photonfarm.shared.hold_out import are_held_out
 from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
@@ -65,23 +66,23 @@ class SampleSource(Protocol):
     def read(self, row: int) -> Sample:
         """A complete row's sample; raises StoreError if it is not, or cannot be read."""
 
-    def modification_key(self, row: int) -> Key:
-        """The content key of a row's configuration."""
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration."""
 
-    def view_key(self, row: int) -> Key:
-        """The content key of a row's configuration and view."""
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration and view."""
 
     def planned(self) -> int:
         """The number of samples in all plans so far, complete or not."""
 
 
-def is_row_held_out(source: SampleSource, row: int, share: float) -> bool:
-    """Whether a row is kept from training, not by when it arrived but by what it is.
+def rows_held_out(source: SampleSource, rows: Sequence[int], share: float) -> list[bool]:
+    """Whether each row is kept from training, not by when it arrived but by what it is.
 
     All views and passes of a configuration are on one side. A static scene has one configuration; there the view
     decides, and all passes of a view are on one side.
     """
-    return is_held_out(source.modification_key(row) if source.spec.groups else source.view_key(row), share)
+    return are_held_out(source.modification_keys(rows) if source.spec.groups else source.view_keys(rows), share)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Self
 
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, is_row_held_out
+from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, rows_held_out
 from photonfarm.trainer.settings import TrainSettings
 
 
@@ -131,7 +131,7 @@ class Feed:
         self._here.update(rows)
         self._gone.update(gone)
         self._gone.difference_update(rows)
-        found = [(row, is_row_held_out(self._source, row, self._settings.hold_out)) for row in rows]
+        found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
         with self._lock:
             self._arrived.extend(found)
             self._complete = 0 < self._source.planned() <= len(self._here) + len(self._gone)

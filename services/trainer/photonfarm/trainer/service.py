@@ -59,7 +59,7 @@ def run(
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
-        with _consumption_told(redis_url, Store(store), scene_id) as count:
+        with _consumption_told(redis_url, store, scene_id) as count:
             outcome = train(source, settings, folder, stop=stop, listen=_tell, count=count, waited=waited)
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
@@ -140,11 +140,11 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _consumption_told(redis_url: str | None, store: Store, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+def _consumption_told(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
     """What takes draws and samples of training; Redis is told now and then, and at the end, how many have been used.
 
     By a thread. Each sample counts once, and held-out ones as soon as they are seen. A Redis that is not there is none
-    of our trouble; that it serves another store is said once.
+    of our trouble, nor a store that is not there yet; that it serves another store is said once.
     """
     told = _Told(redis_url, store, scene_id)
     ended = threading.Event()
@@ -166,8 +166,9 @@ def _consumption_told(redis_url: str | None, store: Store, scene_id: str) -> Ite
 class _Told:
     """What Redis is told of a scene's samples."""
 
-    def __init__(self, redis_url: str | None, store: Store, scene_id: str) -> None:
-        self._url, self._store, self._scene_id = redis_url, store, scene_id
+    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str) -> None:
+        self._url, self._root, self._scene_id = redis_url, store, scene_id
+        self._store: Store | None = None  # opened with the first figures: before training begins there may be none
         self._used: int | None = None  # a run that continues knows only once it has begun
         self._connection: Redis | None = None
         self._refused = False
@@ -184,13 +185,14 @@ class _Told:
 
         try:
             self._connection = self._connection or queue.connect(self._url)
+            self._store = self._store or Store(self._root)
             queue.check_served(self._connection, self._store)
             queue.tell_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
                 click.echo(f"no worker is told what is used: {error}", err=True)
             self._refused = True
-        except (QueueError, RedisError):
+        except (QueueError, RedisError, StoreError):
             pass
 
 

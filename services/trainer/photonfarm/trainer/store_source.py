@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +45,13 @@ class StoreSource:
         """A complete row's sample; raises CorruptError if its bytes are not what was committed."""
         return self._reader.read(row)
 
-    def modification_key(self, row: int) -> Key:
-        """The content key of a row's configuration."""
-        return self._reader.modification_key(row)
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration."""
+        return self._reader.modification_keys(rows)
 
-    def view_key(self, row: int) -> Key:
-        """The content key of a row's configuration and view."""
-        return self._reader.view_key(row)
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration and view."""
+        return self._reader.view_keys(rows)
 
     def planned(self) -> int:
         """The number of samples in all plans at the last refresh, complete or not."""

@@ -67,8 +67,9 @@ def _ask(connection: Redis, store: Store, how: str) -> None:
     if other:
         raise OtherStoreError(
             f"this Redis serves the store with the id {other}, and {store.storage.where} has the id {store.store_id}; "
-            "give the store that is meant (--store), or another database of Redis for this one (redis://host/1). If "
-            f"nobody works with the other store any more, this Redis is free in {-(-left_ms // 1000)} s"
+            "give the store that is meant (--store), or another database of Redis for this one (redis://host/1; with "
+            "`photonfarm up`, another --run). If nobody works with the other store any more, wait: this Redis is free "
+            f"by itself in {max(1, -(-left_ms // 1000))} s"
         )
 
 

@@ -16,8 +16,8 @@ Only what is read off is rounded, once: with n estimates, S₁ = Σ x and S₂ =
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,7 +27,11 @@ from numpy.typing import NDArray
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.records import F32
 from photonfarm.shared.store.batch import Batch
+from photonfarm.shared.store.query import Query
 from photonfarm.shared.store.reader import SceneReader
+from photonfarm.shared.store.scene_match import SceneMatch
+from photonfarm.shared.store.scene_store import SceneStore
+from photonfarm.shared.store.storage import store_errors
 
 F64 = NDArray[np.float64]
 
@@ -63,21 +67,17 @@ class Merged:
         return np.sqrt(self.m2 / (self.count * (self.count - 1)))
 
     def write(self, file: str | Path) -> None:
-        """Store it as a NumPy archive of its fields, with `standard_error`; raises ValueError for a name without .npz.
+        """Store it as a NumPy archive of its fields, with `standard_error`, whole or not at all.
 
-        NumPy would add it to any other name, and no picture format holds all of this.
+        Raises ValueError for a name without .npz, which NumPy would add to any other, and
+        StoreError where the disk refuses.
         """
-        if Path(file).suffix != ".npz":
+        if (path := Path(file)).suffix != ".npz":
             raise ValueError(f"{file}: a merged view is written as a NumPy archive; give it a name that ends in .npz")
-        np.savez(
-            file,
-            passes=self.passes,
-            mean=self.mean,
-            m2=self.m2,
-            half_a=self.half_a,
-            half_b=self.half_b,
-            standard_error=self.standard_error,
-        )
+        part = path.with_suffix(".partial.npz")
+        with store_errors("write a merged view", path):
+            np.savez(part, **asdict(self), standard_error=self.standard_error)
+            part.replace(path)
 
     @classmethod
     def read(cls, file: Path) -> Self:
@@ -205,6 +205,16 @@ def merge_rows(reader: SceneReader, rows: Iterable[int]) -> Moments:
         except ValueError as error:
             raise CorruptError(f"row {row}: {error}") from error
     return moments
+
+
+def merge_views(scene: SceneStore, query: Query) -> Iterator[tuple[str, Merged]]:
+    """The views that some complete sample of a query shows: their content keys, and all complete passes of each."""
+    reader = SceneReader(scene.storage.where, scene.scene_id)
+    complete = set(reader.refresh().tolist())
+    rows = [row for row in SceneMatch(scene, query).rows.tolist() if row in complete]
+    views = {reader.view_row(row): row for row in reversed(rows)}
+    for view_row, row in sorted(views.items()):
+        yield reader.view_key(row).hex(), merge_view(reader, view_row)
 
 
 def merge_view(reader: SceneReader, view_row: int) -> Merged:

@@ -16,6 +16,7 @@ from typing import BinaryIO, Self
 
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store.local import LocalStorage, sync
+from photonfarm.shared.store.storage import discard
 
 FOLDER_VARIABLE = "PHOTONFARM_CACHE"
 """Where copies and unfinished files lie; ~/.cache/photonfarm by default."""
@@ -76,7 +77,7 @@ class ObjectCache:
             sync(part, data_only=True)  # a copy that a power cut emptied would be taken for the object
             part.replace(copy)
         finally:
-            part.unlink(missing_ok=True)
+            discard(part)
 
     def part(self) -> Path:
         """A new path to write to, on the same file system."""

@@ -41,13 +41,13 @@ from obstore.exceptions import (
     UnauthenticatedError,
 )
 from obstore.store import from_url
+from zarr.abc.buffer import Buffer, BufferPrototype
 from zarr.abc.store import ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.store.object_cache import ObjectCache
-from photonfarm.shared.store.storage import STRAY_AGE_S, TMP
+from photonfarm.shared.store.storage import FORMAT_FILE, STRAY_AGE_S, TMP, discard
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion
@@ -157,13 +157,18 @@ class ObjectStorage:
             return patiently(lambda: obstore.head(self._objects, name)["size"])
 
     def names(self, folder: str) -> list[str]:
-        """The names right below a folder; none if it does not exist. A request per thousand of them."""
+        """The names right below a folder; none if it does not exist. A request per thousand of them.
+
+        Raises StoreError if the store is gone, which costs one more where there are none.
+        """
         try:
             with os_errors(folder):
                 found = patiently(lambda: obstore.list_with_delimiter(self._objects, folder or None))
         except FileNotFoundError:  # not even a bucket
-            return []
+            found = {"common_prefixes": [], "objects": []}
         paths = [*found["common_prefixes"], *(about["path"] for about in found["objects"])]
+        if folder and not paths:  # else it is asked whether there is anything at all
+            self.require()
         return [path.rpartition("/")[2] for path in paths]
 
     def zarr(self, folder: str) -> ObjectStore[Any]:
@@ -187,6 +192,7 @@ class ObjectStorage:
     def adopt_folder(self, part: Path, folder: str) -> bool:
         """Claim a folder's name and complete it; False if the name was taken, after completing what took it."""
         self.check()
+        self.require()
         if self.exists(f"{folder}/{ROOT}"):
             return False
         packed = self.part()
@@ -197,7 +203,7 @@ class ObjectStorage:
             else:
                 self._complete(folder, self._copy(claim_of(folder), anew=True))  # for good: not of a damaged copy
         finally:
-            packed.unlink(missing_ok=True)
+            discard(packed)
         return ours
 
     def _complete(self, folder: str, packed: Path) -> None:
@@ -307,7 +313,15 @@ class ObjectStorage:
         return contextlib.nullcontext()
 
     def require(self) -> None:
-        """Nothing: a bucket that cannot be reached is told from one without an object by every request."""
+        """Raise StoreError if the format file is not there: a bucket, or all below its prefix, that was deleted.
+
+        Costs a request. So of what is put only a folder asks for it, and a commit once for all of its files.
+        """
+        if not self.exists(FORMAT_FILE):
+            raise StoreError(
+                f"{self._url}: the store is gone (moved or deleted?): {FORMAT_FILE} is not there any more; bring it "
+                "back, then start again: what was committed in it needs nothing else"
+            )
 
 
 class _Group(ObjectStore[Any]):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import UNUSED, Expansion, Known, PlannedRows, Request, expand
+from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations, schema
 from photonfarm.shared.store.storage import Storage, store_errors
@@ -133,7 +134,8 @@ def build(
 ) -> None:
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
     import zarr
-    from zarr.storage import LocalStore
+
+    from photonfarm.shared.store.building import group_in
 
     count = len(rows.sample_modification)
     attributes: Any = {
@@ -144,10 +146,11 @@ def build(
         "jobs": count // shard_rows,
         "shard_rows": shard_rows,
     }
-    group = zarr.open_group(LocalStore(part), mode="w-", zarr_format=3, attributes=attributes)
-    for declared in declarations.PLAN_INPUTS:
-        schema.create_input(group, declared, getattr(rows, declared.name))
-    schema.create_outputs(group, spec, count, shard_rows)
+    with group_in(part) as store:
+        group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+        for declared in declarations.PLAN_INPUTS:
+            schema.create_input(group, declared, getattr(rows, declared.name))
+        schema.create_outputs(group, spec, count, shard_rows)
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
@@ -217,6 +220,16 @@ def view_at(plans: list[StoredPlan], row: int) -> View:
     """The view in a view row."""
     plan = plan_of(plans, row)
     return View.from_vector(plan.rows.view[row - plan.first_row])
+
+
+def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
+    """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
+    of_row = np.searchsorted([plan.first_row for plan in plans], rows, side="right") - 1
+    vectors = np.empty((len(rows), *getattr(plans[0].rows, kind).shape[1:]), np.float32)
+    for number, plan in enumerate(plans):
+        own = of_row == number
+        vectors[own] = getattr(plan.rows, kind)[rows[own] - plan.first_row]
+    return vectors
 
 
 def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from concurrent.futures import Executor, wait
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
-from photonfarm.shared.store.shards import Shard
+from photonfarm.shared.store.shards import Shard, copy_checked
 from photonfarm.shared.store.storage import FORMAT_FILE, open_storage, renew_copy, store_errors
 from photonfarm.shared.store.store import check_format
 from photonfarm.shared.view import View
@@ -44,6 +46,9 @@ class Sample:
     buffers: ViewBuffers
     pass_: int
 
+
+_PART = 16
+"""Samples of a batch that one thread reads at a time."""
 
 OPEN_SHARDS = 256
 """Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
@@ -124,11 +129,14 @@ class SceneReader:
 
     # ---------------------------------------------------------------------------------------------------------- samples
 
-    def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
+    def read_batch(
+        self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None, threads: Executor | None = None
+    ) -> Batch:
         """Complete samples in the order of `rows`, in the types they are stored in; every byte has been checked.
 
-        They are read into the first places of `out`, and what is returned is these; without, into new memory. Raises
-        CorruptError if their bytes are not what was committed; what `out` holds is then undefined.
+        They are read into the first places of `out`, and what is returned is these; without, into new memory. With
+        threads, several read at once. Raises CorruptError if their bytes are not what was committed; what `out` holds
+        is then undefined.
         """
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)
@@ -141,11 +149,15 @@ class SceneReader:
         batch.modification_rows[:] = self._modification_row[chosen]
         batch.wide.clear()
         with store_errors("read samples", self._storage.where):
-            for place, row in enumerate(chosen.tolist()):
-                self._read_radiance(row, place, batch)
-            for name, memory in batch.buffers.items():
-                for place, row in enumerate(batch.view_rows.tolist()):
-                    self._read_into(name, row, memory[place])
+            parts = [range(len(batch))[first : first + _PART] for first in range(0, len(batch), _PART)]
+            if threads is None:
+                for part in parts:
+                    self._read_part(batch, part)
+            else:
+                reading = [threads.submit(self._read_part, batch, part) for part in parts]
+                wait(reading)  # also where one fails: the memory is used again
+                for read in reading:
+                    read.result()
         return batch
 
     def read(self, row: int) -> Sample:
@@ -183,6 +195,11 @@ class SceneReader:
         rows = rows[rows < len(self._complete)]  # a plan may be younger than the last marker
         return rows[self._complete[rows]]
 
+    def view_row(self, row: int) -> int:
+        """The row of a sample's view: equal for all its passes."""
+        self._check_complete(np.array([row]))
+        return int(self._view_row[row])
+
     def modification_row(self, row: int) -> int:
         """The row of a sample's modification: equal for all samples of one configuration."""
         self._check_complete(np.array([row]))
@@ -192,11 +209,31 @@ class SceneReader:
         """The content key of a sample's configuration, by whose hash samples are held out."""
         return plans.modification_at(self._plans, self.modification_row(row)).key(self._scene_id)
 
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of the configurations of many samples, each hashed once."""
+        chosen = np.asarray(rows, np.int64)
+        self._check_complete(chosen)
+        if not len(chosen):
+            return []
+        distinct, place = np.unique(self._modification_row[chosen], return_inverse=True)
+        keys = modification_keys(self.spec, plans.vectors_at(self._plans, "modification", distinct))
+        return [keys[i] for i in place.tolist()]
+
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of the configurations and views of many samples, each hashed once."""
+        of_row = self.modification_keys(rows)
+        if not of_row:
+            return []
+        distinct, first, place = np.unique(self._view_row[np.asarray(rows)], return_index=True, return_inverse=True)
+        vectors = plans.vectors_at(self._plans, "view", distinct)
+        keys = view_keys([of_row[i] for i in first.tolist()], vectors)
+        return [keys[i] for i in place.tolist()]
+
     def view_key(self, row: int) -> Key:
         """The content key of a sample's configuration and view: equal for all passes of one view."""
         modification_key = self.modification_key(row)
         view = plans.view_at(self._plans, int(self._view_row[row]))
-        return make_key("view", modification_key, view.vector)
+        return view_key(modification_key, view.vector)
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud; raises StoreError while they are not there."""
@@ -212,13 +249,31 @@ class SceneReader:
         if not there.all():
             raise StoreError(f"row {int(rows[~there][0])} of scene {self._scene_id} is not complete")
 
-    def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
-        shard, within = self._shard("radiance", row)
-        if shard is not None and within in shard:
-            self._read_from(shard, "radiance", row, batch.radiance[place])
-            return
-        batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
-        batch.wide[place] = self._read("radiance_wide", row)
+    def _read_part(self, batch: Batch, part: range) -> None:
+        """Some places of a batch."""
+        self._read_radiance(batch, part)
+        for name, memory in batch.buffers.items():
+            for place in part:
+                self._read_into(name, int(batch.view_rows[place]), memory[place])
+
+    def _read_radiance(self, batch: Batch, part: range) -> None:
+        """What is mapped is looked up first, then copied."""
+        mapped: dict[int, tuple[NDArray[np.uint8], int]] = {}  # by place
+        for place in part:
+            row = int(batch.rows[place])
+            shard, within = self._shard("radiance", row)
+            if shard is None or within not in shard:
+                batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
+                batch.wide[place] = self._read("radiance_wide", row)
+            elif (found := shard.mapped(within)) is not None:
+                mapped[place] = found
+            else:
+                self._read_from(shard, "radiance", row, batch.radiance[place])
+        memory = batch.radiance.reshape(len(batch), -1).view(np.uint8)
+        checksums = copy_checked([content for content, _ in mapped.values()], [memory[place] for place in mapped])
+        for (place, (_, expected)), checksum in zip(mapped.items(), checksums, strict=True):
+            if checksum != expected:
+                self._read_into("radiance", int(batch.rows[place]), batch.radiance[place])
 
     def _read(self, name: str, row: int) -> NDArray[Any]:
         array = self._arrays[name]

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.plan import UNUSED
 from photonfarm.shared.records import F32
-from photonfarm.shared.sampling import modification_keys
+from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.store import plans, schema
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.query import Query
@@ -127,7 +127,7 @@ class SceneMatch:
         seen, first = np.unique(view, return_index=True)  # by some sample
         of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
         keys = modification_keys(self._scene.spec, of_view)
-        return _unless_equal([make_key("view", key, vector) for key, vector in zip(keys, vectors, strict=True)], wanted)
+        return _unless_equal(view_keys(keys, vectors), wanted)
 
     # ------------------------------------------------------------------------------------------------------- describing
 
@@ -154,7 +154,7 @@ class SceneMatch:
             modification_key=key.hex(),
             modification=tuple(tuple(map(float, group)) for group in modification.vector),
             view_row=sample.view_row,
-            view_key=make_key("view", key, view.vector).hex(),
+            view_key=view_key(key, view.vector).hex(),
             view=tuple(map(float, view.vector)),
             distance=distance,
             plan=plan.number,

@@ -5,9 +5,7 @@ Plans and markers are the truth. Nothing here needs a lock: a name appears once,
 
 from __future__ import annotations
 
-import asyncio
 import shutil
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -28,9 +26,6 @@ from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import TopUp
 
 SCENES = "scenes"
-
-_removing = threading.Lock()
-"""One thread at a time waits for the tasks of others; two would wait for each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +96,7 @@ class SceneStore:
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         return PlanResult(self.scene_id, len(found), expansion.new, expansion.known, jobs)
                 finally:
-                    remove_built(built)
+                    shutil.rmtree(built, ignore_errors=True)
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -173,7 +168,7 @@ class SceneStore:
                 _build_base(built, {"geometry": geometry, "cloud": cloud})
                 self.storage.adopt_folder(built, f"{self.name}/base")
             finally:
-                remove_built(built)
+                shutil.rmtree(built, ignore_errors=True)
 
 
 def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
@@ -192,31 +187,17 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
     return spec
 
 
-def remove_built(built: Path) -> None:
-    """Remove what was built of a folder, if it is still there.
-
-    Where the disk refuses one of several files, zarr-python raises at once and goes on with the others: these are
-    waited for, as they would make the folder again.
-    """
-    from zarr.core.sync import sync
-
-    async def others() -> None:
-        await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()}, return_exceptions=True)
-
-    with _removing:
-        sync(others())
-    shutil.rmtree(built, ignore_errors=True)
-
-
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:
     import zarr
-    from zarr.storage import LocalStore
 
-    root = zarr.open_group(LocalStore(folder), mode="w-", zarr_format=3, attributes=declarations.stamp())
-    for name, record in records.items():
-        group = root.create_group(name, attributes=declarations.stamp())
-        for declared in declarations.BASE[name]:
-            schema.create_input(group, declared, getattr(record, declared.name))
+    from photonfarm.shared.store.building import group_in
+
+    with group_in(folder) as store:
+        root = zarr.open_group(store, mode="w-", zarr_format=3, attributes=declarations.stamp())
+        for name, record in records.items():
+            group = root.create_group(name, attributes=declarations.stamp())
+            for declared in declarations.BASE[name]:
+                schema.create_input(group, declared, getattr(record, declared.name))
 
 
 def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:

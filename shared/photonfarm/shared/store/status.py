@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
-from photonfarm.shared.errors import StoreError
+from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.store.scene_store import SceneStore
-from photonfarm.shared.store.store import Store
+from photonfarm.shared.store.store import Store, check_format
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +24,8 @@ class SceneStatus:
     size_bytes: int  # of the committed outputs
     core_s: float  # processor time of the committed jobs
     redrawn: int  # renders thrown away for a non-finite value
+    markers_unreadable: int  # of committed jobs whose bytes, time and redrawn renders are not counted
+    marker_error: str | None  # why the first of these cannot be read
     error: str | None = None  # why nothing is known of it; all numbers are 0 then
 
 
@@ -37,11 +39,12 @@ _BLOCK = 256
 def store_status(store: Store) -> list[SceneStatus]:
     """The status of every scene; reads every marker, and holds few of them at a time.
 
-    A scene that cannot be read says why, by its `error`. Raises StoreError if the store cannot be read.
+    A scene that cannot be read says why, by its `error`, and markers that cannot be are counted by themselves. Raises
+    StoreError if the store cannot be read.
     """
     known, failed = store.each(_scene_status)
     for scene_id, error in failed.items():
-        known[scene_id] = SceneStatus(scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, str(error))
+        known[scene_id] = SceneStatus(scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, 0, None, str(error))
     return [known[scene_id] for scene_id in sorted(known)]
 
 
@@ -58,7 +61,10 @@ def _scene_status(scene: SceneStore) -> SceneStatus:
     committed = sorted(scene.committed_jobs())
     with ThreadPoolExecutor(_READERS) as readers:
         blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
-        sums = list(readers.map(partial(_sums, scene), blocks))
+        sums = list(readers.map(partial(_summed, scene), blocks))
+    errors = [each.error for each in sums if each.error]
+    if any(not isinstance(error, CorruptError) for error in errors):
+        check_format(scene.storage)
     return SceneStatus(
         scene.scene_id,
         scene.spec.name,
@@ -66,18 +72,36 @@ def _scene_status(scene: SceneStore) -> SceneStatus:
         progress.committed_samples,
         scene.jobs(),
         len(committed),
-        sum(size_bytes for size_bytes, _, _ in sums),
-        sum((core_s for _, core_s, _ in sums), 0.0),
-        sum(redrawn for _, _, redrawn in sums),
+        sum(each.size_bytes for each in sums),
+        sum((each.core_s for each in sums), 0.0),
+        sum(each.redrawn for each in sums),
+        sum(each.unreadable for each in sums),
+        str(errors[0]) if errors else None,
     )
 
 
-def _sums(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int]:
-    """Bytes, processor seconds and renders thrown away of some committed jobs."""
-    size_bytes, core_s, redrawn = 0, 0.0, 0
+@dataclass(slots=True)
+class _Sums:
+    """What the markers of some committed jobs tell."""
+
+    size_bytes: int = 0
+    core_s: float = 0.0
+    redrawn: int = 0
+    unreadable: int = 0  # markers
+    error: StoreError | None = None  # of the first of these
+
+
+def _summed(scene: SceneStore, jobs: list[int]) -> _Sums:
+    sums = _Sums()
     for job in jobs:
-        marker = scene.marker(job)
-        size_bytes += sum(file["size"] for file in marker["files"].values())
-        core_s += marker["figures"]["core_s"]
-        redrawn += marker["figures"]["redrawn"]
-    return size_bytes, core_s, redrawn
+        try:
+            marker = scene.marker(job)
+        except StoreError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):  # else a repair has moved it since it was listed
+                sums.unreadable += 1
+                sums.error = sums.error or error
+            continue
+        sums.size_bytes += sum(file["size"] for file in marker["files"].values())
+        sums.core_s += marker["figures"]["core_s"]
+        sums.redrawn += marker["figures"]["redrawn"]
+    return sums

@@ -142,6 +142,16 @@ def is_vacant(root: str | Path) -> bool:
         return set(storage.names("")) <= {TMP}
 
 
+def discard(part: Path) -> None:
+    """Remove a part's file if it is still there; where the disk refuses that, a sweep does it later.
+
+    So that what is told is the error that is under way, and a name that has been given is not taken for one that is
+    not.
+    """
+    with contextlib.suppress(OSError):
+        part.unlink(missing_ok=True)
+
+
 def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
     """Store a JSON document durably under a new name; False if the name was taken, which keeps what is there."""
     part = storage.part()
@@ -149,7 +159,7 @@ def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
         part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         placed = storage.adopt(part, name)
     finally:
-        part.unlink(missing_ok=True)
+        discard(part)
     storage.settle([name])
     return placed
 

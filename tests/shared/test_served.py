@@ -1,0 +1,60 @@
+"""A Redis whose store nobody works with any more is free by itself, and says when."""
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import redis
+
+from photonfarm.shared import queue
+from photonfarm.shared.queue import connect
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import Store
+
+
+@pytest.fixture
+def connection(tmp_path: Path) -> Iterator[redis.Redis]:
+    with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connected:
+        yield connected
+
+
+def refusal(connection: redis.Redis, store: Store) -> str:
+    with pytest.raises(queue.OtherStoreError) as caught:
+        queue.serve(connection, store)
+    return str(caught.value)
+
+
+def seconds_told(said: str) -> int:
+    told = re.search(r"wait: this Redis is free by itself in (\d+) s$", said)
+    assert told is not None, said
+    return int(told[1])
+
+
+def test_another_store_takes_over_when_the_time_that_it_was_told_is_over(
+    connection: redis.Redis, tmp_path: Path
+) -> None:
+    """Of an owner that was killed, whose heartbeat and whose word stay behind."""
+    store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
+    queue.serve(connection, store)
+    queue.beat(connection, "killed", "elsewhere", None, ttl_s=3600)
+    assert 110 <= seconds_told(refusal(connection, other)) <= 120
+    connection.pexpire(queue.SERVED, 1500)
+    left_s = seconds_told(refusal(connection, other))
+    assert left_s in (1, 2)
+    time.sleep(left_s)
+    queue.check_served(connection, other)
+    queue.serve(connection, other)
+    assert other.store_id in refusal(connection, store)
+
+
+def test_the_embedded_redis_of_a_run_remembers_its_store_and_the_time_that_is_left(tmp_path: Path) -> None:
+    """So `photonfarm up` with another store in the same --run, after one that was killed, waits no longer than that."""
+    store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
+    with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connection:
+        queue.serve(connection, store)
+        connection.expire(queue.SERVED, 60)
+    with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connection:
+        assert 0 < seconds_told(refusal(connection, other)) <= 60
+        queue.serve(connection, store)

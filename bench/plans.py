@@ -179,6 +179,8 @@ def run(job: str, options: argparse.Namespace, folder: Path, redis_url: str) -> 
 
 
 def page(rows: list[Row], sizes: dict[str, int], options: argparse.Namespace) -> str:
+    from photonfarm.shared import queue
+
     lines = [
         [
             row.step,
@@ -192,6 +194,7 @@ def page(rows: list[Row], sizes: dict[str, int], options: argparse.Namespace) ->
         if row.step in ABOUT
     ]
     header = ["step", "what", "time, s", "processor time, s", "wanted, s", "peak memory of its process, MB"]
+    limit = ", which is the limit" if sizes["queued_jobs"] == queue.QUEUE_LIMIT else ""
     redis_mb = (sizes["redis_bytes"] - sizes["redis_empty_bytes"]) / 1e6
     return f"""# A plan of {options.samples:,} samples
 
@@ -201,8 +204,8 @@ one), on a warm cache.
 
 {results.table(header, lines)}
 
-With {sizes["queued_jobs"]:,} jobs queued, which is the limit, Redis holds {redis_mb:.1f} MB more than empty (wanted:
-< 50). The stored plan takes {sizes["plan_bytes"] / 1e6:.0f} MB.
+With {sizes["queued_jobs"]:,} jobs queued{limit}, Redis holds {redis_mb:.1f} MB more than empty (wanted: < 50). The
+stored plan takes {sizes["plan_bytes"] / 1e6:.0f} MB.
 
 {results.footer("plans")}"""
 

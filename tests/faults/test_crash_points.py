@@ -12,19 +12,24 @@ from types import ModuleType
 import pytest
 
 from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.worker_settings import WorkerSettings
 from photonfarm.shared.plan import Request
+from photonfarm.shared.queue import connect, job_name, open_queue, put_back, queue_status, reconcile
+from photonfarm.shared.queue.job import queued_names, running_names, taken_names
+from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """
 import importlib.util, os, sys
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import JobWriter, Store
 from photonfarm.renderer.jobs import ShardRenderer
 spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
 analytic = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(analytic)
 
 function, count, when = sys.argv[4], int(sys.argv[5]), sys.argv[6]
-plain = getattr(os, function)
+owner = JobWriter if function == "commit" else os
+plain = getattr(owner, function)
 
 def dying(*args, **kwargs):
     global count
@@ -39,7 +44,7 @@ def dying(*args, **kwargs):
 renderer = ShardRenderer(Store(sys.argv[2]), worker="doomed", load=analytic.AnalyticScene.load)
 if sys.argv[3] != "base":
     Store(sys.argv[2]).scenes()[0].write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
-setattr(os, function, dying)
+setattr(owner, function, dying)
 if sys.argv[3] == "plan":
     from photonfarm.shared.plan import Request
     Store(sys.argv[2]).plan(analytic.small_spec(), Request(modifications=9))
@@ -47,9 +52,11 @@ else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)
 """
 
-# A commit of this job writes 9 arrays and the marker: a link each.
+# A commit of this job writes 9 arrays and the marker: a link each, once what it links is synced.
 POINTS = {
-    "after the first temporary file": ("commit", "fdatasync", 1, "after"),
+    "after render, before the commit": ("commit", "commit", 1, "before"),
+    "after the temporary files, before the first is synced": ("commit", "fdatasync", 1, "before"),
+    "after the first temporary file is synced": ("commit", "fdatasync", 1, "after"),
     "in the middle, before a link": ("commit", "link", 5, "before"),
     "in the middle, after a link": ("commit", "link", 5, "after"),
     "after all files, before the folders are synced": ("commit", "fsync", 1, "before"),
@@ -61,26 +68,37 @@ POINTS = {
 }
 
 
+NAMED = {
+    "in the middle, before a link": 4,
+    "in the middle, after a link": 5,
+    "after all files, before the folders are synced": 9,
+    "before the marker": 9,
+    "after the marker": 9,
+}
+"""Files of the job that have their names by then; at all other points none has."""
+
+
 def crash(analytic: ModuleType, store: Path, *point: object) -> None:
     command = [sys.executable, "-c", COMMIT, analytic.__spec__.origin, str(store), *map(str, point)]
     assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize("point", POINTS.values(), ids=POINTS.keys())
+@pytest.mark.parametrize("where", POINTS)
 def test_a_writer_killed_at_any_point_leaves_all_or_nothing(
     analytic: ModuleType,
     planned: Callable[..., SceneStore],
     clean_bytes: Callable[[int], dict[str, bytes]],
     stored_bytes: Callable[[SceneStore], dict[str, bytes]],
-    point: tuple[str, str, int, str],
+    where: str,
 ) -> None:
     scene = planned(1)
-    root = scene.folder.parent.parent
-    crash(analytic, root, *point)
+    root, before = scene.folder.parent.parent, stored_bytes(scene)
+    crash(analytic, root, *POINTS[where])
+    named = [name for name in stored_bytes(scene).keys() - before.keys() if name.startswith("plans/")]
+    assert len(named) == NAMED.get(where, 0)
 
     reader = SceneReader(root, scene.scene_id)
-    after_marker = point == POINTS["after the marker"]
-    assert reader.refresh().size == (2 if after_marker else 0)
+    assert reader.refresh().size == (2 if where == "after the marker" else 0)
     for row in reader.rows:
         reader.read(int(row))
     renderer = ShardRenderer(Store(root), worker="next", load=analytic.AnalyticScene.load)
@@ -89,6 +107,76 @@ def test_a_writer_killed_at_any_point_leaves_all_or_nothing(
     assert stored_bytes(scene) == clean_bytes(1)
     Store(root).sweep(stray_age_s=0)
     assert list(scene.storage.local("tmp").iterdir()) == []
+
+
+CHILD = """
+import importlib.util, os, sys
+from photonfarm.renderer import jobs, worker_child
+spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
+analytic = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(analytic)
+plain = jobs.ShardRenderer.render
+
+def dying(*args):
+    if plain(*args):
+        os.kill(os.getpid(), 9)
+
+jobs.ShardRenderer.render = dying
+sys.exit(worker_child.child(analytic.AnalyticScene.load))
+"""
+
+
+def kill_before_acknowledgement(analytic: ModuleType, root: Path, url: str) -> None:
+    """A worker's child, with nobody who would start it again, dies once it has committed its first job."""
+    settings = WorkerSettings(store=str(root), redis_url=url, name="doomed", heartbeat_ttl_s=1.0, reserve_bytes=0)
+    command = [sys.executable, "-c", CHILD, analytic.__spec__.origin]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
+        child.stdin.write(settings.model_dump_json().encode() + b"\n")
+        child.stdin.flush()  # and left open: its end would tell the child that its supervisor is gone
+        assert child.wait(60) == -signal.SIGKILL
+
+
+def files_of(scene: SceneStore) -> dict[str, tuple[bytes, int, int]]:
+    """Every file of a scene, markers as well: its bytes, and which file it is, and since when."""
+    files = [path for path in scene.folder.rglob("*") if path.is_file()]
+    return {str(path): (path.read_bytes(), path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="the worker's child finds its memory through /proc")
+@pytest.mark.parametrize("comes_again", [False, True], ids=["left in Redis", "given out again"])
+def test_a_job_whose_worker_dies_before_redis_learns_of_its_end_stays_as_it_was_committed(
+    analytic: ModuleType,
+    planned: Callable[..., SceneStore],
+    clean_bytes: Callable[[int], dict[str, bytes]],
+    stored_bytes: Callable[[SceneStore], dict[str, bytes]],
+    redis_server: EmbeddedRedis,
+    comes_again: bool,
+) -> None:
+    """It may be given out again: who fills the queue reads the markers first, and the job may end in between."""
+    scene = planned(2)
+    root, connection = scene.folder.parent.parent, connect(redis_server.url)
+    reconcile(Store(root), connection)
+    kill_before_acknowledgement(analytic, root, redis_server.url)
+    assert scene.committed_jobs() == {0}
+    queue, name = open_queue(connection), job_name(scene.scene_id, 0)
+    assert [entry.decode().partition(":")[0] for entry in running_names(queue)] == [name], "RQ holds it to be running"
+    committed = files_of(scene)
+    if comes_again:
+        put_back(queue, name)
+
+    with analytic.start_worker(root, redis_server.url, analytic.command(), name="next") as worker:
+        try:
+            analytic.wait_for(lambda: not (queued_names(queue) or taken_names(queue) or running_names(queue)))
+        finally:
+            worker.terminate()
+        told = worker.stderr.read().decode()
+        assert worker.wait(20) == 0, told
+    assert "failed" not in told
+    assert {name: file for name, file in files_of(scene).items() if name in committed} == committed
+    assert scene.marker(0)["figures"]["worker"] == "doomed"
+    assert scene.marker(1)["figures"]["worker"] == "next"
+    assert stored_bytes(scene) == clean_bytes(2)
+    assert queue_status(connection).failed == {}
 
 
 @pytest.mark.parametrize("point", [("fsync", 5, "before"), ("rename", 1, "before"), ("rename", 1, "after")])

@@ -50,7 +50,7 @@ def test_a_worker_renders_what_is_whole_and_then_ends_with_the_error_of_what_is_
 def test_the_pace_of_the_trainer_is_that_of_the_scenes_that_can_be_read(
     scenes: tuple[SceneStore, SceneStore], redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    assert TrainerPace(Store(tmp_path / "store"), connect(redis_server.url), 4.0).reason() is None
+    assert TrainerPace(Store(tmp_path / "store"), connect(redis_server.url), 4.0).ahead() == {}
 
 
 def empty(marker: Path) -> None:

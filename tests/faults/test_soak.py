@@ -1,23 +1,100 @@
-"""A short soak; the long one of the same kind is `make bench-soak`."""
+"""A short soak, and that a soak tells what is wrong; the long one of the same kind is `make bench-soak`."""
 
 import importlib.util
+import json
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-_spec = importlib.util.spec_from_file_location("soak", Path(__file__).with_name("soak.py"))
-soak = importlib.util.module_from_spec(_spec)
+from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.markers import name_of
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
 
+@pytest.fixture(scope="module")
+def soak() -> ModuleType:
+    """The module `soak`."""
+    spec = importlib.util.spec_from_file_location("soak", Path(__file__).with_name("soak.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.mark.timeout(300)
-def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(tmp_path: Path) -> None:
-    _spec.loader.exec_module(soak)
-    wanted = soak.Toll(kills=8, stops=4, redis_kills=2, flushes=1, submitters=1)
-    found = soak.Soak(tmp_path, jobs=60, workers=3, pause_s=0.02, seed=1).run(
-        wanted, pace_s=(0.3, 0.9), long_outage_s=4.0
+def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(soak: ModuleType, tmp_path: Path) -> None:
+    wanted = soak.Toll(kills=4, supervisor_kills=1, races=2, redis_kills=2, flushes=1, submitters=1)
+    found = soak.Soak(tmp_path, jobs=40, workers=3, pause_s=0.02, seed=1).run(
+        wanted, pace_s=(0.1, 0.4), long_outage_s=2.0
     )
-    assert not found.toll.left(wanted)
-    assert found.samples == 2 * found.jobs
-    assert found.reads > found.samples
+    assert found.differences == []
+    assert [race for race in found.races if race.committed_by == race.worker] == []
+
+
+def do_no_harm(scene: SceneStore, folder: Path) -> None:
+    """So that what is told below is due to what is done below."""
+
+
+def replace_marker(scene: SceneStore, folder: Path) -> None:
+    """As a commit would that does not mind one before it."""
+    part = scene.storage.part()
+    part.write_text(json.dumps({**scene.marker(0), "figures": {**scene.marker(0)["figures"], "worker": "second"}}))
+    scene.storage.adopt(part, name_of(scene.name, 0), replace=True)
+
+
+def say_a_second_commit(scene: SceneStore, folder: Path) -> None:
+    for child in ("1", "2"):
+        (folder / "journal" / child).write_text("begins 1\ncommits 1\n")
+
+
+def flip_a_bit(scene: SceneStore, folder: Path) -> None:
+    """In a base file, which the reader beside it does not read."""
+    (file, *_) = sorted((scene.folder / "base").rglob("c.*"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def leave_a_part(scene: SceneStore, folder: Path) -> None:
+    scene.storage.part().write_bytes(b"half a file")
+
+
+def take_a_marker(scene: SceneStore, folder: Path) -> None:
+    scene.storage.local(name_of(scene.name, 1)).unlink()
+
+
+@pytest.mark.parametrize(
+    ("harm", "told"),
+    [
+        (do_no_harm, []),
+        (replace_marker, ["job 0 has another marker than it had first"]),
+        (say_a_second_commit, ["job 1 was committed 2 times"]),
+        (flip_a_bit, ["is not what an undisturbed worker writes"]),
+        (leave_a_part, ["is left half-written"]),
+        (take_a_marker, ["job 1 is not committed", "and 2 are complete", "and 2 are shown by a reader that"]),
+    ],
+    ids=["nothing", "a marker replaced", "two commits", "a bit flipped", "a part left", "a marker gone"],
+)
+def test_a_soak_tells_every_difference(
+    soak: ModuleType,
+    analytic: ModuleType,
+    planned: Callable[..., SceneStore],
+    tmp_path: Path,
+    harm: Callable[[SceneStore, Path], None],
+    told: list[str],
+) -> None:
+    scene = planned(2)
+    journal = soak.evidence.Journal(tmp_path / "journal")
+    with soak.evidence.Watcher(tmp_path / "store", scene.scene_id) as watcher:
+        for job in scene.missing_jobs():
+            ShardRenderer(Store(tmp_path / "store"), worker="first", load=analytic.AnalyticScene.load).render(
+                scene.scene_id, job
+            )
+    watcher.check()
+    harm(scene, tmp_path)
+    found = soak.evidence.differences(scene, tmp_path / "clean", journal, watcher)
+    assert len(found) == len(told)
+    assert all(sentence in difference for sentence, difference in zip(told, found, strict=True))

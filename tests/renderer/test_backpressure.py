@@ -13,11 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.renderer import backpressure, cli
-from photonfarm.renderer.backpressure import AHEAD_LOOK_S, FULL_S, DiskReserve, TrainerPace, is_full
-from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.backpressure import FULL_S, DiskReserve, is_full
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.queue import connect, queue_status, tell_consumed
+from photonfarm.shared.queue import connect, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
@@ -59,7 +58,7 @@ def test_a_size_is_read_as_it_is_written(size: str, in_bytes: int) -> None:
     ("arguments", "said"),
     [
         (["--reserve", "5 bananas"], "'5 bananas' is no size; write it as 500MB or 2GB"),
-        (["--ahead", "0"], "--ahead"),
+        (["--ahead", "0.5"], "0.5 is not in the range x>=1"),
         (["--job", "1"], "--job needs --scene"),
     ],
 )
@@ -114,33 +113,6 @@ def test_a_full_disk_is_told_from_other_refusals(number: int, full: bool) -> Non
     assert is_full(error) is full
     assert is_full(error.__cause__) is full
     assert not is_full(ValueError())
-
-
-def test_no_more_is_committed_than_the_ratio_to_what_the_trainer_has_used(
-    analytic: ModuleType, store: Store, scene: SceneStore, server: EmbeddedRedis, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of 8 samples; 2 may be committed in any case."""
-    monkeypatch.setattr(backpressure, "AHEAD_MINIMUM", 2)
-    connection, clock = connect(server.url), Clock()
-    pace = TrainerPace(store, connection, 1.5, clock=clock)
-    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
-
-    def reason_after(job: int | None = None, used: int | None = None) -> str | None:
-        if job is not None:
-            renderer.render(scene.scene_id, job)
-        if used is not None:
-            tell_consumed(connection, scene.scene_id, used)
-        clock.now += AHEAD_LOOK_S
-        return pace.reason()
-
-    assert reason_after(job=0) is None
-    assert reason_after(job=1) == "4 samples are committed, and the trainer has used 0 (--ahead 1.5)"
-    assert reason_after(used=2) == "4 samples are committed, and the trainer has used 2 (--ahead 1.5)"
-    assert reason_after(used=3) is None
-    assert reason_after(job=2) == "6 samples are committed, and the trainer has used 3 (--ahead 1.5)"
-    connection.flushall()
-    assert "has used 0" in reason_after()
-    assert reason_after(used=4) is None
 
 
 def test_the_trainers_first_samples_are_never_held_back() -> None:

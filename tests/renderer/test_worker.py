@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import os
 import re
 import sys
 import time
@@ -19,6 +18,7 @@ from photonfarm.renderer.worker_talk import Talk
 from photonfarm.shared import queue, show
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.plan import Request
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.queue import connect, job_name, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import Source
@@ -260,8 +260,10 @@ def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
         store = Store(tmp_path / "later", create=True)
         scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=3), shard_rows=3).scene_id)
         analytic.wait_for(lambda: scene.missing_jobs() == [], 60)
+        hosts = queue.hosts(connection)
         running.terminate()
         assert running.wait(20) == 0
+    assert hosts == {process_space()}
     assert log.read_text().count(f"worker ada: waiting for a store at {tmp_path / 'later'}") == 1
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", log.read_text()), "a supervisor tells the time as well"
 
@@ -329,7 +331,7 @@ def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(server: Embedded
     queue.beat(connection, "far", "another-machine", None, ttl_s=60)
     with pytest.raises(IncompleteError, match=r"no worker of .* is alive"):
         check(server.url)
-    queue.beat(connection, "near", os.uname().nodename, None, ttl_s=60)
+    queue.beat(connection, "near", process_space(), None, ttl_s=60)
     check(server.url)
 
 

@@ -71,7 +71,7 @@ def base() -> tuple[Geometry, BasePointCloud]:
     return geometry, BasePointCloud(corners, corners, corners, corners, group, face)
 
 
-def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES) -> bool:
+def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES, **options: Any) -> bool:
     """Hand a job's outputs to the store, and commit them."""
     with scene.job_writer(job) as out:
         for row, photons_ in given.photons.items():
@@ -80,7 +80,7 @@ def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGUR
             out.buffers(row, buffers)
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
-        return out.commit(figures)
+        return out.commit(figures, **options)
 
 
 def commit_all(scene: SceneStore) -> None:

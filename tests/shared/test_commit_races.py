@@ -1,9 +1,11 @@
 """A commit among others that change the job's files meanwhile: what is announced is what is there."""
 
 import importlib.util
+import json
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +112,9 @@ def test_two_writers_of_which_one_replaces_what_the_other_kept_announce_what_is_
     monkeypatch.setattr(scene.storage, "adopt", meanwhile)
     if theirs == "after":
         before(monkeypatch, markers, "place", lambda: samples.commit(another, 0, other))
-    samples.commit(scene, 0, ours)
+    samples.commit(scene, 0, ours, clock=lambda: datetime(2031, 1, 1, tzinfo=UTC))
+    told = [json.loads(path.read_text())["when"] for path in scene.storage.root.glob("quarantine/*/job-*.json")]
+    assert told == (["2031-01-01T00:00:00+00:00"] if theirs == "before" else [])  # of the other's marker, wrong now
     whole(scene)
     reader = SceneReader(scene.storage.root, scene.scene_id)
     for row in reader.refresh().tolist():

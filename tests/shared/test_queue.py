@@ -302,7 +302,7 @@ def test_values_of_another_kind_are_read_as_none(connection: redis.Redis) -> Non
     assert queue_status(connection).failed == {NAME: Failure("", 1, set_aside=True)}
     assert queue.hosts(connection) == set()
     assert queue.job_of_worker(connection, "evil") is None
-    assert queue.consumed_samples(connection, [SCENE_ID]) == 0
+    assert queue.consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
 
 
 def test_entries_that_are_no_text_are_tidied_away(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
@@ -675,13 +675,12 @@ def test_a_job_that_is_put_back_is_the_next_one_and_there_once(connection: redis
 
 def test_what_trainers_have_used_is_told_by_scene_and_lost_with_redis(connection: redis.Redis) -> None:
     other = "f" * 32
-    assert queue.consumed_samples(connection, [SCENE_ID]) == 0
+    assert queue.consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
     queue.tell_consumed(connection, SCENE_ID, 100)
     queue.tell_consumed(connection, other, 7)
-    assert queue.consumed_samples(connection, [SCENE_ID]) == 100
-    assert queue.consumed_samples(connection, [SCENE_ID, other]) == 107
+    assert queue.consumed_samples(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 7}
     connection.set(f"rq:photonfarm:consumed:{other}", "-12 or so")
-    assert queue.consumed_samples(connection, [SCENE_ID, other]) == 100
+    assert queue.consumed_samples(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 0}
 
 
 # ------------------------------------------------------------------------------------------------------- permissions

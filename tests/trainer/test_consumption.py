@@ -17,8 +17,9 @@ from photonfarm.trainer.settings import TrainSettings
 SCENE_ID = "0123456789abcdef" * 2
 
 
-def made(folder: Path) -> Store:
-    return Store(folder / "store", create=True)
+def made(folder: Path) -> Path:
+    Store(folder / "store", create=True)
+    return folder / "store"
 
 
 def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,7 +29,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
 
         def wait_for(samples: int) -> None:
             deadline = time.monotonic() + 60
-            while consumed_samples(connection, [SCENE_ID]) != samples:
+            while consumed_samples(connection, [SCENE_ID]) != {SCENE_ID: samples}:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
 
@@ -49,7 +50,7 @@ def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch:
     with EmbeddedRedis(tmp_path / "redis") as server:
         with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
             count(120, 48)
-        assert consumed_samples(connect(server.url), [SCENE_ID]) == 48
+        assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
 
 
 def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
@@ -74,7 +75,7 @@ def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once
         with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
             count(40, 100)
             time.sleep(0.3)
-        assert consumed_samples(connection, [SCENE_ID]) == 0
+        assert consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
     assert capsys.readouterr().err.count("no worker is told what is used: this Redis serves the store") == 1
 
 
@@ -84,3 +85,24 @@ def test_without_a_redis_training_goes_on(url: str | None, tmp_path: Path, monke
     with service._consumption_told(url, made(tmp_path), SCENE_ID) as count:
         count(1, 1)
         time.sleep(0.1)
+
+
+def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(
+    tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        service.run("cornell", tmp_path / "none", run, "small", {"max_seconds": 0.3}, server.url)
+    said = capsys.readouterr().err
+    assert "waiting for a store and a scene" in said
+    assert "ended at step 0: seconds" in said
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "TELL_S", 0.01)
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        with service._consumption_told(server.url, tmp_path / "store", SCENE_ID) as count:
+            count(1, 1)
+            time.sleep(0.1)
+            made(tmp_path)
+        assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 1}

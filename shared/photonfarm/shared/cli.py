@@ -88,17 +88,30 @@ def redis_option(command: Command) -> Command:
     """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
     return click.option(
         "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
-        help="The queue's Redis. A password belongs not here but into the variable, or into a file that "
-        "PHOTONFARM_REDIS_PASSWORD_FILE names.", show_envvar=True, callback=_with_password,
+        help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
+        "file that PHOTONFARM_REDIS_PASSWORD_FILE names.", show_envvar=True, callback=_with_password,
     )(command)  # fmt: skip
 
 
-def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:  # noqa: ARG001
+def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
+    if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
     if not (file := os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")):
         return url
     from photonfarm.shared.queue import with_password_of
 
     return with_password_of(Path(file), url)
+
+
+def _refuse_password(url: str) -> None:
+    from photonfarm.shared.queue import has_password
+
+    if has_password(url):
+        raise click.BadParameter(
+            "a password on the command line can be read by everybody on this machine, and stays in the shell's "
+            "history; give the URL without it, and put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE "
+            "names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as `redis` in the configuration file.)"
+        )
 
 
 def json_option(command: Command) -> Command:

@@ -1,10 +1,13 @@
-"""Processes that end with the one that started them."""
+"""Processes that end with the one that started them, and where the number of one means something."""
 
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 
 _LAUNCH = """
 import ctypes, os, signal, sys
@@ -19,3 +22,14 @@ os.execv(sys.argv[2], sys.argv[2:])
 def tied(command: Sequence[str]) -> list[str]:
     """The command, to be started by the main thread: on Linux it gets SIGTERM when we end, however we do."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
+
+
+@cache
+def process_space() -> str:
+    """Where process numbers mean what they mean here: containers may share a host's name, but not its processes."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text()[:8]
+        space = f"{boot}{Path('/proc/self/ns/pid').stat().st_ino:x}"
+    except OSError:  # not Linux, hence no containers: the host's name must do
+        space = "0"
+    return f"{socket.gethostname()}-{space}"

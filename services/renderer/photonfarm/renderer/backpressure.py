@@ -68,9 +68,9 @@ def is_full(error: BaseException) -> bool:
 
 
 class TrainerPace:
-    """Keeps committed samples ≤ ratio × those that the trainer has used, or AHEAD_MINIMUM if that is more.
+    """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
 
-    Over the scenes that the worker works for, together.
+    Each scene by itself: a trainer uses the samples of one.
     """
 
     def __init__(
@@ -82,21 +82,21 @@ class TrainerPace:
         scene_id: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take where both numbers are found."""
+        """Take where both numbers are found; a ratio below 1 would stop for good, as no more is used than committed."""
         self._store = store
         self._connection = connection
         self._ratio = ratio
         self._scene_id = scene_id
         self._clock = clock
         self._due = 0.0
-        self._reason: str | None = None
+        self._ahead: dict[str, str] = {}
 
-    def reason(self) -> str | None:
-        """Why no job should be taken now; None if there is none. Raises redis.RedisError."""
+    def ahead(self) -> dict[str, str]:
+        """Why no job of a scene should be taken now, by the ids of such scenes. Raises redis.RedisError."""
         if self._clock() >= self._due:
-            self._reason = self._look()
+            self._ahead = self._look()
             self._due = self._clock() + AHEAD_LOOK_S
-        return self._reason
+        return self._ahead
 
     def _progress(self) -> dict[str, Progress]:
         """By scene id; a scene that cannot be read holds nobody back."""
@@ -104,12 +104,16 @@ class TrainerPace:
             return self._store.each(SceneStore.progress)[0]
         return {self._scene_id: self._store.scene(self._scene_id).progress()}
 
-    def _look(self) -> str | None:
-        progress = self._progress()
-        committed = sum(scene.committed_samples for scene in progress.values())
-        if committed <= AHEAD_MINIMUM:
-            return None
-        used = queue.consumed_samples(self._connection, list(progress))
-        if committed <= self._ratio * used:
-            return None
-        return f"{committed} samples are committed, and the trainer has used {used} (--ahead {self._ratio:g})"
+    def _look(self) -> dict[str, str]:
+        committed = {
+            scene_id: progress.committed_samples
+            for scene_id, progress in self._progress().items()
+            if AHEAD_MINIMUM < progress.committed_samples < progress.planned_samples
+        }
+        used = queue.consumed_samples(self._connection, list(committed))
+        return {
+            scene_id: f"{samples} samples are committed, and the trainer has used {used[scene_id]} "
+            f"(--ahead {self._ratio:g})"
+            for scene_id, samples in committed.items()
+            if samples > self._ratio * used[scene_id]
+        }

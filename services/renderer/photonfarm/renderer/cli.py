@@ -51,9 +51,9 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
     help="Take no job while less of the store's disk is free.",
 )
 @click.option(
-    "--ahead", type=click.FloatRange(0, min_open=True), metavar="RATIO",
-    help="Take no job while more samples are committed than RATIO × those that the trainer has used. The first 256 may "
-    "always be; without a trainer it stops there.",
+    "--ahead", type=click.FloatRange(1), metavar="RATIO",
+    help="Take no job of a scene while more of its samples are committed than RATIO × those that its trainer has used. "
+    "The first 256 of a scene may always be; without a trainer it stops there. Below 1 it would stop for good.",
 )  # fmt: skip
 @click.option(
     "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,

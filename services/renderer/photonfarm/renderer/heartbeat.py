@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import os
-import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import redis
 
 from photonfarm.renderer.worker_settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import QueueError
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.store import Store
 
 STDERR = 2
@@ -22,7 +22,7 @@ STDERR = 2
 class Heart:
     """Tells Redis that the worker and its job are alive, and what holds it up, from a thread with its own connection.
 
-    `paused` says why it takes no jobs, and `left` by scene id why it leaves scenes to others.
+    `paused` says why it takes no jobs, and `left` by scene id why it leaves scenes alone for now.
     """
 
     def __init__(self, settings: WorkerSettings, store: Store, words: int | None) -> None:
@@ -35,7 +35,8 @@ class Heart:
         self._job: str | None = None
         self._ended = threading.Event()
         self.paused: str | None = None
-        self.left: dict[str, str] = {}
+        self.left: Mapping[str, str] = {}  # replaced, never changed
+        self._left_told: Mapping[str, str] = {}
 
     def start(self) -> None:
         """Take over from a child that died, and beat for as long as the process lives."""
@@ -47,7 +48,7 @@ class Heart:
         """Say that the worker's child is gone; its supervisor keeps the name."""
         self._ended.set()
         queue.free_job(self._connection, self._settings.name)
-        queue.forget_held_up(self._connection, self._settings.name, self.left)
+        queue.forget_held_up(self._connection, self._settings.name, {*self.left, *self._left_told})
 
     @contextlib.contextmanager
     def working(self, name: str) -> Iterator[None]:
@@ -77,6 +78,8 @@ class Heart:
 
     def _beat(self) -> None:
         name, ttl_s = self._settings.name, self._settings.heartbeat_ttl_s
-        host = socket.gethostname()
-        queue.beat(self._connection, name, host, self._job, ttl_s=ttl_s, process=self._supervisor)
-        queue.tell_held_up(self._connection, name, self.paused, dict(self.left), ttl_s=ttl_s)
+        queue.beat(self._connection, name, process_space(), self._job, ttl_s=ttl_s, process=self._supervisor)
+        left, self._left_told = self._left_told, self.left
+        if no_longer := left.keys() - self._left_told.keys():
+            queue.forget_held_up(self._connection, name, no_longer)
+        queue.tell_held_up(self._connection, name, self.paused, self._left_told, ttl_s=ttl_s)

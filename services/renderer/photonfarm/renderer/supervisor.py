@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -18,6 +17,7 @@ import redis
 from photonfarm.renderer.worker_settings import GRACE_S, JOB_IN_HAND, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.find import scene_named
 from photonfarm.shared.store.storage import is_vacant
@@ -48,6 +48,11 @@ class Words:
         others = [line for line in lines if line.strip() and not line.startswith(JOB_IN_HAND)]
         stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
         return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]))
+
+    @property
+    def overdue(self) -> str | None:
+        """The job that the deadline has ended; None if it has ended none."""
+        return self.job if self.hung else None
 
 
 class Supervisor:
@@ -87,7 +92,7 @@ class Supervisor:
         wanted = self._settings.name
         try:
             name = queue.take_name(
-                connection, wanted, socket.gethostname(), os.getpid(), ttl_s=self._settings.heartbeat_ttl_s
+                connection, wanted, process_space(), os.getpid(), ttl_s=self._settings.heartbeat_ttl_s
             )
         except redis.RedisError as error:
             raise QueueError(f"Redis failed while worker {wanted} was announced: {error}") from error
@@ -107,7 +112,7 @@ class Supervisor:
         while is_vacant(settings.store):
             with contextlib.suppress(redis.RedisError):
                 queue.beat(
-                    connection, settings.name, socket.gethostname(), None, ttl_s=settings.heartbeat_ttl_s,
+                    connection, settings.name, process_space(), None, ttl_s=settings.heartbeat_ttl_s,
                     process=os.getpid(),
                 )  # fmt: skip
             if self._stop.wait(POLL_S):
@@ -133,7 +138,10 @@ class Supervisor:
             failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
             pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
-            self._say(f"worker {self._settings.name}: {self._ending(code, words)}; starting again in {pause:g} s")
+            if code > 0 and words.overdue:
+                _count_overdue(self._settings, words.overdue)
+            ending = _ending(code, words, self._settings.deadline_s)
+            self._say(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
     def _run_child(self) -> tuple[int, Words]:
@@ -150,15 +158,6 @@ class Supervisor:
                 self._child.stdin.flush()  # and left open: its end tells the child that we are gone
             told = self._child.stdout.read().decode(errors="replace")
             return self._child.wait(), Words.of(told)
-
-    def _ending(self, code: int, words: Words) -> str:
-        if code < 0:
-            return f"its child was ended by {signal.Signals(-code).name}"
-        if words.hung and words.job:
-            _count_overdue(self._settings, words.job)
-            deadline = f"--deadline {self._settings.deadline_s:g} s"
-            return f"job {words.job} took longer than {deadline} and was ended, while in\n{words.hung}\n"
-        return words.last or f"its child ended with exit code {code}, for the reason above"
 
     # ---------------------------------------------------------------------------------------------------------- signals
 
@@ -192,6 +191,16 @@ class Supervisor:
         time.sleep(GRACE_S)
         if self._child is not None:
             self._child.kill()
+
+
+def _ending(code: int, words: Words, deadline_s: float) -> str:
+    """How a child has ended, in words."""
+    if code < 0:
+        return f"its child was ended by {signal.Signals(-code).name}"
+    if words.overdue:
+        deadline = f"--deadline {deadline_s:g} s"
+        return f"job {words.overdue} took longer than {deadline} and was ended, while in\n{words.hung}\n"
+    return words.last or f"its child ended with exit code {code}, for the reason above"
 
 
 def _free_job(settings: WorkerSettings) -> None:

@@ -21,6 +21,7 @@ from photonfarm.renderer.supervisor import Supervisor
 from photonfarm.renderer.worker_settings import LOG_FORMAT, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.errors import IncompleteError, StoreError
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.find import scene_named
 
@@ -74,6 +75,9 @@ def _default_name() -> str:
 
 
 def check(redis_url: str) -> None:
-    """Return if a worker of this machine is alive; raises IncompleteError if none is, QueueError without a Redis."""
-    if socket.gethostname() not in queue.hosts(queue.connect(redis_url)):
+    """Return if a worker of this host, or container, is alive; raises IncompleteError if none is.
+
+    Raises QueueError without a Redis.
+    """
+    if process_space() not in queue.hosts(queue.connect(redis_url)):
         raise IncompleteError(f"no worker of {socket.gethostname()} is alive")

@@ -49,6 +49,9 @@ RQ_WORKER_TTL_S = 120
 POLL_S = 0.2
 """Between looks at an empty queue."""
 
+NOT_HERE_S = 300.0
+"""For so long a scene is left to others whose files are not here; then they are looked for again."""
+
 log = logging.getLogger(__name__)
 
 
@@ -106,7 +109,8 @@ class RenderWorker(SimpleWorker):
         self._fatal: PhotonfarmError | None = None
         self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
         self._failed = False  # the job in hand
-        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others
+        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others…
+        self._look_again: dict[str, float] = {}  # …and until when
         self._heart = Heart(settings, store, words)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
@@ -160,9 +164,10 @@ class RenderWorker(SimpleWorker):
     def _take(self) -> RenderJob | None:
         """The next job; None if for a while there was none, or none should be taken."""
         queue.serve(self.connection, self._store)
-        held_back = self._disk.reason() or (self._pace.reason() if self._pace else None)
+        held_back = self._disk.reason()
         self._talk.pausing(held_back)
         self._heart.paused = held_back
+        self._heart.left = self._left()
         until = time.monotonic() + self._settings.idle_s
         while True:
             job, strangers = (None, 0) if held_back else self._next()
@@ -170,10 +175,18 @@ class RenderWorker(SimpleWorker):
                 log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
             if job is not None or time.monotonic() >= until:
                 return job
-            time.sleep(POLL_S)
+            time.sleep(self._settings.idle_s if self._heart.left else POLL_S)  # Redis looks at each job that is left
 
     def _next(self) -> tuple[RenderJob | None, int]:
-        return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._not_here)
+        return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._heart.left)
+
+    def _left(self) -> dict[str, str]:
+        """Why this worker takes no jobs of some scenes now, by their ids."""
+        ahead = self._pace.ahead() if self._pace else {}
+        self._talk.waiting(ahead)
+        for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
+            del self._not_here[scene_id], self._look_again[scene_id]
+        return {**ahead, **{scene_id: str(error) for scene_id, error in self._not_here.items()}}
 
     def _fill_or_finish(self) -> bool:
         """Look at the store, as there is no coordinator; True if there is nothing left to wait for.
@@ -256,7 +269,7 @@ class RenderWorker(SimpleWorker):
         elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
             scene_id = job.id.rpartition("-")[0]
             self._not_here[scene_id] = error
-            self._heart.left[scene_id] = str(error)
+            self._look_again[scene_id] = time.monotonic() + NOT_HERE_S
             log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
         elif (fatal := self._fatal_of(error)) is not None:
             self._fatal = fatal

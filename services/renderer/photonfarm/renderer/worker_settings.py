@@ -44,4 +44,4 @@ class WorkerSettings(Frozen):
     idle_s: Count = 2  # between looks at the store, while the queue is empty
     report_s: Positive = 60.0  # between lines that say how it goes
     reserve_bytes: Annotated[int, Field(ge=0)] = 10**9  # a few jobs, and room for whatever else needs the disk
-    ahead: Positive | None = None  # samples committed at most for each that the trainer has used; None: no matter
+    ahead: Annotated[float, Field(ge=1)] | None = None  # a scene's samples committed for each that its trainer has used

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from photonfarm.renderer.worker_settings import WorkerSettings
 
@@ -24,6 +24,7 @@ class Talk:
         self._seconds = 0.0
         self._said = -settings.report_s
         self._pausing = False
+        self._waiting: set[str] = set()
 
     @contextlib.contextmanager
     def timing(self, name: str) -> Iterator[None]:
@@ -51,3 +52,11 @@ class Talk:
         elif self._pausing and not reason:
             log.warning("worker %s: takes jobs again", self._name)
         self._pausing = bool(reason)
+
+    def waiting(self, ahead: Mapping[str, str]) -> None:
+        """Say once of each scene that its jobs are left for a reason, and once that they are taken again."""
+        for scene_id in ahead.keys() - self._waiting:
+            log.warning("worker %s: takes no jobs of scene %s: %s", self._name, scene_id, ahead[scene_id])
+        for scene_id in self._waiting - ahead.keys():
+            log.warning("worker %s: takes jobs of scene %s again", self._name, scene_id)
+        self._waiting = set(ahead)

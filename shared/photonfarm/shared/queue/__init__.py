@@ -8,15 +8,15 @@ write to it can delay jobs, and can neither run code in a worker nor change what
     rq:photonfarm:failures:<job name>   how often a job has failed
     rq:photonfarm:starts:<job name>     how often a job was started without an end
     rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
-    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host, the job it renders, or -, and the
-                                        process of its supervisor
+    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host with the process space, the
+                                        job it renders, or -, and the process of its supervisor
     rq:photonfarm:paused:<worker name>  why a worker takes no jobs
-    rq:photonfarm:left:<scene id>:<worker name>  why a worker leaves a scene to others
+    rq:photonfarm:left:<scene id>:<worker name>  why a worker leaves a scene alone
     rq:photonfarm:store                 the id of the store that this Redis serves, while somebody works with it
     rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
-from photonfarm.shared.queue.connection import connect, with_password_of
+from photonfarm.shared.queue.connection import connect, has_password, with_password_of
 from photonfarm.shared.queue.consumption import consumed_samples, tell_consumed
 from photonfarm.shared.queue.failures import (
     FAILED,
@@ -81,6 +81,7 @@ __all__ = [
     "forget_held_up",
     "forget_starts_of",
     "free_job",
+    "has_password",
     "hosts",
     "job_name",
     "job_of_worker",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 import redis
 from redis import Redis
@@ -54,6 +54,12 @@ def without_password(url: str) -> str:
     if "@" in rest and "@" not in before_options:  # in a password with a ?, or in an option
         return f"{scheme}{separator}…"
     return f"{scheme}{separator}{before_options.rpartition('@')[2]}"
+
+
+def has_password(url: str) -> bool:
+    """Whether a URL holds a password, also where it is not a proper URL."""
+    rest = url.partition("://")[2] or url
+    return ":" in rest.rpartition("@")[0] or "password=" in unquote(rest.partition("?")[2])
 
 
 def with_password_of(file: Path | None, url: str) -> str:

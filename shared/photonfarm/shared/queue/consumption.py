@@ -5,7 +5,7 @@ A number that is told again and again: a Redis that loses it has it back within 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 from redis import Redis
 
@@ -21,7 +21,9 @@ def tell_consumed(connection: Redis, scene_id: str, samples: int) -> None:
     connection.set(CONSUMED + scene_id, samples, ex=CONSUMED_TTL_S)
 
 
-def consumed_samples(connection: Redis, scene_ids: Iterable[str]) -> int:
-    """How many samples of these scenes trainers have used, by what they said last; 0 where none has said anything."""
+def consumed_samples(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
+    """How many samples of each of these scenes its trainer has used, by what it said last; 0 if it has said nothing."""
     told = beginnings(connection, [CONSUMED + scene_id for scene_id in scene_ids], 20)
-    return sum(int(samples) for samples in told if samples.isdecimal())
+    return {
+        scene_id: int(samples) if samples.isdecimal() else 0 for scene_id, samples in zip(scene_ids, told, strict=True)
+    }

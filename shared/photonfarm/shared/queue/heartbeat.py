@@ -21,7 +21,7 @@ _VALUE_BYTES = 1024
 
 @dataclass(frozen=True, slots=True)
 class _Heartbeat:
-    host: str
+    host: str  # the supervisor's process space, in which `process` counts
     job: str | None
     process: int  # of the supervisor; 0: not told
 
@@ -29,7 +29,8 @@ class _Heartbeat:
 def take_name(connection: Redis, name: str, host: str, process: int, *, ttl_s: float) -> str:
     """The name that a worker has from now on: this one, or with a number behind it while another worker has it.
 
-    One that was killed on this host leaves its name, and its job, at once, and not when its heartbeat has run out.
+    One that was killed on this `host`, which is `processes.process_space()`, leaves its name, and its job, at once, and
+    not when its heartbeat has run out.
     """
     for number in count(1):
         own = name if number == 1 else f"{name}-{number}"
@@ -43,8 +44,8 @@ def take_name(connection: Redis, name: str, host: str, process: int, *, ttl_s: f
 
 
 def _is_gone(process: int) -> bool:
-    """Whether no process of this machine, but perhaps our own, has that number."""
-    if process == os.getpid():  # that of a predecessor in a container that was started again
+    """Whether no process here, but perhaps our own, has that number."""
+    if process == os.getpid():  # that of a predecessor, which has ended
         return True
     try:
         os.kill(process, 0)
@@ -56,7 +57,7 @@ def _is_gone(process: int) -> bool:
 
 
 def beat(connection: Redis, worker: str, host: str, name: str | None, *, ttl_s: float, process: int = 0) -> None:
-    """Say for a time that a worker is alive, and the job that it renders, if any."""
+    """Say for a time that a worker is alive on a `host`, as in `take_name`, and the job that it renders, if any."""
     ttl_ms = int(ttl_s * 1000)  # the server's clock counts it down, not a client's
     with connection.pipeline() as pipeline:
         pipeline.set(WORKER + worker, f"{host} {name or '-'} {process}", px=ttl_ms)
@@ -94,6 +95,6 @@ def _heartbeat_of(connection: Redis, worker: str) -> _Heartbeat | None:
 
 
 def hosts(connection: Redis) -> set[str]:
-    """The hosts that have a worker alive."""
+    """The hosts, each a process space, that have a worker alive."""
     said = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
     return {value.split()[0] for value in said if value.strip()}

@@ -1,4 +1,4 @@
-"""What holds workers up, by their own account: that they take no jobs, or leave a scene to others.
+"""What holds workers up, by their own account: that they take no jobs, or leave a scene alone.
 
 It is said with every heartbeat and gone with it, and is text for people: nothing is decided by it.
 """
@@ -6,7 +6,7 @@ It is said with every heartbeat and gone with it, and is text for people: nothin
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from redis import Redis
@@ -25,11 +25,11 @@ class HeldUp:
     """What workers say, by name; printable."""
 
     paused: dict[str, str]  # why a worker takes no jobs
-    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it leaves the scene to others
+    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it leaves the scene alone
 
 
 def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
-    """Say for a time why a worker takes no jobs, if it takes none, and which scenes it leaves to others."""
+    """Say for a time why a worker takes no jobs, if it takes none, and which scenes it leaves alone."""
     ttl_ms = int(ttl_s * 1000)
     with connection.pipeline(transaction=False) as pipeline:
         if paused is None:
@@ -41,8 +41,8 @@ def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mappi
         pipeline.execute()
 
 
-def forget_held_up(connection: Redis, worker: str, left: Mapping[str, str]) -> None:
-    """A worker that has ended is held up by nothing."""
+def forget_held_up(connection: Redis, worker: str, left: Iterable[str]) -> None:
+    """A worker is held up by nothing any more, and leaves none of these scenes."""
     connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
 
 

@@ -6,8 +6,10 @@ plans take, 32 bytes a sample, and one row of each array for each thread.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from math import ceil
 
 from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
 from photonfarm.shared.scene import SceneSpec
@@ -15,11 +17,11 @@ from photonfarm.shared.store import markers, plans
 from photonfarm.shared.store.content_check import Tally
 from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, Remedy
 from photonfarm.shared.store.halves import SIGNIFICANCE, HalvesResult, HalvesTest
-from photonfarm.shared.store.job_check import Checked, marker_files
+from photonfarm.shared.store.job_check import Checked
 from photonfarm.shared.store.job_pool import JobPool
 from photonfarm.shared.store.plan_check import PlanCheck
 from photonfarm.shared.store.plan_repair import PlanRepair
-from photonfarm.shared.store.quarantine import Quarantine
+from photonfarm.shared.store.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.repeated_seeds import equal_samples
 from photonfarm.shared.store.scene_store import SCENES, read_spec
 from photonfarm.shared.store.storage import TMP, Storage, store_errors
@@ -92,7 +94,8 @@ def check_store(
 
 def said(halves: HalvesResult) -> str:
     """The outcome of the test between A and B in words."""
-    return (
+    few = "" if halves.tells else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
+    return few + (
         f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
         f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
         f"± {halves.standard_error:.2%} over {halves.samples} samples"
@@ -109,6 +112,7 @@ class _SceneChecking:
         self._tell = tell
         self._findings = Findings()
         self._markers: dict[int, bytes] = {}  # of jobs with findings
+        self._same: dict[int, bool] = {}  # of such jobs: whether they came out the same when they were rendered again
         self._scenes = scenes
         self._tally = Tally(HalvesTest(scenes))
 
@@ -163,13 +167,33 @@ class _SceneChecking:
                 for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
                     if found:
                         self._markers[job] = marker
-                        self._add(found)
+                        self._add(self._again(found))
             for tally in pool.tallies:
                 self._tally.add(tally)
         self._tell(scene.spec.name, len(committed), len(committed), self._tally.size_bytes)
-        self._add(equal_samples(scene, self._tally))
+        self._add(self._again(equal_samples(scene, self._tally)))
         if (halves := self._tally.halves.result()) is not None and not halves.passed:
             self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+
+    def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
+        """Findings; equal halves that came out equal when they were rendered again are not set aside once more."""
+        for finding in found:
+            equal = finding.cause in (Cause.EQUAL_HALVES, Cause.EQUAL_SAMPLES)
+            again = equal and finding.job is not None and self._came_out_the_same(finding.job)
+            yield replace(finding, cause=Cause.SAME_AGAIN) if again else finding
+
+    def _came_out_the_same(self, job: int) -> bool:
+        if job not in self._same:
+            self._same[job] = False
+            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or a finding of its own
+                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker(job))
+        return self._same[job]
+
+    def _marker(self, job: int) -> bytes:
+        """The marker that findings of a job are about; raises FileNotFoundError if it is set aside in the meantime."""
+        if job not in self._markers:  # found when all samples were looked at
+            self._markers[job] = self._storage.read(markers.name_of(self._name, job))
+        return self._markers[job]
 
     def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
         self._findings.add(found)
@@ -187,7 +211,9 @@ class _SceneChecking:
     def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
         aside = []
         for job, why in sorted(self._findings.jobs.items()):
-            if scene is not None and self._set_aside(scene, quarantine, job, why):
+            if scene is None or scene.plans is None:
+                self._add([Finding(Cause.LEFT, "stays until the plans are whole", self._scene_id, job)])
+            elif self._set_aside(scene, quarantine, job, why):
                 aside.append(f"job {job}")
         if why := self._findings.of(Cause.BASE):
             quarantine.base(self._name, why)
@@ -202,11 +228,12 @@ class _SceneChecking:
         return aside
 
     def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
-        marker = self._markers.get(job)
-        if marker is None:  # found when all samples were looked at
-            marker = self._storage.read(markers.name_of(self._name, job))
+        files = set(scene.files_of(job).values())
         try:
-            files = {*scene.files_of(job).values(), *marker_files(marker, self._name, job)}
+            marker = self._marker(job)
+            files.update(markers.files(marker, self._name, job))
+        except FileNotFoundError:  # another repair has been here
+            return False
         except CorruptError:
-            files = set(scene.files_of(job).values())
+            pass
         return quarantine.job(self._name, job, marker, sorted(files), why)

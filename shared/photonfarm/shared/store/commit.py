@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 from photonfarm.shared.errors import CorruptError, IncompleteError
 from photonfarm.shared.records import F32, Photons, ViewBuffers, arrays_of
 from photonfarm.shared.store import markers, schema
+from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.plans import JobRows, StoredPlan
+from photonfarm.shared.store.quarantine import Quarantine
 from photonfarm.shared.store.shards import Shard, ShardWriter, encode
-from photonfarm.shared.store.storage import store_errors
+from photonfarm.shared.store.storage import discard, renew_copy, store_errors
 
 if TYPE_CHECKING:
     from photonfarm.shared.store.scene_store import SceneStore
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 WAITING_ROWS = 8
 """Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
 
+
+T = TypeVar("T")
 
 ATTEMPTS = 3
 """At a commit among others that change the job's files; a second one takes two of them at once."""
@@ -45,6 +49,13 @@ class Figures:
     redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
     worker: str
     versions: Mapping[str, str]
+
+
+Clock = Callable[[], datetime]
+
+
+def _utc_now() -> datetime:
+    return datetime.now(UTC)
 
 
 class JobWriter:
@@ -81,8 +92,7 @@ class JobWriter:
         for shard in self._shards.values():
             with contextlib.suppress(OSError):  # why a disk refuses is told by the error that is under way
                 shard.close()
-            with contextlib.suppress(OSError):
-                shard.part.unlink(missing_ok=True)
+            discard(shard.part)
 
     # ------------------------------------------------------------------------------------------------------------- rows
 
@@ -148,7 +158,7 @@ class JobWriter:
 
     # ----------------------------------------------------------------------------------------------------------- commit
 
-    def commit(self, figures: Figures) -> bool:
+    def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
         """Make the rows part of the store, all or nothing; False if another worker's commit came first.
 
         False too if a repair has set aside files that we had named already, with a commit that relied on them, say; the
@@ -156,7 +166,7 @@ class JobWriter:
 
         Files that another writer left are kept where every row of the job can be read from them and ours, and are
         replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError
-        if others go on changing the files meanwhile.
+        if others go on changing the files meanwhile. `clock` tells when a marker of other files is set aside.
 
         Who meets files of others may meet those at work too: a repair, which has taken the marker back, and goes on to
         move the files, and a writer that replaces what it cannot read. Each acts first and looks then, so that one of
@@ -180,7 +190,7 @@ class JobWriter:
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
                 placed = self._place(described, figures)
-                if (placed and alone and self._are_there(described)) or self._is_marker_right():
+                if (placed and alone and self._are_there(described)) or self._is_marker_right(clock):
                     return placed
             raise CorruptError(
                 f"{self._storage.where}/{self._scene.name}: the files of job {self._rows.job} change while it is "
@@ -225,14 +235,14 @@ class JobWriter:
         for name in self._arrays:
             if self._storage.exists(self._file(name)):
                 with contextlib.suppress(CorruptError):  # moved in the meantime
-                    found[name] = self._shard(name).summary()
+                    found[name] = self._look(name, Shard.summary)
         return found
 
     def _place(self, described: Mapping[str, Mapping[str, Any]], figures: Figures) -> bool:
         files = {self._file(name): about for name, about in described.items()}
         return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
 
-    def _is_marker_right(self) -> bool:
+    def _is_marker_right(self, clock: Clock) -> bool:
         """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside.
 
         A file that it does not name takes nothing from those that it does: a writer that was late, and whose render
@@ -244,18 +254,23 @@ class JobWriter:
         except FileNotFoundError:  # a repair has seen it first
             return False
         told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
-        there = self._summaries()
-        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
-        if all(_is_told(told.get(self._plan_file(name)), there.get(name)) for name in relevant):
+        wrong = self._told_wrong(told)
+        renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
+        if any(renewed):
+            wrong = self._told_wrong(told)
+        if not wrong:
             return True
-        from photonfarm.shared.store.findings import Cause, Finding
-        from photonfarm.shared.store.quarantine import Quarantine
-
         detail = "files were moved or replaced while the job was committed; those that are there stay"
         why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
-        when = datetime.now(UTC).isoformat(timespec="seconds")
+        when = clock().isoformat(timespec="seconds")
         Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
         return False
+
+    def _told_wrong(self, told: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """The arrays whose files are not what a marker tells of them."""
+        there = self._summaries()
+        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
+        return [name for name in relevant if not _is_told(told.get(self._plan_file(name)), there.get(name))]
 
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
@@ -275,6 +290,15 @@ class JobWriter:
 
     def _shard(self, name: str) -> Shard:
         return Shard(self._storage.local(self._file(name)), self._arrays[name], self._plan.shard_rows)
+
+    def _look(self, name: str, look: Callable[[Shard], T]) -> T:
+        """What a look at an array's file gives; of a bucket's, at a new copy where this machine's is damaged."""
+        try:
+            return look(self._shard(name))
+        except CorruptError:
+            if not renew_copy(self._storage, self._file(name)):
+                raise
+        return look(self._shard(name))
 
     def _is_readable(self) -> bool:
         try:
@@ -298,10 +322,10 @@ class JobWriter:
         """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
         if not wanted:
             return set()
-        shard = self._shard(name)
-        missing = {row for row in wanted if shard.read(row % self._plan.shard_rows) is None}
+        rows = self._plan.shard_rows
+        missing = self._look(name, lambda shard: {row for row in wanted if shard.read(row % rows) is None})
         if missing and not may_be_missing:
-            raise CorruptError(f"{shard.path}: row {min(missing)} is missing")
+            raise CorruptError(f"{self._storage.where}/{self._file(name)}: row {min(missing)} is missing")
         return missing
 
 

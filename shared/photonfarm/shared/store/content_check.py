@@ -44,22 +44,26 @@ class Tally:
 class ContentCheck:
     """Looks at the rows of a scene, one after the other; says what is found as a cause and a detail."""
 
-    def __init__(self, spec: SceneSpec, tally: Tally) -> None:
+    def __init__(self, spec: SceneSpec) -> None:
         self._spec = spec
-        self._tally = tally
         self._rays: NDArray[np.float32] | None = None
 
-    def radiance(self, row: int, halves: NDArray[Any]) -> Iterator[tuple[Cause, str]]:
+    def radiance(self, row: int, halves: NDArray[Any], tally: Tally) -> Iterator[tuple[Cause, str]]:
         """The halves of a sample, (2, H, W, 3) finite, scaled as they are stored."""
-        self._tally.samples += 1
-        self._tally.halves.add(halves)
-        prints = [self._tally.fingerprints.add(row, half) for half in halves if largest(half)]
+        tally.samples += 1
+        tally.halves.add(halves)
+        black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
+        prints = [tally.fingerprints.add(row, values) for values in halves if largest(values)]
         if not prints:
             yield Cause.BLACK, "all zero"
+        elif black:
+            yield Cause.BLACK_HALF, f"{black[0]} is all zero"
         elif prints[0] == prints[-1] and np.array_equal(*halves) and not is_constant(halves[0]):
             yield Cause.EQUAL_HALVES, "A = B in every pixel"
 
-    def view(self, depth: NDArray[Any], normal: NDArray[Any], view: View | None) -> Iterator[tuple[Cause, str]]:
+    def view(
+        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: Tally
+    ) -> Iterator[tuple[Cause, str]]:
         """The buffers of a view: depth (H, W), normals (H, W, 3) as modelled.
 
         Normals are not turned to the camera, so that the inside of a box or the back of a leaf is rightly seen from
@@ -72,8 +76,8 @@ class ContentCheck:
             yield Cause.EMPTY_VIEW, "depth is 0 in every pixel"
         elif view is not None:
             behind = int(np.count_nonzero((self._cosine(normal, view) > 0) & hit.reshape(-1)))
-            self._tally.hit_pixels += hits
-            self._tally.back_facing_pixels += behind
+            tally.hit_pixels += hits
+            tally.back_facing_pixels += behind
             if behind == hits:
                 yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
 

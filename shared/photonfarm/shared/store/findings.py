@@ -38,6 +38,11 @@ class Cause(Enum):
     NOT_FINITE = "not-finite", "a stored value is NaN or infinite", Remedy.RENDER
     EQUAL_HALVES = "equal-halves", "halves A and B of a sample are equal: one seed, used twice", Remedy.RENDER
     EQUAL_SAMPLES = "equal-samples", "halves of different samples are equal: one seed, used twice", Remedy.RENDER
+    SAME_AGAIN = (
+        "same-again",
+        "halves are equal, and came out the same when their job was set aside and rendered again: without noise?",
+        Remedy.LOOK,
+    )
     SAME_SEED = (
         "same-seed",
         "halves of different samples are equal: their keys happen to give one seed, and would give it again",
@@ -56,6 +61,11 @@ class Cause(Enum):
         "is rendered stays, checked by its markers",
         Remedy.REPORT,
     )
+    LEFT = (
+        "left-in-place",
+        "a damaged job that --repair leaves: while a plan of its scene cannot be read, nobody can render it again",
+        Remedy.REPORT,
+    )
     PLAN_INPUTS = (
         "plan-inputs",
         "an input of a plan, or the declaration of an output, is not what was stored",
@@ -63,8 +73,18 @@ class Cause(Enum):
     )
     BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
     BLACK = "black", "both halves are black: no light, or the camera is inside something", Remedy.LOOK
+    BLACK_HALF = (
+        "black-half",
+        "one half is black, and the other is not: hardly any light, or a fault of the renderer if there are many",
+        Remedy.LOOK,
+    )
     EMPTY_VIEW = "empty-view", "nothing is met in the whole view", Remedy.LOOK
     BACK_FACING = "back-facing", "every first hit of the view is seen from behind", Remedy.LOOK
+    TWICE = (
+        "twice",
+        "a row is in radiance and in radiance_wide: two renders of it met, and radiance counts",
+        Remedy.LOOK,
+    )
     NO_MARKER = "no-marker", "files without a marker: a worker is at it, or has died", Remedy.LOOK
     FOREIGN_FILE = "foreign-file", "a file that no store writes", Remedy.LOOK
 

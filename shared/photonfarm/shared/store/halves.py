@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from math import log, sqrt
 from typing import Any
 
-import google_crc32c
 import numpy as np
+from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 BLOCKS = 8
@@ -37,6 +37,11 @@ class HalvesResult:
     def passed(self) -> bool:
         """Whether nothing differs by more than chance allows."""
         return self.statistic < self.limit
+
+    @property
+    def tells(self) -> bool:
+        """Whether there are enough samples for a difference to show: |S| is √n at most."""
+        return sqrt(self.samples) >= self.limit
 
 
 class HalvesTest:
@@ -99,9 +104,8 @@ class Fingerprints:
     def add(self, row: int, half: NDArray[Any]) -> int:
         """Take in one half of a sample, contiguous; its fingerprint: CRC-32C of the first and of the second part."""
         content = np.ravel(half).view(np.uint8)
-        content.flags.writeable = False  # all that it takes
         middle = len(content) // 2
-        fingerprint = google_crc32c.value(content[:middle]) << 32 | google_crc32c.value(content[middle:])
+        fingerprint = int(crc32c(content[:middle])) << 32 | int(crc32c(content[middle:]))
         self._prints.append(fingerprint)
         self._rows.append(row)
         return fingerprint

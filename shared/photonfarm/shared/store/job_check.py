@@ -43,24 +43,21 @@ class Checked:
         return {}
 
 
-def marker_files(marker: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
-    """The files that a marker names, with their sizes and checksums; raises CorruptError if it is not this job's."""
-    files = markers.parse(marker, job, markers.name_of(scene, job))["files"]
-    return {f"{scene}/{name}": about for name, about in files.items()}
-
-
 class JobCheck:
     """Checks jobs of a scene one after the other, with the same memory for each."""
 
-    def __init__(self, scene: Checked, tally: Tally) -> None:
+    def __init__(self, scene: Checked) -> None:
         self._scene = scene
-        self._tally = tally
         self._arrays = schema.output_arrays(scene.spec)
         self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
-        self._contents = ContentCheck(scene.spec, tally)
+        self._contents = ContentCheck(scene.spec)
 
-    def run(self, job: int) -> tuple[list[Finding], bytes]:
-        """What is found of a job, and its marker; nothing if that is taken back in the meantime."""
+    def run(self, job: int, tally: Tally) -> tuple[list[Finding], bytes]:
+        """What is found of a job, and its marker; nothing if that is taken back in the meantime.
+
+        What it adds to the scene is counted in `tally`.
+        """
+        self._tally = tally
         storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
         try:
             content = storage.read(name)
@@ -83,7 +80,7 @@ class JobCheck:
             yield self._without_plan(job, marker, name)
             return
         try:
-            named = marker_files(marker, scene.name, job)
+            named = markers.files(marker, scene.name, job)
         except CorruptError as error:
             yield self._finding(Cause.MARKER, job, _said(error), name)
             return
@@ -102,7 +99,7 @@ class JobCheck:
         """What a marker of no plan tells: that the last plan is missing, if it names files in the folder of one."""
         scene = self._scene
         with contextlib.suppress(CorruptError):
-            named = {_plan_of(file) for file in marker_files(marker, scene.name, job)}
+            named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
             if missing := named - {plan.folder for plan in scene.plans or []}:
                 return Finding(Cause.PLAN, plans.MISSING, scene.scene_id, job, file=f"{min(missing)}/zarr.json")
         return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
@@ -162,7 +159,7 @@ class JobCheck:
                     yield self._finding(Cause.MISSING_ROW, rows.job, "the plan has it", own[name], row)
         narrow, wide = held.get("radiance", set()), held.get("radiance_wide", set())
         for row in sorted(narrow & wide & samples):
-            yield self._finding(Cause.UNUSED_ROW, rows.job, "radiance has it already", own["radiance_wide"], row)
+            yield self._finding(Cause.TWICE, rows.job, "radiance has it already", own["radiance_wide"], row)
         if not unread & {"radiance", "radiance_wide"}:
             for row in sorted(samples - narrow - wide):
                 yield self._finding(Cause.MISSING_ROW, rows.job, "radiance_wide lacks it too", own["radiance"], row)
@@ -207,10 +204,10 @@ class JobCheck:
     def _content(self, row: int, values: dict[str, NDArray[Any]], rows: JobRows | None) -> Iterator[tuple[Cause, str]]:
         halves = values.get("radiance", values.get("radiance_wide"))
         if halves is not None:
-            yield from self._contents.radiance(row, halves)
+            yield from self._contents.radiance(row, halves, self._tally)
         if "depth" in values and "normal" in values:
             view = None if rows is None else rows.views.get(row)
-            yield from self._contents.view(values["depth"], values["normal"], view)
+            yield from self._contents.view(values["depth"], values["normal"], view, self._tally)
 
     def _unreadable(self, job: int, file: str, error: OSError) -> Finding:
         """The finding for a file that cannot be read; raises OSError if it is the whole store that cannot be."""

@@ -6,7 +6,6 @@ import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 from types import TracebackType
 from typing import Self
 
@@ -62,29 +61,25 @@ class _Checker:
         self.tally = Tally(HalvesTest(scenes))
         self._scene = scene
         self._scenes = scenes
-        self._of_job = Tally(HalvesTest(scenes))  # so that a job that is checked once more counts once
-        self._check = JobCheck(scene, self._of_job)
+        self._check = JobCheck(scene)
 
     def run(self, job: int) -> tuple[list[Finding], bytes]:
         """What is found of a job, and its marker; where copies may be to blame, of new ones."""
-        found, marker = self._check.run(job)
+        found, marker, tally = self._run(job)
         if self._renewed(found):
-            self._begin()
-            found, marker = self._check.run(job)
-        self.tally.add(self._of_job)
-        self._begin()
+            found, marker, tally = self._run(job)
+        self.tally.add(tally)
         return found, marker
+
+    def _run(self, job: int) -> tuple[list[Finding], bytes, Tally]:
+        tally = Tally(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
+        return *self._check.run(job, tally), tally
 
     def _renewed(self, found: list[Finding]) -> bool:
         """Whether what was read differs from what was committed, and was a copy: then the copies are new now."""
         damaged = {finding.file for finding in found if finding.cause is Cause.CHECKSUM and finding.file}
         renewed = [renew_copy(self._scene.storage, file) for file in sorted(damaged)]
         return any(renewed)
-
-    def _begin(self) -> None:
-        fresh = Tally(HalvesTest(self._scenes))
-        for field in fields(Tally):
-            setattr(self._of_job, field.name, getattr(fresh, field.name))
 
 
 def _cores() -> int:

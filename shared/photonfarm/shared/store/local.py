@@ -11,14 +11,13 @@ import errno
 import itertools
 import os
 import shutil
-import socket
 import time
 from collections.abc import Iterable, Iterator
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from photonfarm.shared.errors import StoreError
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ class LocalStorage:
             self.require()
             self._make_folder(self.root)
             tmp.mkdir(exist_ok=True)
-        return tmp / f"{_owner()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
+        return tmp / f"{process_space()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
 
     def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
         """Sync a part and link it to its name; False if that was taken."""
@@ -185,20 +184,9 @@ class LocalStorage:
         return swept
 
 
-@cache
-def _owner() -> str:
-    """Where process numbers mean what they mean here: containers may share a host's name, but not its processes."""
-    try:
-        boot = Path("/proc/sys/kernel/random/boot_id").read_text()[:8]
-        space = f"{boot}{Path('/proc/self/ns/pid').stat().st_ino:x}"
-    except OSError:  # not Linux, hence no containers: the host's name must do
-        space = "0"
-    return f"{socket.gethostname()}-{space}"
-
-
 def _is_of_the_dead(name: str) -> bool:
     owner, *numbers = name.rsplit("-", 3)  # from the right: a host's name may hold any number of -
-    if owner != _owner():
+    if owner != process_space():
         return False  # of another machine or container
     try:
         os.kill(int(numbers[0]), 0)

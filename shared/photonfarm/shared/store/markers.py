@@ -82,6 +82,12 @@ def parse(content: bytes, job: int, where: str) -> dict[str, Any]:
     return _checked(document, job, where)
 
 
+def files(content: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
+    """The files that a marker names, with their sizes and checksums, by their names in the store; raises as `parse`."""
+    named = parse(content, job, name_of(scene, job))["files"]
+    return {f"{scene}/{name}": about for name, about in named.items()}
+
+
 def _checked(document: Any, job: int, where: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise CorruptError(f"{where}: is not a marker: it holds no JSON object")

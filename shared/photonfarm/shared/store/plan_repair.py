@@ -9,6 +9,7 @@ Shape letters: R rows of the plan.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ from photonfarm.shared.store.declarations import Declared
 from photonfarm.shared.store.findings import Finding
 from photonfarm.shared.store.plans import About, StoredPlan
 from photonfarm.shared.store.quarantine import Quarantine
-from photonfarm.shared.store.scene_store import remove_built
-from photonfarm.shared.store.storage import Storage
+from photonfarm.shared.store.storage import Storage, read_or_none
 
 Mask = NDArray[np.bool_]
 
@@ -68,7 +68,7 @@ class PlanRepair:
                 self._scene, number, {name: path for name, path in files.items() if self._differs(name, path)}, why
             )
         finally:
-            remove_built(built)
+            shutil.rmtree(built, ignore_errors=True)
 
     def _about(self, folder: str) -> About:
         import zarr
@@ -122,7 +122,7 @@ class PlanRepair:
         length = min(max(len(values), 1), schema.INPUT_ROWS_PER_CHUNK)
         for number in range(-(-len(values) // length) if values.size else 0):
             name = ".".join(["c", str(number), *("0" for _ in values.shape[1:])])
-            content = self._content(f"{folder}/{declared.name}/{name}")
+            content = read_or_none(self._storage, f"{folder}/{declared.name}/{name}")
             if content is None or not _is_whole(content):
                 continue
             try:
@@ -134,19 +134,13 @@ class PlanRepair:
 
     def _differs(self, name: str, built: Path) -> bool:
         """Whether a file is damaged or missing: a chunk by its checksum, a declaration by what it says."""
-        content = self._content(name)
+        content = read_or_none(self._storage, name)
         if content is None or not name.endswith("zarr.json"):
             return content is None or not _is_whole(content)
         try:
             return bool(json.loads(content) != json.loads(built.read_bytes()))
         except ValueError:
             return True
-
-    def _content(self, name: str) -> bytes | None:
-        try:
-            return self._storage.read(name)
-        except FileNotFoundError:
-            return None
 
     def _hopeless(self, folder: str, why: str) -> CorruptError:
         return CorruptError(f"{self._storage.where}/{folder}: cannot be written again: {why}; {plans.RESTORE}")

@@ -20,8 +20,7 @@ from typing import Any
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.store import markers
 from photonfarm.shared.store.findings import Finding
-from photonfarm.shared.store.job_check import marker_files
-from photonfarm.shared.store.storage import Storage, put_json, store_errors
+from photonfarm.shared.store.storage import Storage, discard, put_json, read_or_none, store_errors
 
 QUARANTINE = "quarantine"
 _DIGITS = 6
@@ -43,14 +42,14 @@ class Quarantine:
         """
         with store_errors(f"set job {job} aside", self._storage.where):
             name = markers.name_of(scene, job)
-            if self._content(name) != marker:
+            if read_or_none(self._storage, name) != marker:
                 return False
             there = [file for file in files if self._storage.exists(file)]
             self._record(f"job-{_id(scene)}-{job}", why, [name, *there], "workers find the job missing, and render it")
             if not self._move([name]):
                 return False
             self._move(there)
-        again = self._content(name)
+        again = read_or_none(self._storage, name)
         if again is not None and not self._has_files(again, scene, job):
             # a worker that had found our files in its way has announced them just before we moved them
             return Quarantine(self._storage, self._when).job(scene, job, again, there, why)
@@ -85,7 +84,7 @@ class Quarantine:
         No name is ever without bytes, so that nobody who reads the plan meanwhile takes it for another one.
         """
         with store_errors(f"write plan {plan} again", self._storage.where):
-            held = {name: self._content(name) for name in files}
+            held = {name: read_or_none(self._storage, name) for name in files}
             there = [name for name, content in held.items() if content is not None]
             self._record(f"plan-{_id(scene)}-{plan}", why, there, "written again from the plan's request")
             for name, part in files.items():
@@ -105,7 +104,7 @@ class Quarantine:
             part.write_bytes(content)
             self._storage.adopt(part, name)
         finally:
-            part.unlink(missing_ok=True)
+            discard(part)
 
     def _claimed(self) -> str:
         """The folder of this repair; two repairs at once get two."""
@@ -139,17 +138,28 @@ class Quarantine:
         self._storage.settle([*moved, *(f"{self._claimed()}/{name}" for name in moved)])
         return moved
 
-    def _content(self, name: str) -> bytes | None:
-        try:
-            return self._storage.read(name)
-        except FileNotFoundError:
-            return None
-
     def _has_files(self, marker: bytes, scene: str, job: int) -> bool:
         try:
-            return all(self._storage.exists(file) for file in marker_files(marker, scene, job))
+            return all(self._storage.exists(file) for file in markers.files(marker, scene, job))
         except CorruptError:
             return True  # another worker's business, and the next check's
+
+
+def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool:
+    """Whether a repair has moved a job's marker and all of its files away, and these were the same as they are now.
+
+    Then the job has been rendered since, and has come out the same. Raises CorruptError for a marker that is none.
+    """
+    name, now = markers.name_of(scene, job), markers.files(marker, scene, job)
+    for number in storage.names(QUARANTINE):
+        folder = f"{QUARANTINE}/{number}"
+        try:
+            then = markers.files(storage.read(f"{folder}/{name}"), scene, job)
+        except (FileNotFoundError, NotADirectoryError, CorruptError):
+            continue
+        if then == now and all(storage.exists(f"{folder}/{file}") for file in then):
+            return True
+    return False
 
 
 def _id(scene: str) -> str:

@@ -142,6 +142,14 @@ def is_vacant(root: str | Path) -> bool:
         return set(storage.names("")) <= {TMP}
 
 
+def read_or_none(storage: Storage, name: str) -> bytes | None:
+    """The bytes of a name; None if it has none."""
+    try:
+        return storage.read(name)
+    except FileNotFoundError:
+        return None
+
+
 def discard(part: Path) -> None:
     """Remove a part's file if it is still there; where the disk refuses that, a sweep does it later.
 

@@ -61,6 +61,11 @@ class Store:
             names = sorted(self.storage.names(SCENES))
             return [name for name in names if self.storage.exists(f"{SCENES}/{name}/spec.json")]
 
+    def has_scene(self, scene_id: str) -> bool:
+        """Whether a scene is there."""
+        with store_errors("look for a scene", self.storage.where):
+            return self.storage.exists(f"{SCENES}/{scene_id}/spec.json")
+
     def scene(self, scene_id: str) -> SceneStore:
         """One scene of the store, the same object each time; raises StoreError if it is not there."""
         if scene_id not in self._opened:
@@ -99,7 +104,7 @@ class Store:
         self, spec: SceneSpec, request: Request, *, shard_rows: int | None = None, dry_run: bool = False
     ) -> PlanResult:
         """Plan what is new of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
-        if dry_run and spec.scene_id not in self.scene_ids():
+        if dry_run and not self.has_scene(spec.scene_id):
             expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0)
         return self.add(spec).plan(request, shard_rows=shard_rows, dry_run=dry_run)

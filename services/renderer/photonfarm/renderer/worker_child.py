@@ -263,7 +263,9 @@ class RenderWorker(SimpleWorker):
             log.warning("job %s is committed; what Redis keeps of it was not: %s", job.id, error)
             return
         self._failed = True
-        log.warning("job %s failed: %s", job.id, error, exc_info=None if isinstance(error, PhotonfarmError) else error)
+        what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"
+        known = isinstance(error, PhotonfarmError | redis.RedisError)
+        log.warning("job %s %s: %s", job.id, what, error, exc_info=None if known else error)
         if is_full(error):
             self._disk.refused()
         elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:

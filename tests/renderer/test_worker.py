@@ -14,7 +14,7 @@ import pytest
 from photonfarm.renderer.heartbeat import Heart
 from photonfarm.renderer.worker import check, render_job, run_worker
 from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.renderer.worker_talk import Talk
+from photonfarm.renderer.worker_talk import Talk, Tally
 from photonfarm.shared import queue, show
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.plan import Request
@@ -61,6 +61,19 @@ def test_a_worker_fills_an_empty_queue_from_the_store_and_stops_when_nothing_is_
     assert (status.queued, status.running, status.failed, status.workers) == (0, 0, {}, 0)
     assert store_status(Store(tmp_path / "store"))[0].core_s > 0
     assert not list(connect(server.url).scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_worker_says_at_its_end_what_all_its_children_have_done(
+    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, quiet: bool
+) -> None:
+    said: list[str] = []
+    run_worker(
+        tmp_path / "store", server.url, name="ada", child=analytic.command(), say=said.append, max_jobs=1, quiet=quiet,
+        **QUICK,
+    )  # fmt: skip
+    summary = r"worker ada: ended: 2 jobs done, 6 samples, \d+ s"
+    assert [bool(re.fullmatch(summary, line)) for line in said] == ([] if quiet else [True])
 
 
 @pytest.mark.parametrize("limit", [{"max_jobs": 1}, {"max_rss_bytes": 1}])
@@ -297,7 +310,8 @@ def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_al
     run_worker(tmp_path / "store", server.url, name="ada", child=analytic.command(), say=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
-    assert said == ["worker ada: another one of this name is alive, so this one goes by ada-2"]
+    assert said[0] == "worker ada: another one of this name is alive, so this one goes by ada-2"
+    assert re.fullmatch(r"worker ada-2: ended: 2 jobs done, 6 samples, \d+ s", said[1])
     assert queue.hosts(connection) == {"another-machine"}
 
 
@@ -348,7 +362,7 @@ def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: 
         with talk.timing(f"job-{job}"):
             pass
     assert [record.getMessage() for record in caplog.records] == [
-        "worker ada: 1 jobs in 0 s, 0.00 s each; the last was job-0"
+        "worker ada: 1 job in 0 s, 0.00 s each; the last was job-0"
     ]
     caplog.clear()
     talk = Talk(settings_of(report_s=1e-9))
@@ -356,6 +370,12 @@ def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: 
         with talk.timing(f"job-{job}"):
             pass
     assert len(caplog.records) == 5
+
+
+def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() -> None:
+    both = Tally.of(Tally(3, 1, 96, 10.25).line) + Tally(1, 0, 32, 2.0)
+    assert both == Tally(4, 1, 128, 12.25)
+    assert str(both) == "4 jobs done, 1 failed, 128 samples, 12 s"
 
 
 def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:

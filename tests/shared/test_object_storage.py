@@ -507,6 +507,23 @@ def test_a_refusal_is_told_at_once(url: str, monkeypatch: pytest.MonkeyPatch) ->
     assert time.monotonic() - began < 10
 
 
+def test_the_servers_reason_is_told_without_its_xml_and_a_bucket_that_is_missing_by_that(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(StoreError, match=r"^s3://no-such-bucket/store: cannot be read: the bucket does not exist$"):
+        Store("s3://no-such-bucket/store")
+    with pytest.raises(StoreError, match=r"is not a store: photonfarm\.json is missing"):
+        Store(url)
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
+    with pytest.raises(
+        StoreError, match=r"403 Forbidden: SignatureDoesNotMatch: The request signature .*\.$"
+    ) as caught:
+        Store(url)
+    assert "<" not in str(caught.value)
+    with pytest.raises(PermissionError, match="403 Forbidden"):  # the answer to a HEAD has no more
+        ObjectStorage(url).size("object")
+
+
 # ----------------------------------------------------------------------------------------------------- the command line
 
 
@@ -549,3 +566,17 @@ def test_a_folders_store_does_not_load_the_library(tmp_path: Path) -> None:
         "assert 'obstore' not in sys.modules"  # fmt: skip
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")], check=True)
     assert open_storage(tmp_path / "store").exists("photonfarm.json")
+
+
+def test_a_bucket_that_has_lost_the_store_s_document_or_a_spec_is_refused_and_told(url: str) -> None:
+    store = Store(url, create=True)
+    scene = store.scene(store.plan(samples.small_spec(), Request()).scene_id)
+    objects_ = store.storage._objects
+    obstore.put(objects_, "scenes/nothex/plans/000000/zarr.json", b"{}")
+    obstore.delete(objects_, f"{scene.name}/spec.json")
+    assert store.scene_ids() == [scene.scene_id]
+    (about,) = store_status(Store(url))
+    assert "spec.json: is missing, and plans or markers of the scene are there" in str(about.error)
+    obstore.delete(objects_, "photonfarm.json")
+    with pytest.raises(CorruptError, match=r"photonfarm\.json: is missing, and scenes are there"):
+        Store(url, create=True)

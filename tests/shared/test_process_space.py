@@ -48,6 +48,13 @@ def test_a_worker_that_was_killed_in_this_container_leaves_its_name_at_once(conn
     assert not connection.exists(queue.ALIVE + NAME)
 
 
+def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts(connection: redis.Redis) -> None:
+    queue.beat(connection, "killed", process_space(), NAME, ttl_s=60, process=gone())
+    queue.beat(connection, "alive", process_space(), None, ttl_s=60, process=os.getppid())
+    queue.beat(connection, "elsewhere", "another-machine", None, ttl_s=60, process=gone())
+    assert queue.queue_status(connection).workers == 2
+
+
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:
     code = "from photonfarm.shared.processes import process_space; print(process_space())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

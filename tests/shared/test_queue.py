@@ -22,7 +22,7 @@ from rq.serializers import JSONSerializer
 from rq.webhook import Webhook
 
 from photonfarm.renderer.jobs import render_shard
-from photonfarm.shared import queue
+from photonfarm.shared import queue, submission
 from photonfarm.shared.errors import IncompleteError, QueueError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import (
@@ -718,6 +718,36 @@ def test_the_server_of_the_compose_file_lets_nobody_in_without_the_password(guar
         with pytest.raises(QueueError, match="no Redis at"):
             connect(f"redis://{user}127.0.0.1:{port}/0")
     assert len(password.read_text().strip()) == 64
+
+
+def test_who_lacks_a_name_or_a_password_is_told_which_and_nobody_to_start_a_server(
+    guarded: tuple[int, Path], store: Store, tmp_path: Path
+) -> None:
+    port, _ = guarded
+    url = f"redis://127.0.0.1:{port}/0"
+    with pytest.raises(QueueError, match=r"wants a password .*PHOTONFARM_REDIS_PASSWORD_FILE names"):
+        connect(url)
+    (tmp_path / "password").write_text("wrong")
+    with pytest.raises(QueueError, match=r"does not let in the user photonfarm .*redis://default@host"):
+        connect(with_password_of(tmp_path / "password", url))
+    request = {"modifications": 1, "views": 1, "passes": 1, "seed": 0}
+    with pytest.raises(QueueError, match=r"submits without Redis$"):
+        submission.submit("cornell", store.root, url, **request)
+    with pytest.raises(QueueError, match=r"without Redis, and `redis-server` or .* starts one$"):
+        submission.submit("cornell", store.root, "redis://127.0.0.1:1/0", **request)
+
+
+def test_the_password_of_a_plain_redis_goes_with_the_user_that_it_has(tmp_path: Path) -> None:
+    (tmp_path / "password").write_text("secret")
+    with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as plain:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        plain.config_set("port", port)
+        plain.config_set("requirepass", "secret")
+        with pytest.raises(QueueError, match="a Redis with `requirepass` has the user default: redis://default@host"):
+            connect(with_password_of(tmp_path / "password", f"redis://127.0.0.1:{port}/0"))
+        with connect(with_password_of(tmp_path / "password", f"redis://default@127.0.0.1:{port}/0")) as let_in:
+            assert let_in.ping()
 
 
 def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(

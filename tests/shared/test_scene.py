@@ -3,9 +3,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import SCENES_VARIABLE, load_spec, parse_spec
+from photonfarm.shared.scene import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec, sentences
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>
@@ -135,3 +136,15 @@ def test_a_spec_survives_json(scenes: Path) -> None:
     again = parse_spec(spec.model_dump(mode="json", exclude={"content"}), where="spec")
     assert again == spec
     assert again.scene_id == spec.scene_id
+
+
+def test_a_file_that_is_no_json_is_told_in_a_short_line_and_so_is_a_long_value() -> None:
+    with pytest.raises(ValidationError) as caught:
+        SceneSpec.model_validate_json(b"garbage\n" * 1000)
+    (said,) = sentences(caught.value)
+    assert said.startswith("the spec: Invalid JSON")
+    with pytest.raises(SpecError) as refused:
+        parse_spec(changed(points="many" * 1000), where="spec")
+    for line in (said, str(refused.value)):
+        assert len(line) < 400
+        assert "\n" not in line

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.top_up import TopUp
 
 _spec = importlib.util.spec_from_file_location("checked_store", Path(__file__).with_name("checked_store.py"))
@@ -41,6 +41,19 @@ def test_damaged_inputs_of_a_plan_are_found_and_what_is_rendered_is_checked_all_
     assert report.scenes[0].samples == 10
     assert not marker(scene, 1).exists()
     assert not shard_or_none(scene, "depth", 1)
+
+
+def test_what_is_damaged_or_missing_of_a_plan_is_named(store: Store, scene: SceneStore) -> None:
+    (view,) = (scene.folder / "plans/000000/view").glob("c.0*")
+    flip(view, view.stat().st_size - 1)
+    with pytest.raises(CorruptError, match="view: Stored and computed checksum do not match") as caught:
+        SceneStore(scene.storage, scene.scene_id).plans()
+    assert "b'" not in str(caught.value)
+    (scene.folder / "plans/000000/radiance/zarr.json").unlink()
+    (group,) = checked(store).scenes[0].groups
+    assert [finding.detail for finding in group.first if "radiance/" in str(finding.file)] == [
+        "cannot be read: radiance is missing"
+    ]
 
 
 def shard_or_none(scene: SceneStore, name: str, job: int) -> list[Path]:
@@ -91,6 +104,49 @@ def test_a_plan_that_is_claimed_and_not_written_yet_is_no_finding(store: Store, 
     assert noted(checked(store)) == {}
 
 
+def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_away(
+    store: Store, scene: SceneStore
+) -> None:
+    """As docs/store-check.md tells it."""
+    scene.plan(Request(modifications=7, views_per_modification=2))
+    commit_all(scene)
+    clean, aside = data(scene), Path(store.root) / "quarantine/by-hand"
+    (scene.folder / "plans/000001/zarr.json").unlink()
+    assert found(checked(store)) == {"plan": 1}
+    aside.mkdir(parents=True)
+    (scene.folder / "plans/000001").rename(aside / "000001")
+    with pytest.raises(CorruptError, match="no plan has this job"):
+        Store(store.root).plan(samples.small_spec(), Request(modifications=7, views_per_modification=2))
+    marker(scene, 3).rename(aside / marker(scene, 3).name)
+    again = Store(store.root).scene(scene.scene_id)
+    assert (found(checked(store)), again.missing_jobs()) == ({}, [])
+    assert again.plan(Request(modifications=7, views_per_modification=2)).plan == 1
+    commit_all(again)
+    assert (found(checked(store)), data(scene)) == ({}, clean)
+
+
+@pytest.mark.parametrize("version", [1, 3, None])
+def test_a_plan_of_another_version_is_refused_in_a_sentence_by_all_who_load_it(
+    store: Store, scene: SceneStore, version: int | None
+) -> None:
+    about = scene.folder / "plans/000000/zarr.json"
+    document = json.loads(about.read_text())
+    document["attributes"]["version"] = version
+    about.write_text(json.dumps(document))
+    said = f"has format 'photonfarm store' version {version}; this program reads and writes"
+    for look in (
+        lambda: Store(store.root).scene(scene.scene_id).plans(),
+        lambda: Store(store.root).plan(samples.small_spec(), Request(modifications=9)),
+        SceneReader(store.root, scene.scene_id).refresh,
+    ):
+        with pytest.raises(StoreError, match=said):
+            look()
+    assert said in str(store_status(Store(store.root))[0].error)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code) == ({"plan": 1}, 4)
+    assert said in report.scenes[0].groups[0].first[0].detail
+
+
 @pytest.mark.parametrize("harm", ["flip", "chunk", "marker", "index", "removed"])
 def test_a_damaged_base_is_set_aside_and_the_next_job_writes_it(store: Store, scene: SceneStore, harm: str) -> None:
     clean = data(scene)
@@ -111,7 +167,10 @@ def test_a_damaged_base_is_set_aside_and_the_next_job_writes_it(store: Store, sc
     report = checked(store, repair=True)
     assert report.exit_code == 7
     assert scene.missing_jobs() == [2]  # whole, but no other job is left to write the base
-    assert report.scenes[0].set_aside == ("base", "job 2 (whole; rendered again, as a job writes the base)")
+    moved = () if harm == "removed" else ("base",)
+    assert report.scenes[0].set_aside == (*moved, "job 2 (whole; rendered again, as a job writes the base)")
+    again = checked(store, repair=True)
+    assert (noted(again), again.exit_code, again.scenes[0].set_aside) == ({"base-to-come": 1}, 0, ())
     commit_all(scene)
     scene.write_base(*samples.base())
     assert data(scene) == clean
@@ -124,7 +183,10 @@ def test_a_damaged_spec_is_set_aside_and_the_next_submission_writes_it(store: St
     whole = file.read_bytes()
     flip(file, 30)
     assert checked(store, repair=True).exit_code == 7
-    assert Store(store.root).scene_ids() == []
+    with pytest.raises(
+        CorruptError, match=r"spec\.json: is missing, .* `photonfarm submit` of the same spec writes it"
+    ):
+        Store(store.root).scene(scene.scene_id)
     assert checked(store).exit_code == 4  # its plans are there without it
     Store(store.root).plan(samples.small_spec(), Request(modifications=5, views_per_modification=2))
     assert file.read_bytes() == whole

@@ -208,3 +208,18 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     assert printed["samples"][0]["complete"]
     assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
+
+
+@pytest.mark.parametrize(
+    ("wanted", "rule"),
+    [
+        (
+            {"modification": "1,2,3"},
+            "--modification: has 3 numbers; four finite ones for each movable group are required",
+        ),
+        ({"view": "1,2,3"}, "--view: has 3 numbers; six finite ones are required"),
+    ],
+)
+def test_a_vector_of_another_length_is_refused_in_a_sentence(wanted: dict[str, str], rule: str) -> None:
+    with pytest.raises(SpecError, match=rule):
+        Query.of(**wanted)

@@ -8,12 +8,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from photonfarm.shared.cli import umbrella
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import connect, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.find import Query, find_samples, scene_named
 from photonfarm.shared.store.local import LocalStorage
 
 _spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
@@ -57,6 +61,7 @@ HARMS: dict[str, Callable[[Path], None]] = {
     "a bit of a plan": lambda scene: flip(scene / "plans/000000/view/c.0.0"),
     "a plan's zarr.json": lambda scene: (scene / "plans/000000/zarr.json").unlink(),
     "the spec": lambda scene: (scene / "spec.json").write_text(""),
+    "the spec, which is lost": lambda scene: (scene / "spec.json").unlink(),
 }
 
 
@@ -84,6 +89,57 @@ def test_a_damaged_scene_holds_up_no_other(
     assert damaged.scene_id in told
     with pytest.raises(CorruptError):
         reconcile(again, connection, scene_id=damaged.scene_id)
+
+
+def test_a_scene_that_has_lost_its_spec_is_told_by_all_and_a_submission_writes_the_spec_again(store: Store) -> None:
+    scene = planned(store)
+    (scene.folder / "spec.json").unlink()
+    again = Store(store.root)
+    assert (again.scene_ids(), again.has_scene(scene.scene_id)) == ([scene.scene_id], True)
+    request = Request(modifications=4)
+    for look in (
+        lambda: again.scene(scene.scene_id),
+        lambda: again.plan(samples.small_spec(points=16), request, dry_run=True),
+        SceneReader(store.root, scene.scene_id).refresh,
+        lambda: find_samples(again, again.scene_ids(), Query.of()),
+    ):
+        with pytest.raises(CorruptError, match=r"spec\.json: is missing, and plans or markers of the scene are there"):
+            look()
+    assert not (scene.folder / "spec.json").exists()
+    assert again.plan(samples.small_spec(points=16), request).known == 4
+    assert again.scene(scene.scene_id).missing_jobs() == [1]
+
+
+def test_what_is_no_scene_of_ours_among_the_scenes_is_ignored_by_all(store: Store) -> None:
+    scene = planned(store)
+    for name in (".DS_Store", "notes.txt", "0" * 32):
+        (store.root / "scenes" / name).write_text("someone's")
+    for name in ("nothex", "1" * 32, "A" * 32):
+        (store.root / "scenes" / name / "plans").mkdir(parents=True)
+    for name in ("nothex", "A" * 32):
+        (store.root / "scenes" / name / "plans/000000").mkdir()
+    again = Store(store.root)
+    assert again.scene_ids() == [scene.scene_id]
+    assert [about.error for about in store_status(again)] == [None]
+    assert scene_named(again, "small") == scene.scene_id
+    samples.commit_all(scene)
+    scene.write_base(*samples.base())
+    report = check_store(again, when="now", repair=True)
+    assert (report.exit_code, [about.scene_id for about in report.scenes]) == (0, [scene.scene_id])
+
+
+def test_status_tells_markers_of_jobs_that_no_plan_has(store: Store) -> None:
+    scene = planned(store)
+    scene.plan(Request(modifications=6))
+    samples.commit_all(scene)
+    words = ["status", "--store", str(store.root), "--redis", "redis://127.0.0.1:1/0"]
+    assert CliRunner().invoke(umbrella, words).exit_code == 0
+    shutil.rmtree(scene.folder / "plans/000001")
+    told = CliRunner().invoke(umbrella, words)
+    assert isinstance(told.exception, StoreError)
+    for said in (told.stdout, str(told.exception)):
+        assert "1 of 3 markers are of jobs that no plan has" in said
+    assert "3/2" in told.stdout
 
 
 def test_a_damaged_plan_s_error_says_what_mends_it(store: Store) -> None:
@@ -178,6 +234,22 @@ def test_nothing_of_a_store_that_is_gone_is_taken_for_missing(
 def test_a_store_without_scenes_or_temporary_files_is_there(store: Store) -> None:
     shutil.rmtree(store.root / "tmp", ignore_errors=True)
     assert (Store(store.root).scene_ids(), store_status(store), store.sweep()) == ([], [], 0)
+
+
+def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_adopted(store: Store) -> None:
+    """A new document would have another id."""
+    planned(store)
+    document = store.root / "photonfarm.json"
+    whole = document.read_bytes()
+    document.unlink()
+    for create in (False, True):
+        with pytest.raises(
+            CorruptError, match=r"photonfarm\.json: is missing, and scenes are there: put it back from a"
+        ):
+            Store(store.root, create=create)
+    assert not document.exists()
+    document.write_bytes(whole)
+    assert Store(store.root, create=True).store_id == store.store_id
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[]"])

@@ -223,11 +223,15 @@ def test_held_out_selects_what_training_keeps(tmp_path: Path, objects: list | No
         assert topped_up(scene, condition) == expected
 
 
-@pytest.mark.parametrize(
-    "condition", ["views=10", "views=first:0", "rows=a", "plan=-1", "modification=XYZ", "held-out=1.5", "all", ""]
-)
+@pytest.mark.parametrize("condition", ["views=10", "views=first:0", "rows=a", "plan=-1", "held-out=1.5", "all", ""])
 def test_a_condition_that_is_none_is_refused_with_those_that_are(condition: str) -> None:
     with pytest.raises(SpecError, match=r"is no condition; allowed are views=first:N"):
+        TopUp.of("+8", [condition])
+
+
+@pytest.mark.parametrize("condition", ["modification=XYZ", "view=zz", "view=", f"view={'a' * 33}"])
+def test_a_key_that_is_none_is_refused_with_what_one_is(condition: str) -> None:
+    with pytest.raises(SpecError, match=r"is no content key of a (view|modification), nor how one begins"):
         TopUp.of("+8", [condition])
 
 

@@ -30,7 +30,7 @@ def umbrella(ctx: click.Context, config: Path) -> None:
 
     Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
     to stdout, talk goes to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec, 4 store, 5 Redis, 6 this machine
-    cannot render, 7 incomplete, 1 anything else.
+    cannot render, 7 incomplete, 130 Ctrl-C, 1 anything else.
     """
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():
@@ -89,7 +89,8 @@ def redis_option(command: Command) -> Command:
     return click.option(
         "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
         help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
-        "file that PHOTONFARM_REDIS_PASSWORD_FILE names.", show_envvar=True, callback=_with_password,
+        "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
+        "redis://default@host for a Redis with requirepass.", show_envvar=True, callback=_with_password,
     )(command)  # fmt: skip
 
 
@@ -123,7 +124,7 @@ def request_options(command: Command) -> Command:
     """The options that make a request."""
     options = (
         click.option("--modifications", type=click.IntRange(1), default=128, show_default=True,
-                     help="Random configurations (one is all there is of a static scene)."),
+                     help="Random configurations; a static scene has one, of which modifications × views are planned."),
         click.option("--views", type=click.IntRange(1), default=2, show_default=True, help="Views per configuration."),
         click.option("--passes", type=click.IntRange(1), default=1, show_default=True, help="Noisy passes per view."),
         click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Master seed; 0 is a seed."),

@@ -8,7 +8,8 @@
     ├── BackendError (RuntimeError) exit 6  this machine cannot render: Mitsuba, LLVM or scene files
     └── IncompleteError            exit 7   work that ended before it was done
 
-Exit 0 is success, 2 is wrong usage of a command (given by click). A message names the key, the value and the rule.
+Exit 0 is success, 2 is wrong usage of a command (given by click), 130 is Ctrl-C in `photonfarm up`.
+A message names the key, the value and the rule.
 """
 
 from __future__ import annotations

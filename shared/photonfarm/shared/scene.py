@@ -28,6 +28,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 BUILTIN_ROOMS = ("cornell", "room")
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
+INPUT_SHOWN = 100
+"""Characters of a wrong value that a message repeats: it may be a whole file."""
 
 
 class Frozen(BaseModel):
@@ -260,12 +262,16 @@ def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str
     for fault in error.errors():
         key = ".".join(map(str, fault["loc"])) or "the spec"
         rule = fault["msg"].removeprefix("Value error, ")
-        if fault["type"] in ("value_error", "missing"):
+        if fault["type"] in ("value_error", "missing", "json_invalid"):
             yield f"{key}: {rule}"
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {scene_files.nearest(str(fault['loc'][-1]), known)}"
         else:
-            yield f"{key} = {fault['input']!r}: {rule}"
+            yield f"{key} = {_shortened(repr(fault['input']))}: {rule}"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
 
 
 def _keys(model: type[BaseModel]) -> set[str]:

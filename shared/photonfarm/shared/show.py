@@ -43,6 +43,9 @@ class Finding(Protocol):
         """Of the command, where this does not work; 0 if it can be done without."""
 
 
+ANSWER_S = 5.0
+"""How long `status` waits for an answer of Redis; workers have more patience."""
+
 HELD_UP_SHOWN = 10
 """Workers that take no jobs, of which it is said why."""
 
@@ -139,7 +142,7 @@ def submission(result: Submission, as_json: bool) -> None:
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     """The store's scenes, and the queue where there is one.
 
-    Raises StoreError at the end if a scene or a marker cannot be read.
+    Raises StoreError at the end if a scene or a marker cannot be read, or a marker is of no plan.
     """
     from photonfarm.shared.errors import StoreError
     from photonfarm.shared.store import Store, store_status
@@ -151,6 +154,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     if unreadable := [s["error"] for s in scenes if s["error"]]:
         unread.append(f"{len(unreadable)} of {len(scenes)} scenes cannot be read: {'; '.join(unreadable)}")
     unread += [f"scene {s['scene_id']}: {_unread_markers(s)}" for s in scenes if s["markers_unreadable"]]
+    unread += [f"scene {s['scene_id']}: {_lost_plan(s)}" for s in scenes if s["markers_without_plan"]]
     if unread:
         raise StoreError("; ".join(unread))
 
@@ -163,22 +167,44 @@ def _unread_markers(scene: Mapping[str, Any]) -> str:
     )
 
 
+def _lost_plan(scene: Mapping[str, Any]) -> str:
+    """What is said of a scene with markers of jobs that no plan has."""
+    return (
+        f"{scene['markers_without_plan']} of {scene['jobs_committed']} markers are of jobs that no plan has; "
+        "`photonfarm store check` tells whether the last plan is missing"
+    )
+
+
 def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json: bool) -> None:
+    from photonfarm.shared import queue
+
+    if as_json:
+        found, _ = _queue_status(opened, redis_url)
+        causes = queue.causes(_still_missing(opened, found.failed)) if found else []
+        _json({"scenes": scenes, "queue": found and _queue_document(found, causes, opened.root)})
+        return
+    _scenes(scenes)  # before Redis is asked, which may not answer
+    found, absent = _queue_status(opened, redis_url)
+    if found is None:
+        click.echo(f"queue: {absent}")
+        return
+    _queue(opened, found, {s["scene_id"]: s["name"] for s in scenes})
+
+
+def _queue_status(opened: Store, redis_url: str) -> tuple[QueueStatus | None, str]:
+    """What Redis knows; None, and why nothing is known."""
     from photonfarm.shared import queue
     from photonfarm.shared.errors import QueueError
 
-    store = opened.root
     try:
-        connection = queue.connect(redis_url)
-        queue.check_served(connection, opened)
-        found: queue.QueueStatus | None = queue.queue_status(connection)
-        absent = ""
+        with queue.connect(redis_url, only_s=ANSWER_S) as connection:
+            queue.check_served(connection, opened)
+            return queue.queue_status(connection), ""
     except QueueError as error:
-        found, absent = None, str(error)
-    causes = queue.causes(_still_missing(opened, found.failed)) if found else []
-    if as_json:
-        _json({"scenes": scenes, "queue": found and _queue_document(found, causes, store)})
-        return
+        return None, str(error)
+
+
+def _scenes(scenes: Iterable[Mapping[str, Any]]) -> None:
     _table(
         (
             (
@@ -196,21 +222,25 @@ def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json
             click.echo(f"{s['name']} {s['scene_id']}: cannot be read: {s['error']}")
         if s["markers_unreadable"]:
             click.echo(f"{s['name']} {s['scene_id']}: {_unread_markers(s)}")
+        if s["markers_without_plan"]:
+            click.echo(f"{s['name']} {s['scene_id']}: {_lost_plan(s)}")
     click.echo()
-    if found is None:
-        click.echo(f"queue: {absent}")
-        return
+
+
+def _queue(opened: Store, found: QueueStatus, names: Mapping[str, str]) -> None:
+    from photonfarm.shared import queue
+
+    causes = queue.causes(_still_missing(opened, found.failed))
     failed, aside = sum(len(cause.jobs) for cause in causes), sum(cause.set_aside for cause in causes)
     click.echo(
         f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
     )
-    names = {s["scene_id"]: s["name"] for s in scenes}
     for line in _held_up(found, names):
         click.echo(f"  {line}")
     for cause in causes:
         click.echo(f"  {len(cause.jobs)} × {cause.cause}")
-        click.echo(f"      to repeat one: {queue.repeating_command(store, cause.example)}")
+        click.echo(f"      to repeat one: {queue.repeating_command(opened.root, cause.example)}")
 
 
 def _held_up(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:

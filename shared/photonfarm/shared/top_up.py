@@ -215,6 +215,11 @@ def _parsed(condition: str) -> Condition:
             return _with_modification, value
         case ["view", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
             return _with_view, value
+        case ["modification" | "view" as kind, value]:
+            raise SpecError(
+                f"where {condition!r}: {value!r} is no content key of a {kind}, nor how one begins: 1 to 32 "
+                "hexadecimal digits, a to f in lower case"
+            )
         case ["held-out"]:
             return _held_out, HELD_OUT
         case ["held-out", value] if re.fullmatch(r"0?\.\d{1,9}", value):

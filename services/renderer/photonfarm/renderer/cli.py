@@ -53,11 +53,13 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
 @click.option(
     "--ahead", type=click.FloatRange(1), metavar="RATIO",
     help="Take no job of a scene while more of its samples are committed than RATIO × those that its trainer has used. "
-    "The first 256 of a scene may always be; without a trainer it stops there. Below 1 it would stop for good.",
+    "About the first 256 of a scene may always be (jobs are taken and finished whole, by each worker); without a "
+    "trainer it stops there. Below 1 it would stop for good.",
 )  # fmt: skip
 @click.option(
     "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
-    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is started five times.",
+    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is started five times. A worker that was "
+    "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
 )  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")

@@ -14,7 +14,8 @@ from types import FrameType
 
 import redis
 
-from photonfarm.renderer.worker_settings import GRACE_S, JOB_IN_HAND, RECYCLED, WorkerSettings
+from photonfarm.renderer.worker_settings import GRACE_S, JOB_IN_HAND, RECYCLED, TALLY, WorkerSettings
+from photonfarm.renderer.worker_talk import Tally
 from photonfarm.shared import queue
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.processes import process_space
@@ -38,6 +39,7 @@ class Words:
     last: str  # why it ended, if it said so
     job: str | None  # the one that it began last
     hung: str  # where the deadline has ended that; "" if it has not
+    tally: Tally  # of the jobs that ended
 
     @classmethod
     def of(cls, told: str) -> Words:
@@ -45,9 +47,11 @@ class Words:
         said, timeout, dump = told.partition("Timeout (")
         lines = said.splitlines()
         jobs = [line.removeprefix(JOB_IN_HAND) for line in lines if line.startswith(JOB_IN_HAND)]
-        others = [line for line in lines if line.strip() and not line.startswith(JOB_IN_HAND)]
+        tallies = [line for line in lines if line.startswith(TALLY)]
+        others = [line for line in lines if line.strip() and not line.startswith((JOB_IN_HAND, TALLY))]
         stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
-        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]))
+        tally = Tally.of(tallies[-1]) if tallies else Tally()
+        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]), tally)
 
     @property
     def overdue(self) -> str | None:
@@ -65,6 +69,7 @@ class Supervisor:
         self._say = say
         self._stop = threading.Event()
         self._child: subprocess.Popen[bytes] | None = None
+        self._tally = Tally()
 
     def run(self) -> None:
         """Supervise; raises what the child cannot go on with."""
@@ -82,6 +87,8 @@ class Supervisor:
                         queue.serve(connection, store)
                         self._supervise(store)
             finally:
+                if (self._tally.jobs or self._tally.failed) and not self._settings.quiet:
+                    self._say(f"worker {self._settings.name}: ended: {self._tally}")
                 with contextlib.suppress(redis.RedisError):
                     if store is not None:
                         queue.release(connection, store)
@@ -156,8 +163,9 @@ class Supervisor:
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
                 self._child.stdin.flush()  # and left open: its end tells the child that we are gone
-            told = self._child.stdout.read().decode(errors="replace")
-            return self._child.wait(), Words.of(told)
+            words = Words.of(self._child.stdout.read().decode(errors="replace"))
+            self._tally += words.tally
+            return self._child.wait(), words
 
     # ---------------------------------------------------------------------------------------------------------- signals
 

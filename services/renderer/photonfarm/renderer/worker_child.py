@@ -26,7 +26,7 @@ from photonfarm.renderer import jobs
 from photonfarm.renderer.backpressure import DiskReserve, TrainerPace, is_full
 from photonfarm.renderer.heartbeat import Heart
 from photonfarm.renderer.worker_settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
-from photonfarm.renderer.worker_talk import Talk
+from photonfarm.renderer.worker_talk import Talk, Tally
 from photonfarm.shared import queue
 from photonfarm.shared.errors import (
     BackendError,
@@ -77,7 +77,7 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
 def _leave_word(words: int, message: str) -> None:
     """Tell the supervisor, if it is still there."""
     with contextlib.suppress(BrokenPipeError):
-        os.write(words, f"{message}\n".encode())
+        os.write(words, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
 
 
 def _end_with_supervisor() -> None:
@@ -119,6 +119,8 @@ class RenderWorker(SimpleWorker):
             else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
         )
         self._talk = Talk(settings)
+        self._words = words
+        self._tally = Tally()
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; the exit code, 0 only if all is complete."""
@@ -230,10 +232,26 @@ class RenderWorker(SimpleWorker):
         """Run one job under a heartbeat and a deadline."""
         self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
         self._failed = False
+        began = time.monotonic()
         with self._heart.working(job.id), self._talk.timing(job.id):
             self._count_start(job)
             super().execute_job(job, queue)
             self._settle(job.id)
+        self._count(job.id, time.monotonic() - began)
+
+    def _count(self, name: str, seconds: float) -> None:
+        """Have the supervisor know what became of the jobs so far: it outlives us, whatever ends us."""
+        done = not self._failed
+        self._tally += Tally(done, not done, self._samples(name) if done else 0, seconds)
+        if self._words is not None:
+            _leave_word(self._words, self._tally.line)
+
+    def _samples(self, name: str) -> int:
+        """How many samples a job has; 0 where its scene cannot be read any more."""
+        with contextlib.suppress(PhotonfarmError, IndexError):
+            arguments = RenderArguments.of(name)
+            return len(self._store.scene(arguments.scene_id).job_rows(arguments.job).samples)
+        return 0
 
     def _count_start(self, job: RenderJob) -> None:
         """Count a start, and have a job refused that has been started too often."""
@@ -260,7 +278,7 @@ class RenderWorker(SimpleWorker):
     def handle_exception(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> None:  # noqa: ARG002
         """Decide what a failed job means: for the job, for this worker, or nothing."""
         if self._is_committed(job.id):
-            log.warning("job %s is committed; what Redis keeps of it was not: %s", job.id, error)
+            log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", job.id, error)
             return
         self._failed = True
         what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"

@@ -18,6 +18,9 @@ RECYCLED = 75
 JOB_IN_HAND = "job in hand: "
 """What a child writes to its supervisor, before a job's name, when it begins the job."""
 
+TALLY = "so far: "
+"""What a child writes to its supervisor, before the numbers of a `Tally`, when a job has ended."""
+
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
 """Of what a supervisor and its child say."""
 

@@ -6,10 +6,51 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
-from photonfarm.renderer.worker_settings import WorkerSettings
+from photonfarm.renderer.worker_settings import TALLY, WorkerSettings
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What became of jobs."""
+
+    jobs: int = 0  # done
+    failed: int = 0
+    samples: int = 0  # of those that are done
+    seconds: float = 0.0  # of all
+
+    def __add__(self, other: Tally) -> Tally:
+        """Both together."""
+        return Tally(
+            self.jobs + other.jobs,
+            self.failed + other.failed,
+            self.samples + other.samples,
+            self.seconds + other.seconds,
+        )
+
+    @property
+    def line(self) -> str:
+        """As a child tells it."""
+        return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
+
+    @classmethod
+    def of(cls, line: str) -> Tally:
+        """What a child has told."""
+        jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
+        return cls(int(jobs), int(failed), int(samples), float(seconds))
+
+    def __str__(self) -> str:
+        """As people are told."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"{counted(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
+
+
+def counted(jobs: int) -> str:
+    """So many jobs, in words."""
+    return f"{jobs} job{'s' * (jobs != 1)}"
 
 
 class Talk:
@@ -37,9 +78,9 @@ class Talk:
         if now - self._said >= self._every_s:
             self._said = now
             log.info(
-                "worker %s: %d jobs in %.0f s, %.2f s each; the last was %s",
+                "worker %s: %s in %.0f s, %.2f s each; the last was %s",
                 self._name,
-                self._jobs,
+                counted(self._jobs),
                 self._seconds,
                 self._seconds / self._jobs,
                 name,

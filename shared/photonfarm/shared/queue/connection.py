@@ -7,22 +7,27 @@ from urllib.parse import quote, unquote, urlsplit
 
 import redis
 from redis import Redis
-from redis.backoff import ExponentialBackoff
+from redis.backoff import ExponentialBackoff, NoBackoff
 from redis.retry import Retry
 
 from photonfarm.shared.errors import QueueError
 
 SOCKET_TIMEOUT_S = 30
+PASSWORD_VARIABLE = "PHOTONFARM_REDIS_PASSWORD_FILE"  # noqa: S105 - the name of a variable
 USER = "photonfarm"
 """Who a URL without a name logs in as, when its password comes from a file."""
 
 
-def connect(url: str) -> Redis:
-    """A connection that has answered once; raises QueueError with a sentence if there is no Redis or it refuses us."""
+def connect(url: str, *, only_s: float | None = None) -> Redis:
+    """A connection that has answered once; raises QueueError with a sentence if there is no Redis or it refuses us.
+
+    With `only_s`, each answer is waited for so long and once, for somebody who looks at the terminal.
+    """
     shown = without_password(url)
+    retry = _retry() if only_s is None else Retry(NoBackoff(), 0)
     try:
         connection = Redis.from_url(
-            _checked(url), socket_timeout=SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=_retry()
+            _checked(url), socket_timeout=only_s or SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=retry
         )
     except (ValueError, TypeError):  # their text may hold a piece of the password
         raise QueueError(
@@ -32,8 +37,34 @@ def connect(url: str) -> Redis:
     try:
         connection.ping()
     except (redis.RedisError, OSError) as error:
-        raise QueueError(f"no Redis at {shown}: {error}") from error
+        raise QueueError(f"no Redis at {shown}: {_reason(error, url)}") from error
     return connection
+
+
+def _reason(error: Exception, url: str) -> str:
+    """Why there is no connection, and what to do if it is for want of a name or password."""
+    if not isinstance(error, redis.AuthenticationError):
+        return str(error)
+    reason = str(error).rstrip(".")
+    if not has_password(url):
+        return (
+            f"it wants a password ({reason}); put it into a file that {PASSWORD_VARIABLE} names. That logs in as the "
+            f"user {USER}, and with redis://default@host as the one that `requirepass` is for"
+        )
+    if urlsplit(url).username == USER:
+        return (
+            f"it does not let in the user {USER} ({reason}), which a password file ({PASSWORD_VARIABLE}) is for unless "
+            "the URL names another; a Redis with `requirepass` has the user default: redis://default@host"
+        )
+    return reason
+
+
+def is_absent(error: QueueError) -> bool:
+    """Whether an error of `connect` means that nothing answers there, and not that it refuses us, or hangs."""
+    cause = error.__cause__
+    return isinstance(cause, redis.ConnectionError) and not isinstance(
+        cause, redis.AuthenticationError | redis.BusyLoadingError
+    )
 
 
 def _checked(url: str) -> str:

@@ -8,6 +8,7 @@ from itertools import count
 
 from redis import Redis
 
+from photonfarm.shared.processes import process_space
 from photonfarm.shared.queue.untrusted import beginnings, names_below, remove_lasting
 
 ALIVE = "alive:"
@@ -88,10 +89,25 @@ def job_of_worker(connection: Redis, worker: str) -> str | None:
 
 
 def _heartbeat_of(connection: Redis, worker: str) -> _Heartbeat | None:
-    words = next(beginnings(connection, [WORKER + worker], _VALUE_BYTES)).split()
+    return _parsed(next(beginnings(connection, [WORKER + worker], _VALUE_BYTES)))
+
+
+def _parsed(value: str) -> _Heartbeat | None:
+    words = value.split()
     if len(words) != 3 or not words[2].isascii() or not words[2].isdecimal() or len(words[2]) > 9:
         return None
     return _Heartbeat(words[0], None if words[1] == "-" else words[1], int(words[2]))
+
+
+def workers_alive(connection: Redis) -> set[str]:
+    """The workers with a heartbeat, but for those of this machine that have ended since their last one."""
+    names = sorted(names_below(connection, WORKER))
+    said = beginnings(connection, [WORKER + name for name in names], _VALUE_BYTES)
+    return {name for name, held in zip(names, map(_parsed, said), strict=True) if not _has_ended(held)}
+
+
+def _has_ended(held: _Heartbeat | None) -> bool:
+    return held is not None and held.host == process_space() and _is_gone(held.process)
 
 
 def hosts(connection: Redis) -> set[str]:

@@ -15,7 +15,7 @@ from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
 from photonfarm.shared.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
-from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, WORKER
+from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
 from photonfarm.shared.queue.held_up import HeldUp, read_held_up
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
@@ -203,7 +203,7 @@ class QueueStatus:
 
     queued: int
     running: int  # jobs with a heartbeat
-    workers: int  # with a heartbeat
+    workers: int  # with a heartbeat; of this machine only those that live
     failed: dict[str, Failure]  # by job name
     held_up: HeldUp
 
@@ -214,7 +214,7 @@ def queue_status(connection: Redis) -> QueueStatus:
         return QueueStatus(
             queued=len(open_queue(connection)),
             running=len(names_below(connection, ALIVE)),
-            workers=len(names_below(connection, WORKER)),
+            workers=len(workers_alive(connection)),
             failed=read_failures(connection),
             held_up=read_held_up(connection),
         )

@@ -23,7 +23,7 @@ from photonfarm.shared.store.plan_check import PlanCheck
 from photonfarm.shared.store.plan_repair import PlanRepair
 from photonfarm.shared.store.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.repeated_seeds import equal_samples
-from photonfarm.shared.store.scene_store import SCENES, read_spec
+from photonfarm.shared.store.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.storage import TMP, Storage, store_errors
 from photonfarm.shared.store.store import Store
 from photonfarm.shared.store.strangers import strangers
@@ -79,7 +79,7 @@ def check_store(
     """
     storage = store.storage
     with store_errors("check the store", storage.where):
-        ids = sorted(storage.names(SCENES)) if scene_id is None else [scene_id]
+        ids = scene_ids(storage) if scene_id is None else [scene_id]
         if scene_id is not None and not storage.names(f"{SCENES}/{scene_id}"):
             raise StoreError(f"{storage.where}: holds no scene {scene_id}")
         quarantine = Quarantine(storage, when)
@@ -127,7 +127,7 @@ class _SceneChecking:
             return self._report(None, aside)
         committed = sorted(markers.jobs(self._storage, self._name))
         inputs, rewritten = self._plans(spec, quarantine)
-        self._add(inputs.check_base(needed=bool(committed)))
+        self._add(inputs.check_base(set(committed)))
         scene = None
         if inputs.shard_rows is not None:
             scene = Checked(
@@ -216,8 +216,8 @@ class _SceneChecking:
             elif self._set_aside(scene, quarantine, job, why):
                 aside.append(f"job {job}")
         if why := self._findings.of(Cause.BASE):
-            quarantine.base(self._name, why)
-            aside.append("base")
+            if quarantine.base(self._name, why):
+                aside.append("base")
             committed = markers.jobs(self._storage, self._name)
             jobs = scene.plans[-1].end_job if scene is not None and scene.plans else 0
             if scene is not None and committed.issuperset(range(jobs)) and jobs:

@@ -37,14 +37,17 @@ def is_store_id(value: object) -> bool:
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) is not None
 
 
-def check_version(name: object, version: object, where: str) -> None:
-    """Return for what this program reads and writes; raises StoreError, with what to do, for any other format."""
+def check_version(name: object, version: object, where: str, document: str = "photonfarm.json") -> None:
+    """Return for what this program reads and writes; raises StoreError, with what to do, for any other format.
+
+    `document` is what states them.
+    """
     if name == FORMAT and type(version) is int and version == VERSION:
         return
     if name != FORMAT:
-        advice = "Give the folder of a photonfarm store."
+        advice = f"Give the folder of a photonfarm store, or restore {document} from a copy."
     elif type(version) is not int or version < 1:
-        advice = "No photonfarm has written that: versions count from 1. Restore photonfarm.json from a copy."
+        advice = f"No photonfarm has written that: versions count from 1. Restore {document} from a copy."
     elif version < VERSION:
         advice = (
             "An older photonfarm made it: read it with the one that its markers name under figures.versions, or render "

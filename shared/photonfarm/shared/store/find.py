@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store.query import Query
 from photonfarm.shared.store.scene_match import FoundSample, Place, SceneMatch
-from photonfarm.shared.store.scene_store import SCENES
 from photonfarm.shared.store.store import Store
 
 __all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named"]
@@ -25,7 +24,7 @@ class Matches:
 
 def scene_named(store: Store, text: str) -> str:
     """The id of a scene by its id, the beginning of its id, or its name; StoreError if that is none or several."""
-    ids = sorted(store.storage.names(SCENES))
+    ids = store.scene_ids()
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
     found = found or [each for each in ids if _has_name(store, each, text)]
     if len(found) != 1:

@@ -72,6 +72,11 @@ class Cause(Enum):
         Remedy.REWRITE,
     )
     BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
+    BASE_TO_COME = (
+        "base-to-come",
+        "geometry and base point cloud are not there: the next job that a worker renders writes them",
+        Remedy.LOOK,
+    )
     BLACK = "black", "both halves are black: no light, or the camera is inside something", Remedy.LOOK
     BLACK_HALF = (
         "black-half",

@@ -408,13 +408,23 @@ def os_errors(name: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
+        if "<Code>NoSuchBucket</Code>" in str(error):  # else what is not there would be looked for in it
+            raise OSError(errno.EIO, "the bucket does not exist", name) from error
         raise FileNotFoundError(errno.ENOENT, "no such object, or no such bucket", name) from error
     except (PermissionDeniedError, UnauthenticatedError) as error:
-        raise PermissionError(errno.EACCES, _first_line(error), name) from error
+        raise PermissionError(errno.EACCES, _reason(error), name) from error
     except BaseError as error:
         if "404 Not Found" in _first_line(error):  # how the library tells that a bucket cannot be listed
             raise FileNotFoundError(errno.ENOENT, "no such bucket", name) from error
-        raise OSError(errno.EIO, _first_line(error), name) from error
+        raise OSError(errno.EIO, _reason(error), name) from error
+
+
+def _reason(error: Exception) -> str:
+    """What the library says, and code and message of the server's answer instead of its XML, in a line."""
+    said = re.split(r"<\?xml|<Error>", _first_line(error))[0].rstrip(": ")
+    answer = str(error).partition("\n\nDebug source:")[0]
+    told = [match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))]
+    return " ".join(": ".join([said, *told]).split())
 
 
 def _first_line(error: Exception) -> str:

@@ -5,7 +5,7 @@ A chunk that is missing is read by Zarr as fill values, in silence; so the chunk
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import fields
 from typing import Any
 
@@ -79,9 +79,13 @@ class PlanCheck:
             return
         try:
             group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
+            plans.check_version(group.attrs, self._storage.where)
             jobs, shard_rows = (int(str(group.attrs[name])) for name in ("jobs", "shard_rows"))
+        except StoreError as error:
+            yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
+            return
         except _UNREADABLE as error:
-            detail = f"cannot be read: {error}; {plans.RESTORE}"
+            detail = f"cannot be read: {plans.reason(error)}; {plans.RESTORE}"
             yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/zarr.json")
             return
         self.shard_rows = self.shard_rows or shard_rows
@@ -102,7 +106,7 @@ class PlanCheck:
         except CorruptError as error:
             return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
         except _UNREADABLE as error:
-            return f"cannot be read: {error}"
+            return f"cannot be read: {plans.reason(error)}"
         return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
 
     def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
@@ -148,20 +152,26 @@ class PlanCheck:
 
     # ------------------------------------------------------------------------------------------------------------- base
 
-    def check_base(self, *, needed: bool) -> Iterator[Finding]:
-        """What is wrong with geometry and base point cloud; `needed` once a job is committed."""
+    def check_base(self, committed: Set[int]) -> Iterator[Finding]:
+        """What is wrong with geometry and base point cloud, which are there once a job is committed.
+
+        Any job that is rendered writes them: without them and with one of the plans' jobs to come, workers mend that.
+        """
         folder = f"{self._scene}/base"
         try:
-            yield from self._base(folder, needed=needed)
+            yield from self._base(folder, committed)
         except OSError as error:
             yield self._unreadable(folder, error)
 
-    def _base(self, folder: str, *, needed: bool) -> Iterator[Finding]:
+    def _base(self, folder: str, committed: Set[int]) -> Iterator[Finding]:
         import zarr
 
         if not self._storage.exists(f"{folder}/zarr.json"):
-            if needed:
-                yield Finding(Cause.BASE, "is missing, and jobs are committed", self._id, file=folder)
+            if committed:
+                jobs = self.plans[-1].end_job if self.plans else 0
+                waits = not self._storage.names(folder) and not committed >= set(range(jobs))
+                cause = Cause.BASE_TO_COME if waits else Cause.BASE
+                yield Finding(cause, "is missing, and jobs are committed", self._id, file=folder)
             return
         found = []
         for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
@@ -171,7 +181,9 @@ class PlanCheck:
                 )
                 names = [(field.name, group[part]) for field in fields(record)]
             except _UNREADABLE as error:
-                found.append(Finding(Cause.BASE, f"cannot be read: {error}", self._id, file=f"{folder}/{part}"))
+                found.append(
+                    Finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", self._id, file=f"{folder}/{part}")
+                )
                 continue
             for name, parent in names:
                 if detail := self._array(parent, f"{folder}/{part}", name):
@@ -187,7 +199,7 @@ def _declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: i
         declared = group[array.name]
         found = declared.shape, declared.dtype, declared.chunks, declared.shards
     except _UNREADABLE as error:
-        return f"cannot be read: {error}"
+        return f"cannot be read: {plans.reason(error)}"
     shape = array.shape
     expected = (jobs * shard_rows, *shape), array.dtype, (1, *shape), (shard_rows, *shape)
     return "" if found == expected else f"declares {found}; {expected} is right"

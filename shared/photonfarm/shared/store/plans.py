@@ -5,25 +5,27 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import UNUSED, Expansion, Known, PlannedRows, Request, expand
 from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.shared.store import declarations, schema
 from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.view import View
 
+PLANS = "plans"
 NAME_DIGITS = 6
 
 MISSING = (
@@ -170,7 +172,7 @@ def count(storage: Storage, scene: str, loaded: int = 0) -> int:
     The last one does not count yet while it is being written, which can be seen in a bucket alone: it is claimed there,
     and its zarr.json comes last.
     """
-    names = [name for name in storage.names(f"{scene}/plans") if name.isascii() and name.isdecimal()]
+    names = [name for name in storage.names(f"{scene}/{PLANS}") if name.isascii() and name.isdecimal()]
     found = max((int(name) + 1 for name in names if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
     if found <= loaded:
         return loaded
@@ -186,14 +188,27 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     name = folder(scene, number)
     try:
         group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+        check_version(group.attrs, f"{storage.where}/{name}")
         names = [field.name for field in fields(PlannedRows)]
         rows = PlannedRows(**{each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in names})
         about = about_plan(dict(group.attrs))
     except FileNotFoundError as error:
         raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
     except (ValueError, KeyError, RuntimeError) as error:
-        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {error}; {REWRITE}") from error
+        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
     return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+
+
+def reason(error: Exception) -> str:
+    """One line of why a plan cannot be read."""
+    if isinstance(error, ValidationError):
+        return "; ".join(sentences(error))
+    return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def check_version(attributes: Mapping[str, Any], where: str) -> None:
+    """Return for the attributes of a plan of this program's version; raises StoreError, with a sentence."""
+    declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
 
 
 def about_plan(attributes: dict[str, Any]) -> About:

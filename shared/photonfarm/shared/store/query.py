@@ -58,6 +58,6 @@ def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | 
     except ValueError as error:
         raise SpecError(f"{option} {text!r}: neither a key of 32 hexadecimal digits nor numbers") from error
     if len(vector) % multiple or not np.isfinite(vector).all() or (multiple == 6 and len(vector) != 6):
-        raise SpecError(f"{option}: has {len(vector)} numbers; {'6' if multiple == 6 else '4 per movable group'} "
-                        "finite ones are required")  # fmt: skip
+        rule = "six finite ones" if multiple == 6 else "four finite ones for each movable group"
+        raise SpecError(f"{option}: has {len(vector)} numbers; {rule} are required")
     return vector

@@ -28,7 +28,7 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.plans import StoredPlan
-from photonfarm.shared.store.scene_store import SCENES, read_base, read_spec
+from photonfarm.shared.store.scene_store import SCENES, is_there, read_base, read_spec
 from photonfarm.shared.store.shards import Shard, copy_checked
 from photonfarm.shared.store.storage import FORMAT_FILE, open_storage, renew_copy, store_errors
 from photonfarm.shared.store.store import check_format
@@ -102,9 +102,11 @@ class SceneReader:
         """
         self.taken_back = np.zeros(0, np.int64)
         if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
-            if self._storage.exists(FORMAT_FILE):
-                check_format(self._storage)
-            return np.zeros(0, np.int64)
+            if not self._storage.exists(FORMAT_FILE):
+                return np.zeros(0, np.int64)
+            check_format(self._storage)
+            if not is_there(self._storage, self._scene_id):
+                return np.zeros(0, np.int64)
         _ = self.spec
         committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
         self._load_plans()

@@ -5,6 +5,8 @@ Plans and markers are the truth. Nothing here needs a lock: a name appears once,
 
 from __future__ import annotations
 
+import contextlib
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -18,7 +20,7 @@ from pydantic import ValidationError
 from photonfarm.shared.errors import CorruptError, SpecError, StoreError
 from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Request
 from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.shared.store import declarations, markers, plans, schema
 from photonfarm.shared.store.commit import JobWriter
 from photonfarm.shared.store.plans import JobRows, StoredPlan
@@ -26,6 +28,7 @@ from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import TopUp
 
 SCENES = "scenes"
+_SCENE_ID = re.compile("[0-9a-f]{32}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,17 +174,47 @@ class SceneStore:
                 shutil.rmtree(built, ignore_errors=True)
 
 
+def scene_ids(storage: Storage) -> list[str]:
+    """The scenes that are there, in order of their ids; what else lies among them is somebody else's."""
+    return sorted(name for name in storage.names(SCENES) if is_there(storage, name))
+
+
+def is_there(storage: Storage, scene_id: str) -> bool:
+    """Whether a scene is there: its spec, which is written first, or plans or markers that have lost it."""
+    if not _SCENE_ID.fullmatch(scene_id):
+        return False
+    name = f"{SCENES}/{scene_id}"
+    with store_errors("look for a scene", storage.where), contextlib.suppress(NotADirectoryError):  # somebody's file
+        return storage.exists(f"{name}/spec.json") or any(
+            storage.names(f"{name}/{part}") for part in (plans.PLANS, markers.COMMITTED)
+        )
+    return False
+
+
+def are_there(storage: Storage) -> bool:
+    """Whether a place that may be no store has folders of scenes; raises StoreError if it cannot be read."""
+    with store_errors("look for scenes", storage.where):
+        return SCENES in storage.names("") and any(map(_SCENE_ID.fullmatch, storage.names(SCENES)))
+
+
 def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
-    """The spec of a scene; raises StoreError if there is no such scene."""
+    """The spec of a scene; raises StoreError if there is no such scene, CorruptError if its spec is lost or damaged."""
     name = f"{SCENES}/{scene_id}/spec.json"
     try:
         spec = SceneSpec.model_validate_json(storage.read(name))
     except FileNotFoundError as error:
-        raise StoreError(f"{storage.where}: holds no scene {scene_id}") from error
+        if not is_there(storage, scene_id):
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}") from error
+        if storage.exists(name):  # a submission has begun the scene in the meantime
+            return read_spec(storage, scene_id)
+        raise CorruptError(
+            f"{storage.where}/{name}: is missing, and plans or markers of the scene are there; `photonfarm submit` of "
+            "the same spec writes it again"
+        ) from error
     except OSError as error:
         raise StoreError(f"{storage.where}/{name}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
-        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {error}") from error
+        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {'; '.join(sentences(error))}") from error
     if spec.scene_id != scene_id:
         raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
     return spec

@@ -128,13 +128,18 @@ def chunk_names(array: Any) -> Iterator[str]:
 def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
     """One whole array of inputs or of the base, which lies in a folder.
 
-    Raises CorruptError for a chunk that is missing, which zarr reads as fill values, and what zarr raises for others.
+    Raises CorruptError for a chunk that is missing, which zarr reads as fill values, and ValueError, with the array's
+    name, for others that zarr cannot read.
     """
     held = set(storage.names(folder))
     for name in chunk_names(array):
         if name not in held:
             raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
-    return np.asarray(array[...])
+    try:
+        return np.asarray(array[...])
+    except (ValueError, KeyError, RuntimeError) as error:
+        reason = str(error).partition(" Stored: b")[0].rstrip(".")  # bytes of checksums tell nobody anything
+        raise ValueError(f"{array.path}: {reason}") from error
 
 
 _FLAT: Any = {"name": "default", "configuration": {"separator": "."}}  # c.0.0 in one folder, which is synced once

@@ -26,6 +26,7 @@ class SceneStatus:
     redrawn: int  # renders thrown away for a non-finite value
     markers_unreadable: int  # of committed jobs whose bytes, time and redrawn renders are not counted
     marker_error: str | None  # why the first of these cannot be read
+    markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
     error: str | None = None  # why nothing is known of it; all numbers are 0 then
 
 
@@ -44,7 +45,9 @@ def store_status(store: Store) -> list[SceneStatus]:
     """
     known, failed = store.each(_scene_status)
     for scene_id, error in failed.items():
-        known[scene_id] = SceneStatus(scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, 0, None, str(error))
+        known[scene_id] = SceneStatus(
+            scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error)
+        )
     return [known[scene_id] for scene_id in sorted(known)]
 
 
@@ -58,7 +61,8 @@ def _name(store: Store, scene_id: str) -> str:
 
 def _scene_status(scene: SceneStore) -> SceneStatus:
     progress = scene.progress()
-    committed = sorted(scene.committed_jobs())
+    committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
+    jobs = scene.jobs()
     with ThreadPoolExecutor(_READERS) as readers:
         blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
         sums = list(readers.map(partial(_summed, scene), blocks))
@@ -70,13 +74,14 @@ def _scene_status(scene: SceneStore) -> SceneStatus:
         scene.spec.name,
         progress.planned_samples,
         progress.committed_samples,
-        scene.jobs(),
+        jobs,
         len(committed),
         sum(each.size_bytes for each in sums),
         sum((each.core_s for each in sums), 0.0),
         sum(each.redrawn for each in sums),
         sum(each.unreadable for each in sums),
         str(errors[0]) if errors else None,
+        sum(job >= jobs for job in committed),
     )
 
 

@@ -11,7 +11,7 @@ from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import SHARD_ROWS, Known, Request, expand
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import declarations
-from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore
+from photonfarm.shared.store.scene_store import SCENES, PlanResult, SceneStore, are_there, is_there, scene_ids
 from photonfarm.shared.store.storage import (
     FORMAT_FILE,
     STRAY_AGE_S,
@@ -44,6 +44,8 @@ class Store:
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
             if foreign and not self.storage.exists(FORMAT_FILE):  # nobody made one in the meantime
                 raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
+            if are_there(self.storage):
+                return  # a store that has lost its document: a new one would have another id
             with self.storage.founding():
                 put_json(self.storage, _new_document(), FORMAT_FILE)
 
@@ -56,15 +58,14 @@ class Store:
             )
 
     def scene_ids(self) -> list[str]:
-        """The scenes that are there, in order of their ids."""
+        """The scenes that are there, damaged ones with them, in order of their ids."""
         with store_errors("list the scenes", self.storage.where):
-            names = sorted(self.storage.names(SCENES))
-            return [name for name in names if self.storage.exists(f"{SCENES}/{name}/spec.json")]
+            return scene_ids(self.storage)
 
     def has_scene(self, scene_id: str) -> bool:
-        """Whether a scene is there."""
+        """Whether a scene is there, damaged or not."""
         with store_errors("look for a scene", self.storage.where):
-            return self.storage.exists(f"{SCENES}/{scene_id}/spec.json")
+            return is_there(self.storage, scene_id)
 
     def scene(self, scene_id: str) -> SceneStore:
         """One scene of the store, the same object each time; raises StoreError if it is not there."""
@@ -107,7 +108,8 @@ class Store:
         if dry_run and not self.has_scene(spec.scene_id):
             expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0)
-        return self.add(spec).plan(request, shard_rows=shard_rows, dry_run=dry_run)
+        scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
+        return scene.plan(request, shard_rows=shard_rows, dry_run=dry_run)
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove temporary files that dead writers left; how many."""
@@ -120,6 +122,14 @@ def _new_document() -> dict[str, Any]:
     return {**declarations.stamp(), "id": declarations.new_store_id()}
 
 
+def _put_back() -> str:
+    """What helps a store that has lost its document."""
+    return (
+        f"put it back from a copy. A new store's would be {json.dumps(_new_document())}: without a copy, write that, "
+        "if a photonfarm of this version made the store"
+    )
+
+
 def check_format(storage: Storage) -> str:
     """The id of a store of this program's format and version; raises StoreError, with a sentence, for any other."""
     file = f"{storage.where}/{FORMAT_FILE}"
@@ -127,14 +137,13 @@ def check_format(storage: Storage) -> str:
         document = json.loads(storage.read(FORMAT_FILE))
         name, version = document["format"], document["version"]
     except FileNotFoundError as error:
+        if are_there(storage):
+            raise CorruptError(f"{file}: is missing, and scenes are there: {_put_back()}") from error
         raise StoreError(f"{storage.where}: is not a store: {FORMAT_FILE} is missing") from error
     except OSError as error:
         raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError) as error:
-        raise CorruptError(
-            f"{file}: is not the document of a store: {error}; put it back from a copy. A new store's would be "
-            f"{json.dumps(_new_document())}: without a copy, write that, if a photonfarm of this version made the store"
-        ) from error
+        raise CorruptError(f"{file}: is not the document of a store: {error}; {_put_back()}") from error
     declarations.check_version(name, version, storage.where)
     if not declarations.is_store_id(store_id := document.get("id")):
         raise CorruptError(f"{file}: id = {store_id!r}: 32 lower-case hexadecimal digits are required")

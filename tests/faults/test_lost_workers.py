@@ -61,7 +61,7 @@ def test_two_workers_under_a_hail_of_kills_complete_the_plan_bit_for_bit(
     root, rng = scene.folder.parent.parent, random.Random(0)
     reconcile(Store(root), connect(redis_server.url))
     workers = [
-        start(root, redis_server.url, analytic.command(0.02), until_complete=True, name=f"worker-{i}") for i in range(2)
+        start(root, redis_server.url, analytic.command(0.08), until_complete=True, name=f"worker-{i}") for i in range(2)
     ]
     kills = 0
     while any(w.poll() is None for w in workers) and kills < 6:

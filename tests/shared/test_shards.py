@@ -112,32 +112,6 @@ def test_shards_read_equal_in_zarr_and_those_of_zarr_read_equal_here(
             assert found is None or same(found, rows[row])
 
 
-@pytest.mark.parametrize("block", [1, 100, 1 << 20])
-@pytest.mark.parametrize("pieces", [1, 3])
-def test_a_shard_is_the_same_in_whatever_blocks_it_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int, pieces: int
-) -> None:
-    array = array_of("<f4", (6, 5), compressed=False)
-    rows = random_rows(array, [2, 0, 3], seed=5)
-    expected = write(tmp_path / "expected", array, rows), (tmp_path / "expected").read_bytes()
-    monkeypatch.setattr(shards, "_BLOCK_BYTES", block)
-    monkeypatch.setattr(shards, "_PIECES", pieces)
-    assert (write(tmp_path / "shard", array, rows), (tmp_path / "shard").read_bytes()) == expected
-
-
-def test_whole_blocks_are_written_while_rows_arrive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that a file never has to wait in memory, and is held in huge pages where there are any."""
-    array = array_of("<f4", (6, 5), compressed=False)
-    monkeypatch.setattr(shards, "_BLOCK_BYTES", 100)
-    writer = ShardWriter(tmp_path / "shard", array, SHARD_ROWS)
-    sizes = []
-    for row, values in random_rows(array, [2, 0, 3], seed=5).items():
-        writer.append(row, encode(array, values))
-        sizes.append((tmp_path / "shard").stat().st_size)
-    writer.close()
-    assert sizes == [100, 200, 300]  # of 124, 248 and 372
-
-
 def test_the_checksum_is_the_crc_32c_of_another_library() -> None:
     content = np.random.default_rng(0).integers(0, 256, 1 << 20, np.uint8).tobytes()
     for length in [*range(300), 4095, 65537, 1 << 20]:

@@ -12,11 +12,9 @@ is cut or whose disk fails ends the process, where reading raises.
 from __future__ import annotations
 
 import errno
-import itertools
 import mmap
 import os
 import weakref
-from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -34,12 +32,6 @@ _CRC_BYTES = 4
 _BLOSC_HEADER_BYTES = 16
 _FLUSH_BYTES = 4 << 20
 """Written before the disk is set to work on it: the sync, which a commit waits for, has little left to do."""
-
-_BLOCK_BYTES = 2 << 20
-"""A huge page of most machines."""
-
-_PIECES = 1024
-"""Of memory, written by one call: IOV_MAX."""
 
 _DAMAGED = (errno.EIO, errno.EBADMSG, errno.EUCLEAN)
 """Why a file system refuses a file that is there: the disk, or its own checksums."""
@@ -61,11 +53,7 @@ def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
 
 
 class ShardWriter:
-    """One shard on its way to disk. Rows may come in any order and may be left out.
-
-    Bytes are written in whole blocks, so that the page cache can hold the file in huge pages: a row is copied out of
-    those in three quarters of the time.
-    """
+    """One shard on its way to disk. Rows may come in any order and may be left out."""
 
     def __init__(self, part: Path, array: ArraySchema, shard_rows: int) -> None:
         """Begin the file, which must be new."""
@@ -74,25 +62,23 @@ class ShardWriter:
         self._index = np.full((shard_rows, 2), _EMPTY, "<u8")
         self._checksums: dict[int, bytes] = {}
         self._file = part.open("xb", buffering=0)
-        self._waiting: deque[memoryview] = deque()
-        self._size = self._written = self._flushed = 0
+        self._size = self._flushed = 0
 
     def append(self, row: int, content: memoryview) -> None:
-        """Take one row as `encode` gave it, which must not change afterwards; raises OSError."""
+        """Write one row as `encode` gave it; raises OSError."""
         self._checksums[row] = _crc(content)
         self._index[row] = self._size, len(content) + _CRC_BYTES
-        self._add(content, memoryview(self._checksums[row]))
-        self._write_up_to(self._size - self._size % _BLOCK_BYTES)
-        if (fresh := self._written - self._flushed) > _FLUSH_BYTES:
+        self._write(content)
+        self._write(self._checksums[row])
+        if (fresh := self._size - self._flushed) > _FLUSH_BYTES:
             # begins to write, and does not wait; what is not yet written stays in the page cache
             os.posix_fadvise(self._file.fileno(), self._flushed, fresh, os.POSIX_FADV_DONTNEED)
-            self._flushed = self._written
+            self._flushed = self._size
 
     def finish(self) -> dict[str, Any]:
         """Write the index; the file's size, and one checksum over those of its rows and of the index."""
         index = self._index.tobytes()
-        self._add(memoryview(index), memoryview(_crc(index)))
-        self._write_up_to(self._size)
+        self._write(index + _crc(index))
         self._file.close()
         checksums = b"".join(self._checksums[row] for row in sorted(self._checksums)) + _crc(index)
         return {"size": self._size, "crc32c": _crc(checksums).hex()}
@@ -101,28 +87,11 @@ class ShardWriter:
         """Close the file, finished or not."""
         self._file.close()
 
-    def _add(self, *data: memoryview) -> None:
-        self._waiting.extend(data)
-        self._size += sum(len(piece) for piece in data)
-
-    def _write_up_to(self, end: int) -> None:
-        """Write what waits, up to an offset in the file."""
-        while self._written < end:
-            pieces, left = [], end - self._written
-            for piece in itertools.islice(self._waiting, _PIECES):
-                pieces.append(piece[:left])
-                left -= len(pieces[-1])
-                if not left:
-                    break
-            self._drop(os.writev(self._file.fileno(), pieces))  # which may be a short one
-
-    def _drop(self, written: int) -> None:
-        self._written += written
-        while written:
-            piece = self._waiting.popleft()
-            if len(piece) > written:
-                self._waiting.appendleft(piece[written:])
-            written -= min(written, len(piece))
+    def _write(self, data: bytes | memoryview) -> None:
+        written = 0
+        while written < len(data):  # an unbuffered write may be a short one
+            written += self._file.write(data[written:])
+        self._size += len(data)
 
 
 class Shard:

@@ -7,6 +7,7 @@
     ├── QueueError (OSError)       exit 5   no Redis, or one that refuses us
     ├── BackendError (RuntimeError) exit 6  this machine cannot render: Mitsuba, LLVM or scene files
     └── IncompleteError            exit 7   work that ended before it was done
+        └── DivergedError          exit 8   training whose loss is no longer finite (in the trainer's `learner`)
 
 Exit 0 is success, 2 is wrong usage of a command (given by click), 130 is Ctrl-C in `photonfarm up`.
 A message names the key, the value and the rule.

@@ -55,6 +55,15 @@ def clean_error(prediction: F32, half_a: F32, half_b: F32) -> float:
     return float(np.mean((prediction.astype(np.float64) - half_a) * (prediction.astype(np.float64) - half_b)))
 
 
+def clean_error_having_seen_a(prediction: F32, half_a: F32, half_b: F32) -> float:
+    """Unbiased mean squared error against the clean image of a prediction that was made from A: mean f² − 2fB + AB.
+
+    f and A both are independent of B, and so E[fB] = E[f] I and E[AB] = I². No square of a noisy value enters.
+    """
+    f, a, b = (image.astype(np.float64) for image in (prediction, half_a, half_b))
+    return float(np.mean(f * (f - 2 * b) + a * b))
+
+
 def noise_floor(half_a: F32, half_b: F32) -> float:
     """The variance of the target (A + B)/2, averaged over pixels: mean (A − B)² / 4.
 

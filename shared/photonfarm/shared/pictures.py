@@ -15,15 +15,23 @@ from photonfarm.shared.records import F32
 
 Picture = NDArray[np.uint8]  # (H, W, 3)
 
+GAMMA = 2.2
+
+
+def display_values(exposed: F32) -> F32:
+    """clip(I, 0, 1)^(1/2.2) of exposed linear radiance, in any shape: what a display is given, in [0, 1]."""
+    shown: F32 = np.clip(exposed, 0, 1) ** np.float32(1 / GAMMA)
+    return shown
+
 
 def display(radiance: F32, exposure: float) -> Picture:
     """Linear radiance (H, W, 3) as clip(exposure · I, 0, 1)^(1/2.2)."""
-    return _bytes(np.clip(exposure * np.nan_to_num(radiance), 0, 1) ** (1 / 2.2))
+    return _bytes(display_values(exposure * np.nan_to_num(radiance)))
 
 
 def of_albedo(albedo: F32) -> Picture:
     """Reflectance (H, W, 3) in [0, 1], gamma 2.2."""
-    return _bytes(np.clip(albedo, 0, 1) ** (1 / 2.2))
+    return _bytes(display_values(albedo))
 
 
 def of_normal(normal: F32) -> Picture:

@@ -65,6 +65,21 @@ class Photons:
     bounce: NDArray[np.int8]  # (K,) 0 for the first hit, −1 for an empty slot
 
 
-def arrays_of(record: Geometry | BasePointCloud | ViewBuffers | Photons) -> dict[str, NDArray[np.generic]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Visibility:
+    """Which of the scene's points a view sees: those in the image that nothing hides from the eye.
+
+    A point is seen if its pixel, by floor, is one of the image's, it lies between the near and the far plane, and no
+    surface meets the straight line to it, from where that line crosses the near plane to 1e-4 of the distance from the
+    eye before the point. Glass and masks hide what is behind them, as they do in `ViewBuffers`.
+    """
+
+    points: NDArray[np.bool_]  # (P,) of the base cloud as it is modified; False for points of removed groups
+    photons: NDArray[np.bool_]  # (K,) of the configuration; False for empty slots; (0,) for a scene without photons
+
+
+def arrays_of(
+    record: Geometry | BasePointCloud | ViewBuffers | Photons | Visibility,
+) -> dict[str, NDArray[np.generic]]:
     """The record's arrays by name, in the order of its fields."""
     return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -162,6 +162,11 @@ class PhotonSpec(Frozen):
     paths: Annotated[int, Field(ge=0, le=1 << 20)] = 1024
     depth: Annotated[int, Field(ge=1, le=16)] = 4
 
+    @property
+    def slots(self) -> int:
+        """Photons stored per modification, K; empty slots count."""
+        return self.paths * self.depth
+
 
 class SceneSpec(Frozen):
     """A scene and everything that shapes its samples. No movable group: a static scene."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Iterable, Mapping, Sequence, Set
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import islice
 
@@ -38,7 +40,9 @@ from photonfarm.shared.store import SceneStore, Store
 QUEUE_LIMIT = 10_000
 """Jobs queued at most, at 1.9 kB of Redis memory each; the store holds the rest."""
 
-LOCK_TTL_S = 120
+LOCK_TTL_S = 10
+"""For so long one that died while it filled the queue keeps others from it; one that lives renews its lock."""
+
 _LOCK = "rq:photonfarm:reconcile"
 
 log = logging.getLogger(__name__)
@@ -78,19 +82,40 @@ def reconcile(
     """
     serve(connection, store)
     try:
-        remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # ours ends by itself by then
-        lock = connection.lock(_LOCK, timeout=LOCK_TTL_S)
-        if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
-            return 0
-        try:
+        with _alone(connection, wait_s) as alone:
+            if not alone:
+                return 0
             if retry_failed or retry_set_aside:
                 forget_failures(connection, set_aside=retry_set_aside)
             return _reconcile(store, scene_id, connection, limit)
-        finally:
-            if lock.owned():
-                lock.release()
     except redis.RedisError as error:
         raise QueueError(f"Redis failed while the queue was filled: {error}") from error
+
+
+@contextlib.contextmanager
+def _alone(connection: Redis, wait_s: float) -> Iterator[bool]:
+    """Keep others from filling the queue until the block ends; False if another one still does after `wait_s`."""
+    remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # ours ends by itself by then
+    lock = connection.lock(_LOCK, timeout=LOCK_TTL_S, thread_local=False)
+    if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
+        yield False
+        return
+    ended = threading.Event()
+
+    def renew() -> None:
+        while not ended.wait(LOCK_TTL_S / 4):
+            with contextlib.suppress(redis.RedisError):
+                lock.reacquire()
+
+    renewing = threading.Thread(target=renew, daemon=True)
+    renewing.start()
+    try:
+        yield True
+    finally:
+        ended.set()
+        renewing.join()
+        if lock.owned():
+            lock.release()
 
 
 def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError, IncompleteError
-from photonfarm.shared.records import F32, Photons, ViewBuffers, arrays_of
+from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.store import markers, schema
 from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.plans import JobRows, StoredPlan
@@ -101,11 +101,13 @@ class JobWriter:
         self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
         self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
 
-    def buffers(self, row: int, buffers: ViewBuffers) -> None:
-        """The buffers of a new view row."""
-        self._claim("view", row, "buffers", self._rows.new_views)
+    def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
+        """What a new view row shows: its buffers, and which points and photons it sees."""
+        self._claim("view", row, "view", self._rows.new_views)
         for name, values in arrays_of(buffers).items():
             self._put(row, name, values)
+        self._put_bits(row, "point_seen", visibility.points)
+        self._put_bits(row, "photon_seen", visibility.photons)
 
     def photons(self, row: int, photons: Photons) -> None:
         """The photons of a new modification row."""
@@ -129,6 +131,13 @@ class JobWriter:
             raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
         self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
         self._raise_error()
+
+    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
+        count = schema.bit_counts(self._scene.spec)[name]
+        if seen.shape != (count,):
+            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
+        if count:
+            self._put(row, name, np.packbits(seen, bitorder="little"))
 
     def _write(self) -> None:
         """The thread: after an error it only empties the queue, so that nobody waits for it."""
@@ -278,7 +287,7 @@ class JobWriter:
     def _check_complete(self) -> None:
         expected = {
             "sample": ("radiance", {sample.row for sample in self._rows.samples}),
-            "view": ("buffers", self._rows.new_views),
+            "view": ("view", self._rows.new_views),
             "modification": ("photons", self._photon_rows()),
         }
         for kind, (what, rows) in expected.items():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store.findings import Cause
 from photonfarm.shared.store.halves import Fingerprints, HalvesTest
+from photonfarm.shared.store.schema import bit_counts
 from photonfarm.shared.view import Camera, View
 
 _FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)}
@@ -80,6 +81,12 @@ class ContentCheck:
             tally.back_facing_pixels += behind
             if behind == hits:
                 yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
+
+    def bits(self, name: str, packed: NDArray[np.uint8]) -> Iterator[tuple[Cause, str]]:
+        """Which points or photons a view sees, as they are stored: `point_seen` or `photon_seen`."""
+        count = bit_counts(self._spec)[name]
+        if count % 8 and packed[-1] >> count % 8:
+            yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
 
     def _cosine(self, normal: NDArray[Any], view: View) -> NDArray[np.float32]:
         """Normal times the direction of the ray through each pixel's centre, (P,): positive where seen from behind.

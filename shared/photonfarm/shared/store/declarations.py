@@ -19,7 +19,7 @@ from photonfarm.shared.errors import StoreError
 from photonfarm.shared.keys import KEY_BYTES
 
 FORMAT = "photonfarm store"
-VERSION = 2
+VERSION = 3
 
 
 def stamp() -> dict[str, Any]:
@@ -67,7 +67,7 @@ class Declared:
 
     name: str
     axes: tuple[str, ...]  # names of the axes
-    shape: tuple[str | int, ...]  # their lengths: numbers, or shape letters
+    shape: tuple[str | int, ...]  # their lengths: numbers, or shape letters; "⌈P/8⌉" is P/8 rounded up
     dtype: str  # numpy's notation; always little-endian
     unit: str
     convention: str
@@ -88,6 +88,8 @@ _RADIANCE = "radiance, as the scene states its emitters"
 _FLUX = "flux: radiance × scene unit² × sr"
 _HALVES = "linear RGB, mean over the pixel, not clipped; halves A and B are independent estimates"
 _WORLD = "world coordinates"
+_BITS = "bit i of byte j, bit 0 the least significant"
+_SEEN = "1: in the image, and hidden by nothing; bits left over: 0"
 
 OUTPUTS = (
     Declared(
@@ -131,6 +133,22 @@ OUTPUTS = (
         "<f2",
         "1",
         f"unit shading normal, {_WORLD}, as modelled: not turned to the camera; 0: nothing is met",
+    ),
+    Declared(
+        "point_seen",
+        ("view", "byte"),
+        ("R", "⌈P/8⌉"),
+        "|u1",
+        "1",
+        f"{_BITS}: whether the view sees point 8j + i of the cloud; {_SEEN}",
+    ),
+    Declared(
+        "photon_seen",
+        ("view", "byte"),
+        ("R", "⌈K/8⌉"),
+        "|u1",
+        "1",
+        f"{_BITS}: whether the view sees the photon in slot 8j + i of its modification; {_SEEN}",
     ),
     Declared(
         "photon_position",

@@ -36,6 +36,11 @@ class Cause(Enum):
     MISSING_ROW = "missing-row", "committed, but a row is missing", Remedy.RENDER
     UNUSED_ROW = "unused-row", "a row that the plan does not use holds data", Remedy.RENDER
     NOT_FINITE = "not-finite", "a stored value is NaN or infinite", Remedy.RENDER
+    UNUSED_BIT = (
+        "unused-bit",
+        "a bit tells that a point or photon is seen which the scene does not have",
+        Remedy.RENDER,
+    )
     EQUAL_HALVES = "equal-halves", "halves A and B of a sample are equal: one seed, used twice", Remedy.RENDER
     EQUAL_SAMPLES = "equal-samples", "halves of different samples are equal: one seed, used twice", Remedy.RENDER
     SAME_AGAIN = (

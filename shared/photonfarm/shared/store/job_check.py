@@ -208,6 +208,9 @@ class JobCheck:
         if "depth" in values and "normal" in values:
             view = None if rows is None else rows.views.get(row)
             yield from self._contents.view(values["depth"], values["normal"], view, self._tally)
+        for name in ("point_seen", "photon_seen"):
+            if name in values:
+                yield from self._contents.bits(name, values[name])
 
     def _unreadable(self, job: int, file: str, error: OSError) -> Finding:
         """The finding for a file that cannot be read; raises OSError if it is the whole store that cannot be."""

@@ -20,43 +20,26 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import itertools
-import re
-import time
 import uuid
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import timedelta
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import obstore
-from obstore.exceptions import (
-    AlreadyExistsError,
-    BaseError,
-    GenericError,
-    PermissionDeniedError,
-    PreconditionError,
-    UnauthenticatedError,
-)
-from obstore.store import from_url
+from obstore.exceptions import AlreadyExistsError, PreconditionError
 from zarr.abc.buffer import Buffer, BufferPrototype
 from zarr.abc.store import ByteRequest
 from zarr.storage import ObjectStore
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.store.object_cache import ObjectCache
+from photonfarm.shared.store.object_requests import connect, os_errors, patiently
 from photonfarm.shared.store.storage import FORMAT_FILE, STRAY_AGE_S, TMP, discard
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion
-
-PATIENCE_S = 60.0
-"""How long a server that fails, or cannot be reached, is asked again: it may be restarted meanwhile."""
-
-PAUSES_S = (0.3, 1.0, 3.0, 5.0)
-"""Before each new attempt of ours, the last one again and again; the library has its own, within an attempt."""
 
 SMALL_BYTES = 4 << 20
 TIMEOUT_S = 30.0
@@ -64,20 +47,12 @@ TIMEOUT_S = 30.0
 TRANSFER_TIMEOUT_S = 300.0
 """…and for larger ones: a shard of 256 MB at 1 MB/s."""
 
-RETRIES = 1000
-"""Of the library within a request; PATIENCE_S ends them. It leaves out what may have worked already, and what breaks
-off in the middle of an answer."""
-
-LONGEST_PAUSE_S = 5.0
-
 PUTS_AT_ONCE = 8
 """Of the files of a folder: they are many and small, and each would wait for its answer."""
 
 TRANSFER_TIMES = 2
 REPLACED_TIMES = 4
 """An object that is replaced while it is fetched is fetched again."""
-
-T = TypeVar("T")
 
 WRITER = "writer"
 """The metadata field with a put's id; letters alone, as not every service takes more."""
@@ -92,8 +67,8 @@ class ObjectStorage:
     def __init__(self, url: str) -> None:
         """Name the bucket; nothing is asked of it yet. Raises StoreError for a URL that cannot be one."""
         self._url = url.rstrip("/")
-        self._objects = _connect(self._url, TIMEOUT_S)
-        self._transfers = _connect(self._url, TRANSFER_TIMEOUT_S)
+        self._objects = connect(self._url, TIMEOUT_S)
+        self._transfers = connect(self._url, TRANSFER_TIMEOUT_S)
         self._cache = ObjectCache.of(self._url)
         self._is_conditional = False
 
@@ -173,7 +148,7 @@ class ObjectStorage:
 
     def zarr(self, folder: str) -> ObjectStore[Any]:
         """A folder as zarr-python reads it."""
-        return _Group(_connect(f"{self._url}/{folder}", TIMEOUT_S), read_only=True)
+        return _Group(connect(f"{self._url}/{folder}", TIMEOUT_S), read_only=True)
 
     # ---------------------------------------------------------------------------------------------------------- writing
 
@@ -336,29 +311,6 @@ class _Group(ObjectStore[Any]):
             return await super().exists(key)
 
 
-def patiently(action: Callable[[], T], *passing: type[Exception], times: int = 1) -> T:
-    """What an action returns, tried again for PATIENCE_S while the server fails, or with one of the `passing` errors.
-
-    At least `times` times, however long each takes: a transfer may break off after minutes. Whether a put that failed
-    has worked is not known; whoever tries it must find out.
-    """
-    failures: tuple[type[Exception], ...] = (GenericError, *passing)
-    deadline = time.monotonic() + PATIENCE_S
-    for tried, pause_s in enumerate(itertools.chain(PAUSES_S, itertools.repeat(PAUSES_S[-1])), 1):
-        try:
-            return action()
-        except failures as error:
-            if (tried >= times and time.monotonic() + pause_s > deadline) or _is_refusal(error):
-                raise
-        time.sleep(pause_s)
-    raise AssertionError("pauses without end have ended")
-
-
-def _is_refusal(error: Exception) -> bool:
-    """Whether the server has refused, as it will the next time (all but "too slow" and "too many requests")."""
-    return isinstance(error, GenericError) and re.search(r"\b4(?!08|29)\d\d [A-Z]", _first_line(error)) is not None
-
-
 def claim_of(folder: str) -> str:
     """The name of the object that decides what a folder holds."""
     return f"{folder}.claim"
@@ -373,60 +325,7 @@ def _pack(folder: Path, packed: Path) -> None:
             claim.write(folder / name, name)
 
 
-def _connect(url: str, timeout_s: float) -> Any:
-    """The library's store; nothing is sent yet."""
-    try:
-        return from_url(
-            url,
-            client_options={
-                "allow_http": True,  # where the endpoint's URL says so, as within a cluster
-                "timeout": timedelta(seconds=timeout_s),
-            },
-            retry_config={
-                "max_retries": RETRIES,
-                "retry_timeout": timedelta(seconds=PATIENCE_S),
-                "backoff": {
-                    "init_backoff": timedelta(seconds=PAUSES_S[0]),
-                    "max_backoff": timedelta(seconds=LONGEST_PAUSE_S),
-                    "base": 2,
-                },
-            },
-        )
-    except (BaseError, ValueError) as error:
-        raise StoreError(f"{url}: cannot be used as a store: {_first_line(error)}") from error
-
-
 def _version(about: ObjectMeta) -> str:
     """A word that changes with an object's bytes."""
     told = about["e_tag"] or f"{about['last_modified']} {about['size']}"
     return hashlib.sha256(told.encode()).hexdigest()[:16]
-
-
-@contextlib.contextmanager
-def os_errors(name: str) -> Iterator[None]:
-    """Turn the library's errors into those of a file system, with the name of the object."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        if "<Code>NoSuchBucket</Code>" in str(error):  # else what is not there would be looked for in it
-            raise OSError(errno.EIO, "the bucket does not exist", name) from error
-        raise FileNotFoundError(errno.ENOENT, "no such object, or no such bucket", name) from error
-    except (PermissionDeniedError, UnauthenticatedError) as error:
-        raise PermissionError(errno.EACCES, _reason(error), name) from error
-    except BaseError as error:
-        if "404 Not Found" in _first_line(error):  # how the library tells that a bucket cannot be listed
-            raise FileNotFoundError(errno.ENOENT, "no such bucket", name) from error
-        raise OSError(errno.EIO, _reason(error), name) from error
-
-
-def _reason(error: Exception) -> str:
-    """What the library says, and code and message of the server's answer instead of its XML, in a line."""
-    said = re.split(r"<\?xml|<Error>", _first_line(error))[0].rstrip(": ")
-    answer = str(error).partition("\n\nDebug source:")[0]
-    told = [match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))]
-    return " ".join(": ".join([said, *told]).split())
-
-
-def _first_line(error: Exception) -> str:
-    """What the library says, without what is meant for its developers."""
-    return str(error).partition("\n")[0]

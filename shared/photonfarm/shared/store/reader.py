@@ -11,7 +11,6 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from concurrent.futures import Executor, wait
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,14 @@ from numpy.typing import NDArray
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
 from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, is_there, read_base, read_spec
-from photonfarm.shared.store.shards import Shard, copy_checked
+from photonfarm.shared.store.shards import Shard
 from photonfarm.shared.store.storage import FORMAT_FILE, open_storage, renew_copy, store_errors
 from photonfarm.shared.store.store import check_format
 from photonfarm.shared.view import View
@@ -44,11 +43,9 @@ class Sample:
     view: View
     radiance: F32  # (2, H, W, 3) linear, unscaled; two independent noisy estimates A and B
     buffers: ViewBuffers
+    visibility: Visibility
     pass_: int
 
-
-_PART = 16
-"""Samples of a batch that one thread reads at a time."""
 
 OPEN_SHARDS = 256
 """Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
@@ -65,6 +62,7 @@ class SceneReader:
         self._spec: SceneSpec | None = None
         self._arrays: dict[str, schema.ArraySchema] = {}
         self._plans: list[StoredPlan] = []
+        self.plan_requests: list[dict[str, Any]] = []  # what was asked for with each: all that its rows follow from
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
         self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found complete no longer: a repair
@@ -128,17 +126,18 @@ class SceneReader:
             self._view_row = np.concatenate([rows.sample_view for rows in inputs])
             self._modification_row = np.concatenate([rows.sample_modification for rows in inputs])
             self._pass = np.concatenate([rows.sample_pass for rows in inputs])
+            self.plan_requests += [
+                {"first_row": plan.first_row, "samples": plan.samples, "request": plan.request.model_dump(mode="json")}
+                for plan in self._plans[known:]
+            ]
 
     # ---------------------------------------------------------------------------------------------------------- samples
 
-    def read_batch(
-        self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None, threads: Executor | None = None
-    ) -> Batch:
+    def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
         """Complete samples in the order of `rows`, in the types they are stored in; every byte has been checked.
 
-        They are read into the first places of `out`, and what is returned is these; without, into new memory. With
-        threads, several read at once. Raises CorruptError if their bytes are not what was committed; what `out` holds
-        is then undefined.
+        They are read into the first places of `out`, and what is returned is these; without, into new memory. Raises
+        CorruptError if their bytes are not what was committed; what `out` holds is then undefined.
         """
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)
@@ -151,32 +150,28 @@ class SceneReader:
         batch.modification_rows[:] = self._modification_row[chosen]
         batch.wide.clear()
         with store_errors("read samples", self._storage.where):
-            parts = [range(len(batch))[first : first + _PART] for first in range(0, len(batch), _PART)]
-            if threads is None:
-                for part in parts:
-                    self._read_part(batch, part)
-            else:
-                reading = [threads.submit(self._read_part, batch, part) for part in parts]
-                wait(reading)  # also where one fails: the memory is used again
-                for read in reading:
-                    read.result()
+            for place, row in enumerate(chosen.tolist()):
+                self._read_radiance(row, place, batch)
+            for name, memory in (*batch.buffers.items(), *batch.seen.items()):
+                for place, row in enumerate(batch.view_rows.tolist()):
+                    self._read_into(name, row, memory[place])
         return batch
 
     def read(self, row: int) -> Sample:
         """One complete sample; raises CorruptError if its bytes are not what was committed."""
         batch = self.read_batch([row])
         buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
-        sample = Sample(
-            row,
-            plans.modification_at(self._plans, int(batch.modification_rows[0])),
-            plans.view_at(self._plans, int(batch.view_rows[0])),
-            batch.linear(0),
-            ViewBuffers(**buffers),
-            int(self._pass[row]),
-        )
+        modification, view, pass_ = self.inputs(row)
+        seen = ViewBuffers(**buffers), batch.visibility(0)
+        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_)
         if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values())):
             raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
         return sample
+
+    def inputs(self, row: int) -> tuple[Modification, View, int]:
+        """The configuration, the view and the number of the noisy pass of a complete sample."""
+        modification = plans.modification_at(self._plans, self.modification_row(row))
+        return modification, plans.view_at(self._plans, int(self._view_row[row])), int(self._pass[row])
 
     def read_photons(self, row: int) -> Photons:
         """The photons of a sample's modification; raises StoreError for a scene without photons."""
@@ -251,31 +246,13 @@ class SceneReader:
         if not there.all():
             raise StoreError(f"row {int(rows[~there][0])} of scene {self._scene_id} is not complete")
 
-    def _read_part(self, batch: Batch, part: range) -> None:
-        """Some places of a batch."""
-        self._read_radiance(batch, part)
-        for name, memory in batch.buffers.items():
-            for place in part:
-                self._read_into(name, int(batch.view_rows[place]), memory[place])
-
-    def _read_radiance(self, batch: Batch, part: range) -> None:
-        """What is mapped is looked up first, then copied."""
-        mapped: dict[int, tuple[NDArray[np.uint8], int]] = {}  # by place
-        for place in part:
-            row = int(batch.rows[place])
-            shard, within = self._shard("radiance", row)
-            if shard is None or within not in shard:
-                batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
-                batch.wide[place] = self._read("radiance_wide", row)
-            elif (found := shard.mapped(within)) is not None:
-                mapped[place] = found
-            else:
-                self._read_from(shard, "radiance", row, batch.radiance[place])
-        memory = batch.radiance.reshape(len(batch), -1).view(np.uint8)
-        checksums = copy_checked([content for content, _ in mapped.values()], [memory[place] for place in mapped])
-        for (place, (_, expected)), checksum in zip(mapped.items(), checksums, strict=True):
-            if checksum != expected:
-                self._read_into("radiance", int(batch.rows[place]), batch.radiance[place])
+    def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
+        shard, within = self._shard("radiance", row)
+        if shard is not None and within in shard:
+            self._read_from(shard, "radiance", row, batch.radiance[place])
+            return
+        batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
+        batch.wide[place] = self._read("radiance_wide", row)
 
     def _read(self, name: str, row: int) -> NDArray[Any]:
         array = self._arrays[name]

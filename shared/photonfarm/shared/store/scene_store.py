@@ -161,6 +161,10 @@ class SceneStore:
         """Whether geometry and base cloud are complete."""
         return self.storage.exists(f"{self.name}/base/zarr.json")
 
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """Geometry and base point cloud; raises StoreError while they are not there."""
+        return read_base(self.storage, self.name)
+
     def write_base(self, geometry: Geometry, cloud: BasePointCloud) -> None:
         """Store geometry and base point cloud; the first ones written stay."""
         if self.has_base():

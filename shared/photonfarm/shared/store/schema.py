@@ -1,6 +1,6 @@
 """The arrays of one scene: their shapes, and how they are laid out in chunks and shards, and encoded.
 
-Shape letters: R rows of a plan, J `shard_rows`, H W image, K photon slots.
+Shape letters: R rows of a plan, J `shard_rows`, H W image, P points, K photon slots.
 
 A row of an output array is one inner chunk, and a job's J rows are one shard: one file, written once and whole. Noise
 does not compress and is stored as it is; everything else is Blosc LZ4 behind a byte shuffle. CRC-32C comes last
@@ -43,7 +43,7 @@ class ArraySchema:
     kind: Kind
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    fill: float | int  # of rows that are not written; never a legal value of a written one, but for `photon_bounce`
+    fill: float | int  # of rows that are not written; a legal value of written ones in `photon_bounce` and bits only
     compressed: bool
     dimensions: tuple[str, ...]  # names of the axes after the row
     attributes: dict[str, Any]
@@ -55,9 +55,16 @@ class ArraySchema:
 
 def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     """The output arrays of a scene, by name; a scene without photons has none for them."""
-    lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.paths * spec.photons.depth}
-    wanted = [declared for declared in OUTPUTS if lengths["K"] or "K" not in declared.shape]
+    points, photons = (-(-count // 8) for count in bit_counts(spec).values())
+    lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
+    lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons}
+    wanted = [declared for declared in OUTPUTS if all(lengths.get(str(n), 1) for n in declared.shape)]
     return {declared.name: _resolved(declared, lengths, spec) for declared in wanted}
+
+
+def bit_counts(spec: SceneSpec) -> dict[str, int]:
+    """The bits of a row in the arrays that hold bits: one for each point, and one for each photon slot."""
+    return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
 
 
 def _resolved(declared: Declared, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:

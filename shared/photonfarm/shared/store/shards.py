@@ -15,7 +15,6 @@ import errno
 import mmap
 import os
 import weakref
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -155,43 +154,29 @@ class Shard:
         """
         memory = np.frombuffer(values.data.cast("B"), np.uint8)
         if self._array.compressed:
-            self._decompress(self._content(row), row, memory)
-        elif (mapped := self.mapped(row)) is None or copy_checked([mapped[0]], [memory]) != [mapped[1]]:
-            self._read_checked(row, memory)
+            self._decompress(self._checked(row), row, memory)
+        else:
+            self._checked(row, memory)
 
-    def mapped(self, row: int) -> tuple[NDArray[np.uint8], int] | None:
-        """The bytes of a written row in a map of the file, and the CRC-32C they should have, as for `copy_checked`.
+    def _checked(self, row: int, memory: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+        """The stored bytes of a row without their checksum, in `memory` if that is given.
 
-        None where the row is better read: for the first time, or not in the page cache. That its end can be read at
-        once tells that it is there, and that the file has not been cut.
+        What is checked is what is returned: the copy in memory, not the file that it was made of.
         """
-        if not self._read_before[row] or _NO_WAIT is None:
-            return None
         offset, length = self._index[row]
         end, crc = offset + length - _CRC_BYTES, bytearray(_CRC_BYTES)
-        try:
-            if os.preadv(self._descriptor, [crc], end, _NO_WAIT) != _CRC_BYTES:
-                return None
-            if self._map is None:
-                self._map = np.frombuffer(mmap.mmap(self._descriptor, self._size, prot=mmap.PROT_READ), np.uint8)
-        except (OSError, ValueError):  # not in the cache, no such reading or mapping on this file system, or cut
-            return None
-        return self._map[offset:end], int.from_bytes(crc, "little")
-
-    def _content(self, row: int) -> NDArray[np.uint8]:
-        """The checked bytes of a row: in the map, or read."""
-        if (mapped := self.mapped(row)) is not None and crc32c(mapped[0]) == mapped[1]:
-            return mapped[0]
-        content = np.empty(self._index[row][1] - _CRC_BYTES, np.uint8)
-        self._read_checked(row, content)
-        return content
-
-    def _read_checked(self, row: int, memory: NDArray[np.uint8]) -> None:
-        self._read_before[row] = True
-        offset, length = self._index[row]
-        crc = bytearray(_CRC_BYTES)
-        if self._read_at(offset, memory.data, crc) != length or _crc(memory) != crc:
+        if (mapped := self._mapped(row, end, crc)) is None:
+            content = np.empty(length - _CRC_BYTES, np.uint8) if memory is None else memory
+            whole = self._read_at(offset, content.data, crc) == length and _crc(content) == crc
+        elif memory is None:
+            content = mapped[offset:end]
+            whole = _crc(content) == crc
+        else:
+            content = memory
+            whole = _copy(mapped[offset:end], memory) == crc
+        if not whole:
             raise self._damaged(f"row {row} of the shard")
+        return content
 
     def _read_at(self, offset: int, *memory: memoryview | bytearray) -> int:
         """Read into some memory from an offset on; how many bytes came. Raises CorruptError where the disk fails."""
@@ -199,6 +184,23 @@ class Shard:
             return os.preadv(self._descriptor, memory, offset)
         except OSError as error:
             raise self._refused(error) from error
+
+    def _mapped(self, row: int, end: int, crc: bytearray) -> NDArray[np.uint8] | None:
+        """The file in memory, if the row should be taken from there, with the row's checksum read into `crc`.
+
+        That it can be read at once tells that the row is in the page cache, and that the file has not been cut.
+        """
+        if not self._read_before[row] or _NO_WAIT is None:
+            self._read_before[row] = True
+            return None
+        try:
+            if os.preadv(self._descriptor, [crc], end, _NO_WAIT) != _CRC_BYTES:
+                return None
+            if self._map is None:
+                self._map = np.frombuffer(mmap.mmap(self._descriptor, self._size, prot=mmap.PROT_READ), np.uint8)
+        except (OSError, ValueError):  # not in the cache, no such reading or mapping on this file system, or cut
+            return None
+        return self._map
 
     def _decompress(self, content: NDArray[np.uint8], row: int, memory: NDArray[np.uint8]) -> None:
         """Blosc's header states both sizes; it writes no less, and reads no more, where they are right."""
@@ -227,21 +229,14 @@ class Shard:
         return {"size": os.fstat(self._descriptor).st_size, "crc32c": checksum.hex()}
 
 
-def copy_checked(sources: Iterable[NDArray[np.uint8]], memory: Iterable[NDArray[np.uint8]]) -> list[int]:
-    """Copy bytes to their places, and give the CRC-32C of what has arrived in each.
-
-    A loop with nothing else in it: each row drives all that is not needed for it out of a core's own cache, and what is
-    done between two rows takes several times what it takes elsewhere.
-    """
-    checksums = []
-    for source, place in zip(sources, memory, strict=True):
-        checksum = 0
-        for start in range(0, len(place), _PIECE_BYTES):
-            piece = place[start : start + _PIECE_BYTES]
-            np.copyto(piece, source[start : start + _PIECE_BYTES])
-            checksum = crc32c(piece, checksum)
-        checksums.append(checksum)
-    return checksums
+def _copy(content: NDArray[np.uint8], memory: NDArray[np.uint8]) -> bytes:
+    """Copy bytes, and the CRC-32C of what has arrived."""
+    checksum = 0
+    for start in range(0, len(memory), _PIECE_BYTES):
+        piece = memory[start : start + _PIECE_BYTES]
+        np.copyto(piece, content[start : start + _PIECE_BYTES])
+        checksum = crc32c(piece, checksum)
+    return checksum.to_bytes(_CRC_BYTES, "little")
 
 
 def _crc(data: bytes | memoryview | NDArray[np.uint8]) -> bytes:

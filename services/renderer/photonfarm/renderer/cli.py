@@ -1,4 +1,4 @@
-"""The verbs of the render service: doctor, preview, scene plan, work."""
+"""The verbs of the render service: buffers, doctor, preview, scene plan, work."""
 
 from __future__ import annotations
 
@@ -102,6 +102,37 @@ def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
 
     write_contact_sheet(SceneReader(store, load_spec(spec).scene_id), count, out)
     click.echo(out)
+
+
+@click.command()
+@store_option
+@click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
+@click.option(
+    "--modification", metavar="VECTOR|KEY", help="The configuration, as `store find` takes it.  [default: at rest]"
+)
+@click.option(
+    "--camera-path",
+    "path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help='JSON: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}.',
+)
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Instead: once around the scene.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="buffers.npz", show_default=True)
+def buffers(
+    store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
+) -> None:  # fmt: skip
+    """Write the buffers of views along a camera path, and the photons: what `photonfarm infer --buffers` shows.
+
+    Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
+    """
+    from photonfarm.renderer.path_buffers import write_buffers
+    from photonfarm.shared.camera_path import CameraPath
+
+    if (path is None) == (orbit is None):
+        raise click.UsageError("one of --camera-path and --orbit is required")
+    frames = write_buffers(store, scene, modification, orbit or CameraPath.load(path or Path()), out)
+    click.echo(f"{out}: {frames} frames")
 
 
 @click.command()

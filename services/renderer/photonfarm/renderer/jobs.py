@@ -10,17 +10,20 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count, groupby, islice
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.shared.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
 from photonfarm.shared.keys import Key, seed_of
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
+from photonfarm.shared.pointcloud import rebuild
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 from photonfarm.shared.view import View
@@ -47,6 +50,9 @@ class SceneRenderer(Protocol):
 
     def buffers(self, view: View) -> ViewBuffers:
         """The image-space buffers of a view."""
+
+    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
+        """Whether a view sees points (N, 3) of the current configuration, (N,)."""
 
     def photons(self, seed: int) -> Photons | None:
         """Light sub-paths of the current configuration; None if the spec wants none."""
@@ -85,6 +91,24 @@ def render_shard(scene_id: str, job: int) -> None:
     _serving.render(scene_id, job)
 
 
+@dataclass(slots=True, eq=False)
+class _Loaded:
+    """A scene that is loaded, and what the store has of it."""
+
+    stored: SceneStore
+    scene: SceneRenderer
+    _cloud: BasePointCloud | None = None
+
+    def cloud(self) -> BasePointCloud:
+        """The base point cloud that is stored; it is written first, with the geometry, where it is not there."""
+        if not self.stored.has_base():
+            self.stored.write_base(*self.scene.base())
+            self._cloud = None
+        if self._cloud is None:
+            self._cloud = self.stored.base()[1]
+        return self._cloud
+
+
 class ShardRenderer:
     """Renders jobs of a store, keeping the scenes it has loaded last."""
 
@@ -93,7 +117,7 @@ class ShardRenderer:
         self._store = store
         self._worker = worker
         self._load = load
-        self._scenes: dict[str, tuple[SceneStore, SceneRenderer]] = {}  # last used last
+        self._scenes: dict[str, _Loaded] = {}  # last used last
 
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit one job; False if it was committed already, or by another worker meanwhile.
@@ -107,12 +131,12 @@ class ShardRenderer:
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
         if stored.is_committed(job):
             return False
-        stored, scene = self._scene(scene_id)
+        loaded = self._scene(scene_id)
+        stored = loaded.stored
         wall, core = time.monotonic(), time.process_time()
-        if not stored.has_base():
-            stored.write_base(*scene.base())
+        cloud = loaded.cloud()
         with stored.job_writer(job) as out:
-            redrawn = _Rendering(scene, scene_id, out).run(stored.job_rows(job))
+            redrawn = _Rendering(loaded.scene, cloud, scene_id, out).run(stored.job_rows(job))
             figures = Figures(
                 core_s=time.process_time() - core,
                 wall_s=time.monotonic() - wall,
@@ -128,7 +152,7 @@ class ShardRenderer:
             log.warning("scene %s, job %d: %s", scene_id, job, what)
         return committed
 
-    def _scene(self, scene_id: str) -> tuple[SceneStore, SceneRenderer]:
+    def _scene(self, scene_id: str) -> _Loaded:
         if scene_id in self._scenes:
             self._scenes[scene_id] = self._scenes.pop(scene_id)
         else:
@@ -137,7 +161,7 @@ class ShardRenderer:
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
             gc.collect()  # Dr.Jit finds no kernel in its cache while an older scene is still half alive
-            self._scenes[scene_id] = stored, self._load(spec)
+            self._scenes[scene_id] = _Loaded(stored, self._load(spec))
         return self._scenes[scene_id]
 
 
@@ -173,30 +197,51 @@ def versions() -> Mapping[str, str]:
 # -------------------------------------------------------------------------------------------------------- rendering
 
 
-class _Rendering:
-    """One pass over a job's samples: each modification applied once, each view's buffers made once."""
+def visibility_of(
+    scene: SceneRenderer, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
+) -> Visibility:
+    """What a view sees of the current configuration: of its cloud, as `rebuild` gives it, and of its photons."""
+    position, present = points
+    if photons is None:
+        return Visibility(scene.sees(view, position) & present, np.zeros(0, np.bool_))
+    seen = scene.sees(view, np.concatenate([position, photons.position]))
+    return Visibility(seen[: len(position)] & present, seen[len(position) :] & (photons.bounce >= 0))
 
-    def __init__(self, scene: SceneRenderer, scene_id: str, out: JobWriter) -> None:
+
+class _Rendering:
+    """One pass over a job's samples: each modification applied once, each new view looked at once."""
+
+    def __init__(self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter) -> None:
         self._scene = scene
+        self._cloud = cloud
         self._scene_id = scene_id
         self._out = out
         self._redrawn = 0
 
     def run(self, rows: JobRows) -> int:
-        """Hand every row of the job to its writer; how many renders were thrown away."""
-        viewed: set[int] = set()
-        for modification_row, samples in groupby(rows.samples, key=lambda sample: sample.modification_row):
-            modification = rows.modifications[modification_row]
+        """Hand every row of the job to its writer; how many renders were thrown away.
+
+        Photons that another job stores, with the modification, are traced for the views that are new here: their seed
+        follows from the modification's key, so that they come out the same. That job counts what it throws away.
+        """
+        new_views = set(rows.new_views)
+        for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
+            modification, samples = rows.modifications[modification_row], list(group)
             self._scene.apply(modification)
-            if modification_row in rows.new_modifications:
-                photons = self._photons(modification.key(self._scene_id))
+            is_new = modification_row in rows.new_modifications
+            wants_photons = is_new or any(sample.view_row in new_views for sample in samples)
+            photons, thrown = photons_of(self._scene, modification.key(self._scene_id)) if wants_photons else (None, 0)
+            if is_new:
+                self._redrawn += thrown
                 if photons is not None:
                     self._out.photons(modification_row, photons)
+            points = rebuild(self._cloud, modification)
             for sample in samples:
                 view = rows.views[sample.view_row]
-                if sample.view_row in rows.new_views - viewed:
-                    self._out.buffers(sample.view_row, self._buffers(sample, view))
-                    viewed.add(sample.view_row)
+                if sample.view_row in new_views:
+                    visibility = visibility_of(self._scene, view, points, photons)
+                    self._out.view(sample.view_row, self._buffers(sample, view), visibility)
+                    new_views.remove(sample.view_row)
                 self._out.radiance(sample.row, self._halves(sample, view))
         return self._redrawn
 
@@ -231,17 +276,26 @@ class _Rendering:
             self._throw_away(key, purpose)
         raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
-    def _photons(self, key: Key) -> Photons | None:
-        for seed in islice(_seeds(key, "photons", ()), ATTEMPTS):
-            photons = self._scene.photons(seed)
-            if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
-                return photons
-            self._throw_away(key, "photons")
-        raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
-
     def _throw_away(self, key: Key, purpose: str) -> None:
         self._redrawn += 1
-        log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
+        _tell_thrown_away(key, purpose)
+
+
+def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:
+    """The photons of the current configuration, by its key, and how often they were not finite before.
+
+    None if the spec wants none. Raises IncompleteError if they stay non-finite.
+    """
+    for thrown, seed in enumerate(islice(_seeds(key, "photons", ()), ATTEMPTS)):
+        photons = scene.photons(seed)
+        if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
+            return photons, thrown
+        _tell_thrown_away(key, "photons")
+    raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
+
+
+def _tell_thrown_away(key: Key, purpose: str) -> None:
+    log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
 
 
 def _seeds(key: Key, purpose: str, taken: tuple[int, ...]) -> Iterator[int]:

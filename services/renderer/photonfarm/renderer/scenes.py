@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.renderer import backend
 from photonfarm.shared.errors import SpecError
@@ -108,6 +109,12 @@ class LoadedScene:
         from photonfarm.renderer.gbuffer import view_buffers
 
         return view_buffers(self.scene, view, self.spec)
+
+    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
+        """Whether the view sees points (N, 3) of the present configuration, (N,)."""
+        from photonfarm.renderer.visibility import seen_points
+
+        return seen_points(self.scene, view, self.spec, position)
 
     def photons(self, seed: int) -> Photons | None:
         """Surface hits of light sub-paths in the present configuration; None if the spec wants none."""

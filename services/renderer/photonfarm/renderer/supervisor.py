@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import subprocess
 import threading
@@ -26,7 +27,7 @@ from photonfarm.shared.store.storage import is_vacant
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 
 POLL_S = 1.0
-"""Between looks for a store that is not there yet."""
+"""Between looks for a store that is not there yet, and for signals that came while the child was being listened to."""
 
 HUNG_LINES = 8
 """Of the stack of a job that the deadline has ended: the innermost calls, which tell where it was."""
@@ -163,7 +164,7 @@ class Supervisor:
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
                 self._child.stdin.flush()  # and left open: its end tells the child that we are gone
-            words = Words.of(self._child.stdout.read().decode(errors="replace"))
+            words = Words.of(_all_told(self._child.stdout.fileno()).decode(errors="replace"))
             self._tally += words.tally
             return self._child.wait(), words
 
@@ -199,6 +200,21 @@ class Supervisor:
         time.sleep(GRACE_S)
         if self._child is not None:
             self._child.kill()
+
+
+def _all_told(pipe: int) -> bytes:
+    """What a child tells until it ends.
+
+    A read that waits for all of it would not see a signal that comes between two parts, for as long as the child says
+    nothing more: Python acts on signals only between its own instructions, or where one interrupts a system call.
+    """
+    told = bytearray()
+    while True:
+        if select.select([pipe], [], [], POLL_S)[0]:
+            part = os.read(pipe, 1 << 16)
+            if not part:
+                return bytes(told)
+            told += part
 
 
 def _ending(code: int, words: Words, deadline_s: float) -> str:

@@ -1,35 +1,55 @@
-"""Checkpoints: written whole or not at all, and enough to continue bit for bit."""
+"""Checkpoints: safetensors with what is no tensor as JSON inside; written whole or not at all, enough to go on exactly.
+
+A file's tensors are named by where they stand in the state, `network.image_synthesis.out.weight`. The rest of the state
+is the JSON under `photonfarm` in the file's metadata, where {"tensor": NAME} stands for each of them.
+"""
 
 from __future__ import annotations
 
-import io
+import json
 import os
-import pickle
-import struct
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
 
 from photonfarm.shared.errors import SpecError, StoreError
 from photonfarm.shared.store import store_errors
 from photonfarm.shared.store.local import sync
 
-FORMAT = 1
+FORMAT = 2
+METADATA = "photonfarm"
+TENSOR = "tensor"
 
-UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, LookupError, TypeError, AttributeError, struct.error,
-              pickle.UnpicklingError)  # fmt: skip
-"""What torch raises on bytes that it did not write."""
+Changes = dict[str, tuple[Any, Any]]
+"""Settings by key, as they were and as they are."""
+
+LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
+"""What a run keeps for as long as it lasts. The rest may be changed where it goes on."""
+
+UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)
+"""What is raised on bytes that were not written here."""
 
 
-def save(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint: to a temporary name, synced, renamed, and the rename synced. StoreError where that fails."""
-    content = io.BytesIO()  # torch writing to the file itself would hide why it failed
-    torch.save({"format": FORMAT, **state}, content)
+def save(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint: to a temporary name, synced, renamed, and the rename synced. StoreError where that fails.
+
+    A state is made of dictionaries by string, lists, tensors, and what JSON has beside them.
+    """
+    tensors: dict[str, Tensor] = {}
+    document = json.dumps({"format": FORMAT, **_apart(state, "", tensors)})
+    content = to_bytes(tensors, {METADATA: document})  # safetensors writing to the file itself would not sync it
     partial = path.with_suffix(".partial")
     with store_errors("write the checkpoint", path):
         with partial.open("wb") as file:
-            file.write(content.getbuffer())
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
@@ -39,21 +59,83 @@ def save(path: Path, state: dict[str, Any]) -> None:
 def load(path: Path) -> dict[str, Any]:
     """A checkpoint's content, on the CPU. Raises StoreError if it cannot be read; nothing in it is executed."""
     try:
-        state: Any = torch.load(path, map_location="cpu", weights_only=True)
+        with safe_open(path, framework="pt") as file:
+            document = json.loads((file.metadata() or {}).get(METADATA, "{}"))
+            found = document.get("format")
+            state: dict[str, Any] = _together(document, file.get_tensor) if found == FORMAT else {}
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise StoreError(f"{path}: is not a readable checkpoint: {reason}") from error
-    found = state.get("format") if isinstance(state, dict) else None
     if found != FORMAT:
         raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
-    return dict(state)
+    return state
 
 
-def check_continues(path: Path, state: dict[str, Any], **expected: Any) -> None:
-    """Raise SpecError if the checkpoint is of another scene, network or seed than is asked for now."""
-    for key, wanted in expected.items():
-        if state[key] != wanted:
-            raise SpecError(
-                f"{path}: was trained with {key} = {state[key]!r}, and {wanted!r} is asked for now; "
-                f"use another run directory, or the same {key}"
-            )
+def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+    """The value with a reference for each tensor; these are put into `tensors`, by their names."""
+    if isinstance(value, Tensor):
+        tensors[name] = value.detach().cpu().contiguous()
+        return {TENSOR: name}
+    if isinstance(value, Mapping):
+        return {key: _apart(member, f"{name}.{key}".lstrip("."), tensors) for key, member in value.items()}
+    if isinstance(value, list):
+        return [_apart(member, f"{name}.{place}", tensors) for place, member in enumerate(value)]
+    return value
+
+
+def _together(value: Any, tensor: Callable[[str], Tensor]) -> Any:
+    """The value with a tensor for each reference."""
+    if isinstance(value, dict):
+        if value.keys() == {TENSOR}:
+            return tensor(value[TENSOR])
+        return {key: _together(member, tensor) for key, member in value.items()}
+    return [_together(member, tensor) for member in value] if isinstance(value, list) else value
+
+
+def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
+    """What a checkpoint has seen of a store: scene, plans, and how many samples had arrived; `following` has which."""
+    return {"scene_id": scene_id, "plans": list(plans), "samples": samples}
+
+
+def versions() -> dict[str, str]:
+    """What the arithmetic of a run depends on."""
+    return {
+        "photonfarm-trainer": version("photonfarm-trainer"),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str, Any]) -> Changes:
+    """Raise SpecError if the checkpoint is of another scene or of a run that `LASTING` settings make another one.
+
+    Returns which other settings are not what they were. Both have `scene_id` and `settings`.
+    """
+    changed = _differing({"scene_id": state["scene_id"], **state["settings"]}, {**identity, **identity["settings"]})
+    lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
+    if lasting:
+        found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
+        raise SpecError(f"{path}: was trained with {found}; use another run directory, or the same values")
+    return changed
+
+
+def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
+    """What is not the same in both, (then, now), by key; a key within another one as OUTER.INNER."""
+    found: Changes = {}
+    for key, then in before.items():
+        if isinstance(then, Mapping):
+            found |= _differing(then, now[key], f"{inside}{key}.")
+        elif then != now.get(key):
+            found[f"{inside}{key}"] = (then, now.get(key))
+    return found
+
+
+def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:
+    """Raise SpecError unless the store's plans begin with those that the checkpoint saw: rows are numbered by them."""
+    before = state["store"]["plans"]
+    if list(plans[: len(before)]) != before:
+        raise SpecError(
+            f"{path}: was trained on the samples of {len(before)} plans that this store does not begin with; "
+            "use another run directory, or the store it was trained on"
+        )

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from photonfarm.shared.errors import IncompleteError
-from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
+from photonfarm.shared.estimate import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.trainer.dataset import Batch
 from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.model import Cnn
+from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.networks.network import Network
 
 Predictor = Callable[[Batch], F32]
 """A batch's images, (B, H, W, 3), linear radiance × exposure."""
@@ -32,6 +36,47 @@ class HeldOut:
     error: Estimate  # against the clean image, over configurations
     floor: float  # noise of the target: what the error against it would show on top
     per_sample: NDArray[np.float64]  # (n,) clean error of each
+    units: tuple[Key, ...]  # (n,) what each is held out by: equal for those of one configuration
+
+
+WARM_CALLS, TIMED_CALLS = 2, 9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DevicePredictor:
+    """A `Predictor` whose images are made of a batch's inputs alone, on a device."""
+
+    images: Callable[[Inputs], Tensor]  # (B, H, W, 3), linear radiance × exposure
+    device: torch.device
+
+    @torch.no_grad()
+    def __call__(self, batch: Batch) -> F32:
+        """A batch's images."""
+        images: F32 = self.images(self._there(batch.inputs)).cpu().numpy()
+        return images
+
+    @torch.no_grad()
+    def seconds(self, inputs: Inputs) -> float:
+        """Wall time of the images of these inputs alone: they lie on the device, and results are left there.
+
+        The median of `TIMED_CALLS` calls, after `WARM_CALLS` that do not count.
+        """
+        there = self._there(inputs)
+        return median([self._timed(there) for _ in range(WARM_CALLS + TIMED_CALLS)][WARM_CALLS:])
+
+    def _there(self, inputs: Inputs) -> Inputs:
+        return map_tensors(lambda tensor: tensor.to(self.device), inputs)
+
+    def _timed(self, inputs: Inputs) -> float:
+        self._wait()
+        began = time.perf_counter()
+        self.images(inputs)
+        self._wait()
+        return time.perf_counter() - began
+
+    def _wait(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
 
 def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
@@ -42,16 +87,9 @@ def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
             yield batch
 
 
-def network_predictor(network: Cnn) -> Predictor:
-    """The network's images."""
-    device = next(network.parameters()).device
-
-    @torch.no_grad()
-    def predict(batch: Batch) -> F32:
-        images: F32 = network(batch.to(device).inputs).cpu().numpy()
-        return images
-
-    return predict
+def network_predictor(network: Network) -> DevicePredictor:
+    """The network's images, made where its parameters are."""
+    return DevicePredictor(network, next(network.parameters()).device)
 
 
 def mean_colour(found: Iterator[Batch]) -> F32:
@@ -66,8 +104,15 @@ def constant_predictor(colour: F32) -> Predictor:
     return lambda batch: np.broadcast_to(colour, batch.inputs.albedo.shape)
 
 
+def error_of(batch: Batch) -> Callable[[F32, F32, F32], float]:
+    """What takes the noise out of the error of a prediction for this batch, given A and B: by whether it has seen A."""
+    return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
+
+
 def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
+
+    Of a predictor that is given noisy colour, which is A's, mean f² − 2fB + AB.
 
     Raises IncompleteError if there is no sample.
     """
@@ -75,11 +120,12 @@ def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
     units: list[Key] = []
     for batch in found:
         units.extend(batch.units)
+        error = error_of(batch)
         for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
-            errors.append(clean_error(image, half_a, half_b))
+            errors.append(error(image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
     if not errors:
         raise IncompleteError("none of the samples to measure on is complete at present; wait for the workers")
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
-    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample)
+    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, tuple(units))

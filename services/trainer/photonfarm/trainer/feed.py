@@ -7,11 +7,14 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.trainer.dataset import Batch, Compact, SampleSource, fill, rows_held_out
+from photonfarm.trainer.dataset import Batch, SampleSource, read_into, rows_held_out
+from photonfarm.trainer.device import usable_device
+from photonfarm.trainer.networks import ARCHITECTURES
+from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.settings import TrainSettings
 
 
@@ -19,34 +22,39 @@ class Feed:
     """Batches in the order they were asked for, and the rows as they arrive; a context manager.
 
     Rows that are not complete when they are read, as a repair of the store may have taken them back, are left out of
-    their batch, until they have become complete again. Only its thread touches the source. Decoded samples are kept up
-    to `cache_bytes`: the first ones stay, since every sample is drawn about equally often, which is where replacing the
-    least recently used one never hits.
+    their batch, until they have become complete again. Only its thread touches the source. Samples are not kept
+    beside the batches: reading one from the system's cache, checked, is less than half of what it takes to make a place
+    of a batch of it (docs/results/train_step.md), so that a cache of our own would hardly pay for its memory.
     """
 
     def __init__(
-        self, source: SampleSource, settings: TrainSettings, clock: Callable[[], float] = time.monotonic
+        self,
+        source: SampleSource,
+        settings: TrainSettings,
+        clock: Callable[[], float] = time.monotonic,
+        needs: Needs | None = None,
     ) -> None:
+        """Feed what the settings' network needs, or what other predictors do."""
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self.geometry, self.cloud = source.base()
         self.spec = source.spec
         self._source, self._settings, self._clock = source, settings, clock
-        self._cache: dict[int, Compact] = {}
-        self._cached_bytes = 0
+        self._needs = needs or ARCHITECTURES[settings.network.architecture].needs
         self._lock = threading.Lock()
         self._arrived: list[tuple[int, bool]] = []
         self._complete = False
+        self._plans: list[dict[str, Any]] = []
         self._here: set[int] = set()  # rows that are complete
-        self._gone: set[int] = set()  # rows that were
+        self._known: set[int] = set()  # rows that are, or were
         self._error: BaseException | None = None
         points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
-        pinned = settings.device.startswith("cuda")
+        pinned = usable_device(settings.device).type == "cuda"
         self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
         self._ready: queue.SimpleQueue[tuple[Batch, Batch] | None] = queue.SimpleQueue()
         self._free: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
         for _ in range(settings.prefetch + 1):
-            self._free.put(Batch.empty(settings.batch, points, self.spec, pinned=pinned))
+            self._free.put(Batch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
         self._lent: Batch | None = None
         self._polled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
@@ -89,6 +97,11 @@ class Feed:
             rows, self._arrived = self._arrived, []
             return rows, self._complete
 
+    def plan_requests(self) -> list[dict[str, Any]]:
+        """What was asked for with each plan, by the last look at the store."""
+        with self._lock:
+            return self._plans
+
     def _raise(self) -> None:
         if self._error is not None:
             raise self._error
@@ -115,42 +128,31 @@ class Feed:
             memory = self._free.get() if rows is not None else None
             if rows is None or memory is None:
                 return
-            found = [(row, sample) for row in rows if (sample := self._sample(row)) is not None]
-            for place, (_, sample) in enumerate(found):
-                fill(memory, place, sample, self.spec, self.cloud)
-            there, units = tuple(row for row, _ in found), tuple(sample.unit for _, sample in found)
-            self._ready.put((memory.filled(there, units), memory))
+            self._ready.put((self._read(rows, memory), memory))
 
     def _poll(self) -> None:
         rows = [int(row) for row in self._source.refresh()]
         gone = [int(row) for row in self._source.taken_back()]
-        for row in gone:
-            if row in self._cache:
-                self._cached_bytes -= self._cache.pop(row).nbytes
         self._here.difference_update(gone)
         self._here.update(rows)
-        self._gone.update(gone)
-        self._gone.difference_update(rows)
+        self._known.update(rows)
         found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
         with self._lock:
             self._arrived.extend(found)
-            self._complete = 0 < self._source.planned() <= len(self._here) + len(self._gone)
+            self._plans = self._source.plan_requests()
+            self._complete = 0 < self._source.planned() <= len(self._known)
         self._polled.set()
 
-    def _sample(self, row: int) -> Compact | None:
-        """The sample of a row; None while it is not complete."""
-        if row in self._here and row not in self._cache:
-            try:
-                return self._read(row)
-            except StoreError:
-                self._poll()  # a repair may have set it aside since the last time, and a worker have rendered it again
-                if row in self._here:
-                    return self._read(row)
-        return self._cache.get(row)
+    def _read(self, rows: Sequence[int], memory: Batch) -> Batch:
+        """Those of the rows that are complete."""
+        if not self._known.issuperset(rows):
+            self._poll()  # somebody else has seen them arrive
+        try:
+            return self._read_complete(rows, memory)
+        except StoreError:
+            self._poll()  # a repair may have set some aside since the last time, and a worker have rendered them again
+            return self._read_complete(rows, memory)
 
-    def _read(self, row: int) -> Compact:
-        sample = Compact.of(self._source.read(row), self.spec)
-        if self._cached_bytes + sample.nbytes <= self._settings.cache_bytes:
-            self._cache[row] = sample
-            self._cached_bytes += sample.nbytes
-        return sample
+    def _read_complete(self, rows: Sequence[int], memory: Batch) -> Batch:
+        there = [row for row in rows if row in self._here]
+        return read_into(memory, self._source, there, self._needs, self.cloud)

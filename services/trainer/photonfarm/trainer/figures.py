@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from photonfarm.shared.errors import IncompleteError, StoreError
@@ -26,10 +23,11 @@ from photonfarm.trainer.evaluation import (
 )
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.model import Cnn, SceneFrame, build
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.settings import MOST_HELD_OUT, TrainSettings
+from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.waits import bottleneck, samples_per_used, waits
 
-MOST_HELD_OUT = 512  # samples to evaluate on
 MOST_TRAINING = 1024  # samples to take the mean colour of
 SHOWN = 6  # samples shown as pictures
 
@@ -46,7 +44,7 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evaluation:
+class RunFigures:
     """The networks of a run on the same held-out samples."""
 
     first: HeldOut  # the network before its first step
@@ -56,7 +54,7 @@ class Evaluation:
     parameters: int
 
 
-def evaluate(source: SampleSource, settings: TrainSettings, run: Path) -> Evaluation:
+def run_figures(source: SampleSource, settings: TrainSettings, run: Path) -> RunFigures:
     """Evaluate a run on the first `MOST_HELD_OUT` held-out samples, on the CPU wherever it was trained.
 
     Raises IncompleteError if nothing is held out, StoreError without checkpoints.
@@ -71,14 +69,14 @@ def evaluate(source: SampleSource, settings: TrainSettings, run: Path) -> Evalua
             raise IncompleteError(
                 f"{len(training)} training and {len(held_out)} held-out samples are complete; a report needs both"
             )
-        frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
-        first, last = (_network(run / name, settings, frame) for name in (INITIAL, CHECKPOINT))
+        base = feed.geometry, feed.cloud
+        first, last = (TrainedRun.load(run, name).network(feed.spec, base) for name in (INITIAL, CHECKPOINT))
         colour = mean_colour(batches(feed, training, settings.batch))
 
-        def error(network: Cnn) -> HeldOut:
+        def error(network: Network) -> HeldOut:
             return measure(network_predictor(network), batches(feed, held_out, settings.batch))
 
-        return Evaluation(
+        return RunFigures(
             first=error(first),
             last=(last_error := error(last)),
             mean_colour=measure(constant_predictor(colour), batches(feed, held_out, settings.batch)),
@@ -87,13 +85,7 @@ def evaluate(source: SampleSource, settings: TrainSettings, run: Path) -> Evalua
         )
 
 
-def _network(path: Path, settings: TrainSettings, frame: SceneFrame) -> Cnn:
-    network = build(settings.network, frame, settings.seed)
-    network.load_state_dict(checkpoint.load(path)["network"])
-    return network
-
-
-def _shown(feed: Feed, network: Cnn, rows: list[int], errors: HeldOut, size: int) -> list[Shown]:
+def _shown(feed: Feed, network: Network, rows: list[int], errors: HeldOut, size: int) -> list[Shown]:
     predict = network_predictor(network)
     found: list[Shown] = []
     for batch in batches(feed, rows, size):
@@ -112,7 +104,7 @@ def production(store: str | Path, scene_id: str) -> SceneStatus:
     raise StoreError(f"{store}: holds no scene {scene_id}")
 
 
-def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: SceneStatus) -> dict[str, Any]:
+def summary(settings: TrainSettings, run: Path, found: RunFigures, status: SceneStatus) -> dict[str, Any]:
     """The figures of report.json."""
     state = checkpoint.load(run / CHECKPOINT)
     following = state["following"]
@@ -121,29 +113,27 @@ def summary(settings: TrainSettings, run: Path, evaluation: Evaluation, status: 
         "scene_id": status.scene_id,
         "samples_planned": status.samples_planned,
         "samples_committed": status.samples_complete,
-        "samples_held_out": len(evaluation.last.per_sample),
-        "configurations_held_out": evaluation.last.error.count,
+        "samples_held_out": len(found.last.per_sample),
+        "configurations_held_out": found.last.error.count,
         "samples_per_core_second": status.samples_complete / status.core_s if status.core_s > 0 else None,
         "render_core_seconds": status.core_s,
         "renders_redrawn": status.redrawn,
         "train_steps": state["step"],
-        "draws": state["step"] * settings.batch,
-        "draws_per_sample": state["step"] * settings.batch / max(len(following["sampler"]["rows"]), 1),
-        "val_error_first": evaluation.first.error.mean,
-        "val_error_last": evaluation.last.error.mean,
-        "val_error_last_standard_error": evaluation.last.error.standard_error,
-        "val_error_mean_colour": evaluation.mean_colour.error.mean,
-        "noise_floor": evaluation.last.floor,
-        "parameters": evaluation.parameters,
+        "draws": (draws := state["step"] * settings.batch),
+        "draws_per_sample": draws / max(len(following["sampler"]["rows"]), 1),
+        "samples_per_used": samples_per_used(len(following["arrived"]), draws),
+        "val_error_first": found.first.error.mean,
+        "val_error_last": found.last.error.mean,
+        "val_error_last_standard_error": found.last.error.standard_error,
+        "val_error_mean_colour": found.mean_colour.error.mean,
+        "noise_floor": found.last.floor,
+        "parameters": found.parameters,
         "seeds": {"training": settings.seed},
         "seconds": state["seconds"],
+        "waits": (shares := waits(state["seconds"])),
+        "bottleneck": bottleneck(shares),
         "settings": settings.model_dump(mode="json"),
-        "versions": {
-            "photonfarm-trainer": version("photonfarm-trainer"),
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-        },
+        "versions": checkpoint.versions(),
     }
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
+
+import torch
 
 from photonfarm.trainer.dataset import Batch
+from photonfarm.trainer.distributed import ALONE, Group
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.sampler import RoundSampler
 from photonfarm.trainer.settings import TrainSettings
@@ -15,10 +18,19 @@ from photonfarm.trainer.settings import TrainSettings
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What arrived and when: with the seed, all that the order of training depends on."""
+    """What arrived and when: with the seed, all that the order of training depends on.
+
+    A run's checkpoint has it whole, as `following.arrived` and `following.growth`. To look at there is metrics.jsonl,
+    each record of which tells how many draws there were and how many samples had arrived.
+    """
 
     rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
     log: list[tuple[int, int]] = field(default_factory=list)  # (batches drawn by then, rows that had arrived)
+
+    @classmethod
+    def of(cls, state: dict[str, Any]) -> Self:
+        """That of a run, by the `following` of its checkpoint."""
+        return cls(state["arrived"].tolist(), [(drawn, arrived) for drawn, arrived in state["growth"].tolist()])
 
     def visible(self, drawn: int) -> int | None:
         """How many rows had arrived when batch `drawn` was drawn; None past the log's end."""
@@ -31,8 +43,9 @@ class Growth:
 class Following:
     """Draws batches ahead of training; they are read meanwhile. A `script` repeats the growth of an earlier run."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None) -> None:
-        self._feed, self._settings = feed, settings
+    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: Group = ALONE) -> None:
+        """Draw for all processes of a group, and read this one's part."""
+        self._feed, self._settings, self._group = feed, settings, group
         self._script = script or Growth()
         self._sampler = RoundSampler(settings.seed, settings.catch_up)
         self._waiting: dict[int, bool] = {}  # arrived, not yet visible: row → held out
@@ -95,54 +108,56 @@ class Following:
             self.look()
             if not self.may_draw():
                 break
-            rows = self._sampler.draw(self._settings.batch)
-            self._asked.append(rows)
-            self._feed.ask(rows)
+            self._ask(self._sampler.draw(self._settings.batch))
             self.drawn += 1
         return bool(self._asked)
 
+    def _ask(self, rows: tuple[int, ...]) -> None:
+        self._asked.append(rows)
+        self._group.tell("rows", rows)
+        self._feed.ask(self._group.part(rows))
+
     def take(self) -> Batch | None:
-        """The next batch drawn, read; draws of rows that are not complete any more do not count.
+        """The next batch drawn, this process' part of it read; draws of rows that are not complete now do not count.
 
         None if there is no row left in it: another one is drawn in its place, as the last one.
         """
         batch = self._feed.take()
-        rows = self._asked.popleft()
-        self._sampler.put_back((Counter(rows) - Counter(batch.rows)).elements())
-        if batch.rows:
+        self._group.tell("take")  # only now, so that the others wait for no rank that has failed to read
+        rows, there = self._asked.popleft(), self._group.joined(batch.rows)
+        self._sampler.put_back((Counter(rows) - Counter(there)).elements())
+        if there:
             return batch
-        rows = self._sampler.draw(self._settings.batch)
-        self._asked.append(rows)
-        self._feed.ask(rows)
+        self._ask(self._sampler.draw(self._settings.batch))
         return None
 
     def drop(self) -> None:
-        """Let go of the batches that were read ahead, so that something else can be read."""
+        """Let go of the batches that were read ahead, so that something else can be read; other ranks keep theirs."""
         for _ in self._asked:
             self._feed.take()
 
     def ask_again(self) -> None:
         """Have the batches that were let go read again."""
         for rows in self._asked:
-            self._feed.ask(rows)
+            self._feed.ask(self._group.part(rows))
 
     def state(self) -> dict[str, Any]:
-        """What is to be restored for the same batches to follow."""
+        """What is to be restored for the same batches to follow; int64 tensors where there is a number for each row."""
         return {
             "sampler": self._sampler.state(),
             "asked": [list(rows) for rows in self._asked],
             "drawn": self.drawn,
-            "arrived": list(self.growth.rows),
-            "growth": [list(entry) for entry in self.growth.log],
-            "held_out": list(self.held_out),
+            "arrived": torch.tensor(self.growth.rows, dtype=torch.int64),
+            "growth": torch.tensor(self.growth.log, dtype=torch.int64).reshape(-1, 2),
+            "held_out": torch.tensor(self.held_out, dtype=torch.int64),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
         self._sampler.restore(state["sampler"])
-        self._asked = deque(tuple(rows) for rows in state["asked"])
         self.drawn = state["drawn"]
-        self.growth = Growth(list(state["arrived"]), [(drawn, n) for drawn, n in state["growth"]])
-        self.held_out = list(state["held_out"])
+        self.growth = Growth.of(state)
+        self.held_out = state["held_out"].tolist()
         self._known = set(self.growth.rows)
-        self.ask_again()
+        for rows in state["asked"]:
+            self._ask(tuple(rows))

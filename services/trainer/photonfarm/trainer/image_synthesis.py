@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from photonfarm.trainer.settings import Precision
+
 HALVINGS = 3
 
 
@@ -31,10 +33,13 @@ class ImageSynthesisLayer(nn.Module):
     """Three halvings by max-pooling at widths d, 2d, 4d, 8d; bilinear up, joined with the encoder's block outputs.
 
     Ours where the figure is silent: 3×3 convolutions between the widths, no normalisation, no activation at the end.
+    With `precision` "bfloat16" it computes in that type but for the last convolution, so that the image and what the
+    loss makes of it are float32, as are all weights.
     """
 
-    def __init__(self, channels_in: int, width: int) -> None:
+    def __init__(self, channels_in: int, width: int, precision: Precision = "float32") -> None:
         super().__init__()
+        self.precision = precision
         widths = [width << level for level in range(HALVINGS + 1)]
         self.enter = nn.ModuleList(_conv(a, b) for a, b in pairwise([channels_in, *widths]))
         self.encode = nn.ModuleList(ConvBlock(w) for w in widths)
@@ -44,6 +49,12 @@ class ImageSynthesisLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, channels_in, H, W) → (B, 3, H, W), exposed linear radiance."""
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+            x = self._features(x)
+        return self.out(x.float())
+
+    def _features(self, x: Tensor) -> Tensor:
+        """(B, channels_in, H, W) → (B, width, H, W)."""
         skips = []
         for level, (enter, encode) in enumerate(zip(self.enter, self.encode, strict=True)):
             x = encode(enter(functional.max_pool2d(x, 2) if level else x))
@@ -52,7 +63,7 @@ class ImageSynthesisLayer(nn.Module):
         for join, decode in reversed(list(zip(self.join, self.decode, strict=True))):
             x = functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
             x = decode(join(torch.cat([skips.pop(), x], dim=1)))
-        return self.out(x)
+        return x
 
 
 def _conv(channels_in: int, channels_out: int) -> nn.Conv2d:

@@ -14,24 +14,31 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from pydantic import ValidationError
 
 from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.records import F32
+from photonfarm.shared.scene import sentences
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import Batch, SampleSource
-from photonfarm.trainer.evaluation import batches, measure, network_predictor
+from photonfarm.trainer.device import usable_device
+from photonfarm.trainer.distributed import ALONE, Group, Ranks
+from photonfarm.trainer.evaluation import Predictor, batches, measure, network_predictor
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.following import Following, Growth
-from photonfarm.trainer.losses import LOSSES
+from photonfarm.trainer.learner import Learner
 from photonfarm.trainer.metrics_log import MetricsLog
-from photonfarm.trainer.model import SceneFrame, build, usable_device
+from photonfarm.trainer.optimisers import rate_at
 from photonfarm.trainer.run_folder import held
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.settings import KEYS, TrainSettings
+from photonfarm.trainer.waits import Stopwatch, samples_per_used, waits
 
+Show = Callable[[int, F32, F32], None]
 T = TypeVar("T")
 
-CHECKPOINT = "checkpoint.pt"
-INITIAL = "initial.pt"
+CHECKPOINT = "checkpoint.safetensors"
+INITIAL = "initial.safetensors"
 METRICS = "metrics.jsonl"
 SETTINGS = "settings.json"
 LOG_EVERY = 50  # steps
@@ -60,6 +67,20 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.signal(name, handler)
 
 
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a session of training has around it; `train` says what each is for."""
+
+    run: Path
+    watch: Stopwatch
+    stop: threading.Event
+    group: Group
+    script: Growth | None
+    listen: Callable[[dict[str, Any]], object] | None
+    count: Callable[[int, int], None] | None
+    show: Show | None
+
+
 def train(
     source: SampleSource,
     settings: TrainSettings,
@@ -68,67 +89,77 @@ def train(
     stop: threading.Event | None = None,
     clock: Callable[[], float] = time.monotonic,
     script: Growth | None = None,
-    listen: Callable[[dict[str, Any]], None] | None = None,
+    listen: Callable[[dict[str, Any]], object] | None = None,
     count: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
+    group: Group = ALONE,
+    show: Show | None = None,
 ) -> Outcome:
     """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
     checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
     metrics.jsonl as it is written; `count`, after each step and where a run begins, how many draws there were by then
-    and how many samples have arrived. `waited` seconds have gone by already. Raises SpecError for a run of another
-    network or scene, a device that is not there or a hold-out that leaves nothing, StoreError for a folder that cannot
-    be written or that another trainer has, IncompleteError for a loss that is not finite; the last checkpoint stays.
+    and how many samples have arrived. `waited` seconds have gone by already. Of a `group` this is rank 0. At each
+    validation `show` gets the step, targets and predictions of the first held-out samples. Raises SpecError for a run
+    of another network, scene or store, a device that is not there or a hold-out that leaves nothing, StoreError for a
+    folder that cannot be written or that another trainer has, DivergedError for a loss that is not finite; the last
+    checkpoint stays.
     """
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
-    stop = stop or threading.Event()
-    began = clock() - waited
+    stop, watch = stop or threading.Event(), Stopwatch(clock, "wait_data", waited)
     with held(run):
         while not source.ready():
-            if stop.wait(settings.poll_seconds) or clock() - began >= (settings.max_seconds or math.inf):
+            if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
                 return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
+        watch.turn("start")
         with Feed(source, settings, clock) as feed:
-            log = MetricsLog(run / METRICS, listen)
-            return Session(feed, settings, run, log, stop, clock, script, count).run(waited=clock() - began)
+            around = Surroundings(run, watch, stop, group, script, listen, count, show)
+            return Session(feed, settings, around).run()
+
+
+def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
+    """Train with rank 0 until that ends; `source` makes the samples of a scene by its id.
+
+    The folder `run`, which rank 0 writes, is read where the run goes on. Raises what `train` does.
+    """
+    torch.set_num_threads(settings.threads)
+    what, told = ranks.hear()
+    if what == "end":
+        return
+    own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
+    with Feed(source(told["scene_id"]), own) as feed:
+        learner, step = Learner(feed, settings, ranks), told["step"]
+        if told["continues"]:
+            learner.restore(checkpoint.load(run / CHECKPOINT))
+        while (heard := ranks.hear())[0] != "end":
+            if heard[0] == "rows":
+                feed.ask(ranks.part(heard[1]))
+                continue
+            batch = feed.take()
+            if ranks.joined(batch.rows):
+                learner.step(step, batch)
+                step += 1
 
 
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
-    def __init__(
-        self,
-        feed: Feed,
-        settings: TrainSettings,
-        run: Path,
-        log: MetricsLog,
-        stop: threading.Event,
-        clock: Callable[[], float],
-        script: Growth | None,
-        count: Callable[[int, int], None] | None,
-    ) -> None:
-        self._count = count
-        self._feed, self._settings, self._run, self._log = feed, settings, run, log
-        self._stop, self._clock = stop, clock
-        self._device = usable_device(settings.device)
-        frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
-        self._network = build(settings.network, frame, settings.seed).to(self._device)
-        self._optimiser = torch.optim.Adam(
-            self._network.parameters(),
-            lr=settings.learning_rate,
-            betas=(settings.beta1, settings.beta2),
-            fused=True,  # one pass over the weights; half the time of the default on a CPU
-        )
-        self._following = Following(feed, settings, script)
+    def __init__(self, feed: Feed, settings: TrainSettings, around: Surroundings) -> None:
+        self._feed, self._settings, self._around = feed, settings, around
+        self._run, self._watch, self._stop = around.run, around.watch, around.stop
+        self._log = MetricsLog(around.run / METRICS, around.listen)
+        self._learner = Learner(feed, settings, around.group)
+        self._following = Following(feed, settings, around.script, around.group)
         self._step = 0
-        self._seconds = {"train": 0.0, "validate": 0.0, "wait_data": 0.0, "wait_read": 0.0}
         self._last_error: float | None = None
+        self._seconds_told: dict[str, float] = {}  # by the last validation
 
-    def run(self, waited: float = 0.0) -> Outcome:
-        """Train until something ends it; `waited` seconds have gone by waiting for the scene."""
+    def run(self) -> Outcome:
+        """Train until something ends it."""
         self._begin()
-        self._seconds["wait_data"] += waited
+        self._watch.turn("other")
         while (reason := self._ended()) is None:
             if self._step % self._settings.validate_every == 0 and self._wait(self._can_validate):
                 self._validate()
@@ -144,77 +175,78 @@ class Session:
 
     def _begin(self) -> None:
         path = self._run / CHECKPOINT
-        if path.exists():
-            self._continue(path)
-        else:
-            checkpoint.save(self._run / INITIAL, {"network": self._network.state_dict(), **self._identity()})
+        changed = self._continue(path) if path.exists() else self._start()
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         self._log.cut(self._step)
+        if changed:
+            self._log.write("changes", step=self._step, changes=changed)
         self._tell_count()
 
-    def _continue(self, path: Path) -> None:
+    def _start(self) -> checkpoint.Changes:
+        self._tell_begin(continues=False)
+        checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
+        return {}
+
+    def _continue(self, path: Path) -> checkpoint.Changes:
+        """Go on from a checkpoint; returns which settings are others than they were."""
         state = checkpoint.load(path)
-        checkpoint.check_continues(path, state, **self._identity())
-        self._network.load_state_dict(state["network"])
-        self._optimiser.load_state_dict(state["optimiser"])
-        torch.set_rng_state(state["rng"])
-        self._step, self._seconds, self._last_error = state["step"], state["seconds"], state["last_error"]
+        changed = checkpoint.check_continues(path, state, self._identity())
+        checkpoint.check_same_store(path, state, self._feed.plan_requests())
+        self._learner.restore(state)
+        self._step, self._last_error = state["step"], state["last_error"]
+        self._watch.add(state["seconds"])
+        self._seconds_told = dict(state["seconds"])
+        self._tell_begin(continues=True)
         self._following.restore(state["following"])
+        return changed
+
+    def _tell_begin(self, *, continues: bool) -> None:
+        told = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        self._around.group.tell("begin", told)
 
     def _identity(self) -> dict[str, Any]:
-        return {
-            "scene_id": self._feed.spec.scene_id,
-            "network_settings": self._settings.network.model_dump(),
-            "batch": self._settings.batch,
-            "hold_out": self._settings.hold_out,
-            "seed": self._settings.seed,
-        }
+        return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
 
     def _save(self) -> None:
-        state = {
-            "network": self._network.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-            "rng": torch.get_rng_state(),
-            "step": self._step,
-            "seconds": self._seconds,
-            "last_error": self._last_error,
-            "following": self._following.state(),
-        }
-        checkpoint.save(self._run / CHECKPOINT, {**state, **self._identity()})
+        with self._watch.on("save"):
+            samples = len(self._following.growth.rows)
+            state = {
+                **self._learner.state(),
+                **self._identity(),
+                "step": self._step,
+                "seconds": self._watch.seconds,
+                "last_error": self._last_error,
+                "following": self._following.state(),
+                "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
+                "versions": checkpoint.versions(),
+            }
+            checkpoint.save(self._run / CHECKPOINT, state)
 
     def _ended(self) -> str | None:
         if self._stop.is_set():
             return "stopped"
         if self._step >= self._settings.max_steps:
             return "steps"
-        if self._settings.max_seconds is not None and sum(self._seconds.values()) >= self._settings.max_seconds:
+        if self._settings.max_seconds is not None and self._watch.total >= self._settings.max_seconds:
             return "seconds"
         return None
 
     # -----------------------------------------------------------------------------------------------------------------
-
-    @contextmanager
-    def _timed(self, what: str) -> Iterator[None]:
-        began = self._clock()
-        try:
-            yield
-        finally:
-            self._seconds[what] += self._clock() - began
 
     def _wait(self, look: Callable[[], T | None]) -> T | None:
         """Wait for data until `look` finds something, and return it; None once training has ended."""
         while not (found := look()):
             if self._ended() is not None:
                 return None
-            with self._timed("wait_data"):
+            with self._watch.on("wait_data"):
                 self._stop.wait(NAP_SECONDS)
         return found
 
     def _next_batch(self) -> Batch | None:
         if not self._following.draw_ahead(self._settings.max_steps):
             return None
-        with self._timed("wait_read"):
+        with self._watch.on("wait_read"):
             return self._following.take()
 
     def _can_validate(self) -> bool:
@@ -235,11 +267,11 @@ class Session:
     def _validate(self) -> None:
         """Log the held-out error of the network as it is."""
         rows = self._following.held_out[: self._settings.validation_samples]
-        with self._timed("validate"):
+        with self._watch.on("validate"):
             self._following.drop()
             found = batches(self._feed, rows, self._settings.batch)
             try:
-                held_out = measure(network_predictor(self._network), found)
+                held_out = measure(self._shown(network_predictor(self._learner.network)), found)
             except IncompleteError:  # a repair has taken all of them back, for now
                 return
             finally:
@@ -252,51 +284,58 @@ class Session:
             standard_error=held_out.error.standard_error,
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
+            waits=waits(seconds := self._watch.seconds, self._seconds_told),
             **self._counts(),
         )
+        self._seconds_told = seconds
+
+    def _shown(self, predict: Predictor) -> Predictor:
+        """The same predictor; the first batch of a validation is shown on the way."""
+        waiting = [self._around.show] if self._around.show is not None else []
+
+        def predict_and_show(batch: Batch) -> F32:
+            images = predict(batch)
+            for show in waiting:
+                show(self._step, batch.target.mean(dim=1).cpu().numpy(), images)
+            waiting.clear()
+            return images
+
+        return predict_and_show
 
     def _used(self) -> tuple[int, int]:
         """Draws so far, and samples that have arrived."""
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
     def _tell_count(self) -> None:
-        if self._count is not None:
-            self._count(*self._used())
+        if self._around.count is not None:
+            self._around.count(*self._used())
 
     def _counts(self) -> dict[str, Any]:
         draws, samples = self._used()
-        return {"draws": draws, "samples": samples, "seconds": {k: round(v, 3) for k, v in self._seconds.items()}}
+        ahead = round(samples_per_used(samples, draws), 3)
+        seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
+        return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}
 
     def _train_step(self, batch: Batch) -> None:
-        """One step of Adam [supplement 3.1]."""
-        with self._timed("train"):
-            rate = self._rate()
-            for group in self._optimiser.param_groups:
-                group["lr"] = rate
-            batch = batch.to(self._device)
-            loss = LOSSES[self._settings.loss](self._network(batch.inputs), batch.target)
-            value = loss.item()
-            if not math.isfinite(value):
-                raise IncompleteError(
-                    f"step {self._step}: the loss is {value} on rows {list(batch.rows)}; training cannot go on. "
-                    f"The last checkpoint in {self._run} is kept; a smaller learning_rate or a larger batch may help"
-                )
-            self._optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            self._optimiser.step()
+        with self._watch.on("train"):
+            value = self._learner.step(self._step, batch)
         self._step += 1
         self._tell_count()
         if self._step % LOG_EVERY == 0:
+            rate = rate_at(self._step - 1, self._settings)
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())
-
-    def _rate(self) -> float:
-        epoch = self._step * self._settings.batch // self._settings.epoch_samples
-        return self._settings.learning_rate * self._settings.decay**epoch
 
 
 def read_settings(run: Path) -> TrainSettings:
     """The settings a run was made with. Raises SpecError if there is no run."""
+    path = run / SETTINGS
     try:
-        return TrainSettings.model_validate(json.loads((run / SETTINGS).read_text()))
-    except (OSError, ValueError) as error:
-        raise SpecError(f"{run}: is not a training run: {error}") from error
+        return TrainSettings.model_validate(json.loads(path.read_text()))
+    except FileNotFoundError as error:
+        raise SpecError(f"{run}: is not a training run: it holds no {SETTINGS}") from error
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise SpecError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
+    except ValueError as error:
+        raise SpecError(f"{path}: is not the JSON that a training run leaves there: {error}") from error

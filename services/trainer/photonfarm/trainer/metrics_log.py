@@ -14,7 +14,7 @@ from photonfarm.shared.store import store_errors
 class MetricsLog:
     """The log of one run. `listen` gets each record as it is written; StoreError where it cannot be."""
 
-    def __init__(self, path: Path, listen: Callable[[dict[str, Any]], None] | None = None) -> None:
+    def __init__(self, path: Path, listen: Callable[[dict[str, Any]], object] | None = None) -> None:
         self._path, self._listen = path, listen
 
     def cut(self, step: int) -> None:

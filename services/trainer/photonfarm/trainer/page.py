@@ -11,6 +11,7 @@ import numpy as np
 from photonfarm.shared.pictures import display, of_albedo, png_uri
 from photonfarm.trainer.curve import Level, learning_curve
 from photonfarm.trainer.figures import Shown
+from photonfarm.trainer.waits import stated
 
 STYLE = """
 :root { color-scheme: light; }
@@ -108,6 +109,7 @@ def _details(figures: dict[str, Any]) -> str:
         ("network", f"{settings['network']['architecture']}, {figures['parameters']:,} parameters"),
         ("draws", f"{figures['draws']}, {figures['draws_per_sample']:.1f} of each training sample"),
         ("seconds", seconds),
+        ("waits", stated(figures["waits"], figures["samples_per_used"])),
         ("rendering", f"{figures['render_core_seconds']:.1f} core-seconds, {figures['renders_redrawn']} drawn again"),
         ("seeds", ", ".join(f"{k} {v}" for k, v in figures["seeds"].items())),
         ("versions", ", ".join(f"{k} {v}" for k, v in figures["versions"].items())),

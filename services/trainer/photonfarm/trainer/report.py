@@ -8,7 +8,7 @@ from typing import Any
 
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.figures import evaluate, production, summary, validations
+from photonfarm.trainer.figures import production, run_figures, summary, validations
 from photonfarm.trainer.loop import CHECKPOINT, read_settings
 from photonfarm.trainer.page import page
 from photonfarm.trainer.store_source import StoreSource
@@ -23,10 +23,10 @@ def write_report(store: str | Path, run: Path, out: Path) -> dict[str, Any]:
     """
     settings = read_settings(run)
     scene_id = checkpoint.load(run / CHECKPOINT)["scene_id"]
-    evaluation = evaluate(StoreSource(store, scene_id), settings, run)
-    figures = summary(settings, run, evaluation, production(store, scene_id))
+    found = run_figures(StoreSource(store, scene_id), settings, run)
+    figures = summary(settings, run, found, production(store, scene_id))
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
-        (out / "report.html").write_text(page(figures, validations(run), evaluation.shown))
+        (out / "report.html").write_text(page(figures, validations(run), found.shown))
     return figures

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from photonfarm.shared.keys import Stream, make_key
@@ -16,8 +17,9 @@ class RoundSampler:
     """Every round draws each row once, in random order, and a row that is behind up to `catch_up` times more.
 
     Once no rows arrive, all are drawn equally often to within one. Uniform draws from a growing set would favour the
-    early rows by r ln(n_end/n_then); strictly the fewest-drawn first would, after each arrival, train on nothing but
-    the new rows until they had caught up, which is where a network forgets the others. A large `catch_up` is that.
+    early rows by r ln(n_end/n_then). Strictly the fewest-drawn first, shard by shard as they arrive, would train on
+    nothing but the new shard's rows until they had caught up, which is where a network forgets the others; so here new
+    rows come more often and never alone, and a `catch_up` larger than any row has been drawn is that strict order.
     Deterministic in the seed, the order of arrival, and how many had arrived at each draw.
     """
 
@@ -66,21 +68,21 @@ class RoundSampler:
             self._visits[self.rows.index(row)] -= 1
 
     def state(self) -> dict[str, Any]:
-        """All that draws depend on besides the seed; plain lists and numbers."""
+        """All that draws depend on besides the seed; int64 tensors where there is a number for each row."""
         return {
-            "rows": list(self.rows),
-            "visits": self._visits.tolist(),
+            "rows": torch.tensor(self.rows, dtype=torch.int64),
+            "visits": torch.from_numpy(self._visits.copy()),
             "joined": self._joined,
-            "deck": list(self._deck),
+            "deck": torch.tensor(list(self._deck), dtype=torch.int64),
             "shuffles": self._shuffles,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
-        self.rows = list(state["rows"])
-        self._visits = np.array(state["visits"], np.int64)
+        self.rows = state["rows"].tolist()
+        self._visits = state["visits"].numpy().copy()
         self._joined = state["joined"]
-        self._deck = deque(state["deck"])
+        self._deck = deque(state["deck"].tolist())
         self._shuffles = state["shuffles"]
 
     def _round(self, first: int) -> NDArray[np.int64]:

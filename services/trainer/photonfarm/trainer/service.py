@@ -7,8 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from pydantic import ValidationError
@@ -19,11 +20,13 @@ from photonfarm.shared.estimate import stated
 from photonfarm.shared.scene import load_spec, sentences
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.storage import is_vacant
-from photonfarm.trainer.settings import TrainSettings, small
+from photonfarm.trainer import waits
+from photonfarm.trainer.settings import KEYS, NetworkSettings, TrainSettings, preset
+
+if TYPE_CHECKING:
+    from photonfarm.trainer.distributed import Group
 
 T = TypeVar("T")
-
-PRESETS: dict[str, Callable[..., TrainSettings]] = {"small": small, "paper": TrainSettings}
 
 POLL_S = 1.0
 ALIVE_FILE = "alive"
@@ -35,23 +38,49 @@ def run(
     spec: str | None,
     store: str | Path,
     folder: Path,
-    preset: str,
+    preset_name: str,
     changes: dict[str, Any],
     redis_url: str | None = None,
 ) -> None:
     """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint.
 
     Waiting for a scene, its base and its samples counts as time spent. With a Redis, workers are told what is used.
+    Started by torchrun, rank 0 does all this, and the others train with it until it ends; all need the same folder.
     """
-    from photonfarm.trainer.loop import stop_on_signals, train
-    from photonfarm.trainer.model import usable_device
+    from photonfarm.trainer.device import described
+    from photonfarm.trainer.distributed import ALONE, leading, ranks
+    from photonfarm.trainer.loop import assist, stop_on_signals
     from photonfarm.trainer.store_source import StoreSource
 
-    settings = _settings(preset, changes)
-    usable_device(settings.device)
-    scene_id = load_spec(spec).scene_id if spec else _begun_on(folder)
-    began = time.monotonic()
-    with stop_on_signals() as stop, _sign_of_life(folder):
+    settings = _settings(preset_name, changes)
+    with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
+        group = ours or ALONE
+        device = group.device(settings.device)
+        if ours is not None and ours.rank:
+            assist(partial(StoreSource, store), settings, folder, ours)
+            return
+        with leading(group):
+            click.echo(f"training on {described(device)}", err=True)
+            _lead(load_spec(spec).scene_id if spec else None, store, folder, settings, redis_url, stop, group)
+
+
+def _lead(
+    scene_id: str | None,
+    store: str | Path,
+    folder: Path,
+    settings: TrainSettings,
+    redis_url: str | None,
+    stop: threading.Event,
+    group: Group,
+) -> None:
+    """Train as the only process or as rank 0: it waits for a scene, tells, and leaves event files for TensorBoard."""
+    from photonfarm.trainer.loop import train
+    from photonfarm.trainer.store_source import StoreSource
+    from photonfarm.trainer.tensorboard import event_files
+
+    scene_id = scene_id or _begun_on(folder)
+    with _sign_of_life(folder), event_files(folder) as board:
+        began = time.monotonic()
         if is_vacant(store):
             click.echo(f"waiting for a store and a scene in {store}", err=True)
         scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
@@ -60,7 +89,11 @@ def run(
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         with _consumption_told(redis_url, store, scene_id) as count:
-            outcome = train(source, settings, folder, stop=stop, listen=_tell, count=count, waited=waited)
+            listen = [_tell, *([board.record] if board else [])]
+            outcome = train(
+                source, settings, folder, stop=stop, count=count, waited=waited, group=group,
+                listen=lambda record: [hear(record) for hear in listen], show=board.pictures if board else None,
+            )  # fmt: skip
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 
@@ -76,11 +109,67 @@ def check(folder: Path) -> None:
         )
 
 
+def summarise(spec: str | None, store: str | Path, preset_name: str, changes: dict[str, Any]) -> str:
+    """The parameters and the work of a network, as a table; nothing is trained, and of a store only a spec is read.
+
+    Raises SpecError without a spec, unless the store has one scene.
+    """
+    from photonfarm.trainer.networks import ARCHITECTURES
+    from photonfarm.trainer.networks.summary import summary, table
+
+    network = _settings(preset_name, changes).network
+    if spec:
+        scene = load_spec(spec)
+    else:
+        scene_id = _only_scene(store)
+        if scene_id is None:
+            raise SpecError(f"{store}: holds no scene; name the spec of the one to summarise a network for")
+        scene = Store(store).scene(scene_id).spec
+    points = min(network.points or scene.points, scene.points)
+    head = (
+        f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
+        f"width {network.width}" + (f", {points} points" if ARCHITECTURES[network.architecture].needs.points else "")
+    )
+    return f"{head}\n{table(summary(scene, network))}"
+
+
+def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, changes: dict[str, Any]) -> str:
+    """The table of a grid search over optimisers, rates and decays on a complete store; goes on where it was stopped.
+
+    What `changes` set of these is searched no further. Raises SpecError without a spec, unless the store has one scene,
+    for a store without the scene, and in one of several processes.
+    """
+    from photonfarm.trainer.distributed import processes
+    from photonfarm.trainer.grid import AXES, STEPS, run_grid, table
+    from photonfarm.trainer.loop import stop_on_signals
+    from photonfarm.trainer.store_source import StoreSource
+
+    if (size := processes()) > 1:
+        raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
+    settings = _settings(preset_name, {"max_steps": STEPS, **changes})
+    scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
+    if scene_id is None or not StoreSource(store, scene_id).ready():
+        wanted = f" {spec}" if spec else ""
+        raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
+    with stop_on_signals() as stop, _sign_of_life(folder):
+        axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
+        tell = partial(click.echo, err=True)
+        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
+        if stop.is_set():
+            tell(f"stopped after {len(cells)} cells; the same command goes on")
+        return table(cells)
+
+
 def _settings(name: str, changes: dict[str, Any]) -> TrainSettings:
+    """A preset with changes; keys of the network may stand among them, under their own names."""
+    network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
+    others = {key: value for key, value in changes.items() if key not in network}
+    if "network" in others:
+        raise SpecError("the settings of the training: network: its keys are set each by its own name, as in width=32")
     try:
-        return PRESETS[name](**changes)
+        return preset(name, network=network, **others)
     except ValidationError as error:
-        raise SpecError(f"the settings of the training: {'; '.join(sentences(error))}") from error
+        raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error
 
 
 def _begun_on(folder: Path) -> str | None:
@@ -197,9 +286,13 @@ class _Told:
 
 
 def _tell(record: dict[str, Any]) -> None:
+    if record["kind"] == "changes":
+        changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
+        click.echo(f"goes on from step {record['step']} with {changed}", err=True)
     if record["kind"] == "validation":
         click.echo(
             f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
-            f"on {record['held_out']} of {record['samples']} samples",
+            f"on {record['held_out']} of {record['samples']} samples; "
+            + waits.stated(record["waits"], record["samples_per_used"]),
             err=True,
         )

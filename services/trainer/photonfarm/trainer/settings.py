@@ -5,16 +5,29 @@ Where a default is the supplement's, its section is named; the others are ours.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-DepthSpace = Literal["window", "linear", "relative"]
-Architecture = Literal["light_transport", "cnn"]
+from photonfarm.trainer import biased
+
+Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
+Architecture = Literal[
+    "cnn", "feature_projection", "light_transport", "light_transport_photons",
+    "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
+]  # fmt: skip
+Precision = Literal["float32", "bfloat16"]
 Loss = Literal["linear", "relative"]
+Optimiser = Literal["adam", "rmsprop"]
+UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
+
+MOST_HELD_OUT = 512
+"""Samples that a finished run is measured on, at most."""
 
 
 class _Frozen(BaseModel):
@@ -28,8 +41,17 @@ class NetworkSettings(_Frozen):
     width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
     points: Count | None = None  # first points of the base cloud to use; None: all of them
     descriptor: Annotated[int, Field(ge=0, le=512)] = 32  # learnable numbers per point
-    depth_space: DepthSpace = "window"  # where the occlusion tolerance is measured
-    occlusion_tolerance: Positive = 1e-3  # [S 1.2]
+    occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
+    # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
+    occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
+    precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
+    demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
+
+    @model_validator(mode="after")
+    def _has_what_is_projected(self) -> Self:
+        if self.architecture == "feature_projection" and not self.descriptor:
+            raise ValueError("has descriptor = 0; feature_projection projects descriptors, and at least 1 is needed")
+        return self
 
 
 class TrainSettings(_Frozen):
@@ -43,8 +65,11 @@ class TrainSettings(_Frozen):
     learning_rate: Positive = 5e-4  # [S 3.1]
     decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]
     epoch_samples: Count = 50_000  # an epoch counts samples drawn, so the schedule ignores how much has arrived
+    optimiser: Optimiser = "adam"  # [S 3.1]
     beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
-    beta2: Annotated[float, Field(ge=0, lt=1)] = 0.999  # nearer 1 under rare fireflies, which darken Adam [method 3]
+    beta2: Annotated[float, Field(ge=0, lt=1)] = 0.999  # with rare fireflies 0.9999 … 0.99999: 1 / (1 − β₂) steps
+    # must see some 25 of them, or the weights that they reach stay too dark (docs/results/firefly.md)
+    alpha: Annotated[float, Field(ge=0, lt=1)] = 0.99  # of RMSprop, as β₂ of Adam: with 0.99 it darkens even more
 
     max_steps: Count = 150_000  # [S 4]
     max_seconds: Positive | None = None  # wall time of all sessions of the run together
@@ -59,10 +84,31 @@ class TrainSettings(_Frozen):
     validation_samples: Count = 64  # at most so many held-out samples each time
     checkpoint_every: Count = 500  # steps
     poll_seconds: Positive = 1.0  # between looks at the store
-    cache_bytes: Annotated[int, Field(ge=0)] = 1 << 30  # of decoded samples kept in memory
     prefetch: Count = 2  # batches read ahead
     threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of torch on the CPU; renderers share the machine
-    device: str = "cpu"
+    device: str = "auto"  # cuda where torch has one, and otherwise the cpu
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_what_biases(cls, settings: Any) -> Any:
+        return biased.refuse(settings)
+
+
+KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model_fields) if key != "network")
+"""Every key that can be set, those of the network among them."""
+
+
+def paper_static(**changes: object) -> TrainSettings:
+    """The supplement's settings for a static scene: batches of 128; the image is what the scene's film is."""
+    return paper_dynamic(**{"batch": 128, **changes})
+
+
+def paper_dynamic(**changes: object) -> TrainSettings:
+    """The supplement's settings for movable objects and lights: width 64, 16 384 points (ours), batches of 32 [S 3.1].
+
+    Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they are what the scene's film is.
+    """
+    return TrainSettings.model_validate({"network": NetworkSettings(points=16384), **changes})
 
 
 def small(**changes: object) -> TrainSettings:
@@ -78,3 +124,16 @@ def small(**changes: object) -> TrainSettings:
         "max_steps": 4000,
     }
     return TrainSettings.model_validate({**described, **changes})
+
+
+PRESETS: dict[str, Callable[..., TrainSettings]] = {
+    "small": small,
+    "paper-static": paper_static,
+    "paper-dynamic": paper_dynamic,
+}
+
+
+def preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), **changes: object) -> TrainSettings:
+    """The settings of a preset with changes, those of its network in `network`. Raises ValidationError."""
+    settings = PRESETS[name](**changes)
+    return TrainSettings.model_validate({**dict(settings), "network": {**dict(settings.network), **network}})

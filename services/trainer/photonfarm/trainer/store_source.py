@@ -3,15 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.keys import Key
-from photonfarm.shared.records import BasePointCloud, Geometry
+from photonfarm.shared.modification import Modification
+from photonfarm.shared.records import BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store.reader import Sample, SceneReader
+from photonfarm.shared.store.batch import Batch
+from photonfarm.shared.store.reader import SceneReader
+from photonfarm.shared.view import View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredSample:
+    """One sample in the types that it is stored in; its images lie in memory that the next batch is read into."""
+
+    modification: Modification
+    view: View
+    radiance: NDArray[np.floating]  # (2, H, W, 3), times `scale` linear
+    scale: float
+    buffers: ViewBuffers
+    visibility: Visibility
+    pass_: int
 
 
 class StoreSource:
@@ -19,6 +37,7 @@ class StoreSource:
 
     def __init__(self, root: str | Path, scene_id: str) -> None:
         self._reader = SceneReader(root, scene_id)
+        self._memory: Batch | None = None
 
     def ready(self) -> bool:
         """Whether spec and base are there; they come with the scene's first job."""
@@ -41,9 +60,24 @@ class StoreSource:
         """The rows that were complete before the last `refresh` and not after it: a repair has set their jobs aside."""
         return self._reader.taken_back
 
-    def read(self, row: int) -> Sample:
-        """A complete row's sample; raises CorruptError if its bytes are not what was committed."""
-        return self._reader.read(row)
+    def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
+        """Complete rows' samples, valid until the next call; CorruptError if their bytes are not what was committed."""
+        if self._memory is None or len(rows) > len(self._memory):
+            self._memory = Batch.empty(self.spec, len(rows))
+        read = self._reader.read_batch(rows, self._memory)
+        return [self._sample(read, place, row) for place, row in enumerate(rows)]
+
+    def _sample(self, read: Batch, place: int, row: int) -> StoredSample:
+        modification, view, pass_ = self._reader.inputs(row)
+        radiance, scale = read.radiance[place], 2.0**-read.radiance_exponent
+        if place in read.wide:
+            radiance, scale = read.wide[place], 1.0
+        buffers = ViewBuffers(**{name: values[place] for name, values in read.buffers.items()})
+        return StoredSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_)
+
+    def read_photons(self, row: int) -> Photons:
+        """The photons of a complete row's configuration; raises StoreError for a scene that has none."""
+        return self._reader.read_photons(row)
 
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
         """The content key of each row's configuration."""
@@ -56,3 +90,7 @@ class StoreSource:
     def planned(self) -> int:
         """The number of samples in all plans at the last refresh, complete or not."""
         return self._reader.planned
+
+    def plan_requests(self) -> list[dict[str, Any]]:
+        """What was asked for with each plan, in order, as JSON has it: all that the rows follow from."""
+        return list(self._reader.plan_requests)

@@ -1,0 +1,245 @@
+"""`photonfarm evaluate`: the error of trained networks, and of denoisers that nobody trained, on what is held out.
+
+Two errors, which answer different questions. In linear radiance noisy halves are enough: their noise is taken out
+exactly. The columns of the paper's tables are of what a display shows, and need converged references [supplement 4].
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.estimate import Estimate, group_means
+from photonfarm.shared.keys import Key
+from photonfarm.shared.records import F32
+from photonfarm.shared.store import store_errors
+from photonfarm.shared.store.merge import Merged
+from photonfarm.trainer.animation import write_png
+from photonfarm.trainer.comparison import COMPARISON, comparison
+from photonfarm.trainer.dataset import Batch, kept_count
+from photonfarm.trainer.device import described, usable_device
+from photonfarm.trainer.evaluation import HeldOut, Predictor, batches, measure
+from photonfarm.trainer.evaluation_samples import References, Samples, Target, read_references
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.metrics import ImageMetrics, Inception, confidence_interval, image_metrics, load_inception
+from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.untrained import Untrained
+
+EVALUATION = "evaluation.json"
+
+Tell = Callable[[str, int, int], object]
+"""Told of a predictor, by its name, on how many samples of how many it has been measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """One predictor on the held-out samples."""
+
+    name: str
+    kept: int | None  # it is given one of so many pixels of half A; None: no colour
+    held_out: HeldOut  # linear radiance × exposure, noise removed
+    seconds: float  # of its network alone, for one image
+    metrics: ImageMetrics | None  # of what a display shows; None where no view has a reference
+    shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
+
+    def behind(self, first: Row) -> Estimate | None:
+        """By how much its linear error is above another's, in pairs of configurations; None for other samples."""
+        if self.held_out.units != first.held_out.units:
+            return None
+        difference = self.held_out.per_sample - first.held_out.per_sample
+        return Estimate.of(group_means(difference, self.held_out.units))
+
+    def document(self, first: Row) -> dict[str, Any]:
+        """What evaluation.json says of it, and of how far it is behind the first row."""
+        error, behind = self.held_out.error, self.behind(first)
+        return {
+            "predictor": self.name,
+            "network_seconds": self.seconds,
+            "linear_mse": {
+                "mean": error.mean,
+                "standard_error": error.standard_error,
+                "interval_95": confidence_interval(error),
+                "count": error.count,
+                "per_sample": self.held_out.per_sample.tolist(),
+            },
+            "behind_first": None if behind is None else {**asdict(behind), "interval_95": confidence_interval(behind)},
+            "metric_space": None if self.metrics is None else asdict(self.metrics),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """Several predictors on the same samples."""
+
+    scene: str
+    scene_id: str
+    unit: str  # what is independent: "configuration" or, of a static scene, "view"
+    samples: int  # of which those that are complete no longer are left out
+    device: str  # of the networks
+    threads: int  # of torch on the CPU
+    references: References | None
+    rows: tuple[Row, ...]
+    shown: tuple[Target, ...]
+
+    @property
+    def noise_floor(self) -> float:
+        """Of the targets: what the linear error against them would show on top."""
+        return self.rows[0].held_out.floor
+
+    @property
+    def units(self) -> int:
+        """How many configurations the samples are of; of a static scene, how many views."""
+        return self.rows[0].held_out.error.count
+
+    def document(self) -> dict[str, Any]:
+        """What evaluation.json says."""
+        return {
+            "scene": self.scene,
+            "scene_id": self.scene_id,
+            "samples": self.samples,
+            "unit": self.unit,
+            "units": self.units,
+            "noise_floor": self.noise_floor,
+            "device": self.device,
+            "threads": self.threads,
+            "references": None if self.references is None else asdict(self.references),
+            "rows": [row.document(self.rows[0]) for row in self.rows],
+        }
+
+
+def compare(
+    store: str | Path,
+    runs: Sequence[TrainedRun],
+    denoisers: Sequence[tuple[UntrainedDenoiser, int]] = (),
+    *,
+    references: Path | None = None,
+    inception: Path | None = None,
+    most: int = MOST_HELD_OUT,
+    device: str = "auto",
+    tell: Tell | None = None,
+) -> Evaluation:
+    """The runs, and denoisers of one of so many pixels, on the first `most` samples that no run was trained on.
+
+    References are files `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the
+    metric space, and each view is in it once, by its first sample. Raises SpecError for runs of different scenes, for
+    references of another size, for a film with too few pixels to keep some, and for a package that is missing;
+    IncompleteError if no held-out sample is complete.
+    """
+    first, place = runs[0], usable_device(device)
+    _check_same_scene(runs)
+    torch.set_num_threads(first.settings.threads)
+    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    spec = samples.source.spec
+    for _, kept in denoisers:
+        kept_count(spec, kept)
+    found = {} if references is None else read_references(references, samples)
+    targets = tuple(samples.target(row, found.get(row)) for row in samples.to_show(found))
+    network = load_inception(inception, str(place)) if found else None
+    shown = [target.row for target in targets]
+    test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
+    untrained = (Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers)
+    predictors: tuple[TrainedRun | Untrained, ...] = (*runs, *untrained)
+    return Evaluation(
+        scene=spec.name,
+        scene_id=first.scene_id,
+        unit="configuration" if spec.groups else "view",
+        samples=len(samples.rows),
+        device=described(place),
+        threads=first.settings.threads,
+        references=References.of(found, spec.transport.half_spp),
+        rows=tuple(test.row(predictor) for predictor in predictors),
+        shown=targets,
+    )
+
+
+def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
+    first = runs[0]
+    for run in runs:
+        if run.scene_id != first.scene_id:
+            raise SpecError(
+                f"{run.folder}: was trained on scene {run.scene_id}, and {first.folder} on {first.scene_id}; "
+                "runs of one scene can be compared"
+            )
+
+
+def write(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
+    """Leave evaluation.json and comparison.png in each run's folder; returns the pictures. Raises StoreError."""
+    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
+    for run in runs:
+        with store_errors("write the evaluation", run.folder):
+            (run.folder / EVALUATION).write_text(text)
+        write_png(picture, run.folder / COMPARISON)
+    return [run.folder / COMPARISON for run in runs]
+
+
+# --------------------------------------------------------------------------------------------------------- predictors
+
+
+@dataclass(slots=True)
+class _Watched:
+    """A predictor whose images of some rows are kept."""
+
+    predict: Predictor
+    wanted: set[int]
+    tell: Callable[[int], object]  # how many samples there were so far
+    images: dict[int, F32] = field(default_factory=dict)
+    units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
+    samples: int = 0
+
+    def __call__(self, batch: Batch) -> F32:
+        images = self.predict(batch)
+        for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
+            if row in self.wanted:
+                self.images[row], self.units[row] = image.copy(), unit
+        self.samples += len(batch.rows)
+        self.tell(self.samples)
+        return images
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Test:
+    """What all predictors are put to."""
+
+    store: str | Path
+    samples: Samples
+    references: Mapping[int, Merged]  # by row
+    shown: list[int]  # rows
+    inception: Inception | None
+    device: str
+    tell: Tell
+
+    def row(self, predictor: TrainedRun | Untrained) -> Row:
+        settings = predictor.settings.model_copy(update={"device": self.device})
+        rows, total = self.samples.rows, len(self.samples.rows)
+        with Feed(StoreSource(self.store, self._scene_id), settings, needs=predictor.needs) as feed:
+            predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
+            watched = _Watched(
+                predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, total)
+            )
+            held_out = measure(watched, batches(feed, rows, settings.batch))
+            seconds = predict.seconds(next(batches(feed, rows, 1)).inputs)
+        shown = {row: watched.images[row] for row in self.shown if row in watched.images}
+        metrics = self._metrics(watched)
+        return Row(predictor.name, predictor.needs.kept, held_out, seconds, metrics, shown)
+
+    @property
+    def _scene_id(self) -> str:
+        return self.samples.source.spec.scene_id
+
+    def _metrics(self, watched: _Watched) -> ImageMetrics | None:
+        rows = [row for row in watched.images if row in self.references]
+        if not rows:
+            return None
+        exposure = np.float32(self.samples.source.spec.exposure)
+        references = np.stack([exposure * self.references[row].mean.astype(np.float32) for row in rows])
+        units = [watched.units[row] for row in rows]
+        return image_metrics(np.stack([watched.images[row] for row in rows]), references, self.inception, units)

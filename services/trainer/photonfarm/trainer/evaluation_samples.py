@@ -1,0 +1,100 @@
+"""The samples that predictors are compared on: held out from all of them, some with converged references."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.keys import Key
+from photonfarm.shared.records import F32
+from photonfarm.shared.store.merge import Merged
+from photonfarm.trainer.dataset import rows_held_out, units_of
+from photonfarm.trainer.store_source import StoreSource
+
+SHOWN = 4  # samples shown as pictures
+
+
+@dataclass(frozen=True, slots=True)
+class References:
+    """What the columns of the metric space were measured against."""
+
+    views: int
+    spp: int  # of the reference that has the fewest
+    half_a_share: float  # of that reference's samples: those of one half A, if all passes of the view were merged
+
+    @classmethod
+    def of(cls, found: Mapping[int, Merged], half_spp: int) -> Self | None:
+        """Those that were found; None where there are none."""
+        if not found:
+            return None
+        count = min(reference.count for reference in found.values())
+        return cls(len(found), count * half_spp, 1 / count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """What a shown sample's predictions are looked at beside."""
+
+    row: int
+    image: F32  # (H, W, 3) linear radiance × exposure
+    spp: int
+    is_reference: bool  # or else the mean of the sample's own noisy halves
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """The held-out samples that all predictors are measured on."""
+
+    source: StoreSource
+    rows: list[int]
+    view_keys: list[Key]  # of each
+
+    @classmethod
+    def of(cls, source: StoreSource, share: float, most: int) -> Samples:
+        """Those held out by the smallest share: shares are nested, so that no run has seen them."""
+        complete = source.refresh().tolist()
+        held_out = [row for row, held in zip(complete, rows_held_out(source, complete, share), strict=True) if held]
+        if not held_out:
+            raise IncompleteError(
+                f"hold_out = {share:g}: none of the {len(complete)} complete samples is held out; wait for the workers"
+            )
+        return cls(source, held_out[:most], source.view_keys(held_out[:most]))
+
+    def to_show(self, references: Mapping[int, Merged]) -> list[int]:
+        """The first sample of each of the first configurations: of those that have a reference, where there are any."""
+        rows = list(references) or self.rows
+        first = dict(zip(reversed(units_of(self.source, rows)), reversed(rows), strict=True))
+        return sorted(first.values())[:SHOWN]
+
+    def target(self, row: int, reference: Merged | None) -> Target:
+        """A sample's reference, or the mean of its halves; StoreError for one that has been taken back."""
+        spec = self.source.spec
+        half_spp = spec.transport.half_spp
+        if reference is not None:
+            exposed = (spec.exposure * reference.mean).astype(np.float32)
+            return Target(row, exposed, reference.count * half_spp, is_reference=True)
+        (sample,) = self.source.read_batch([row])
+        mean = sample.radiance.astype(np.float32).mean(axis=0)
+        return Target(row, np.float32(spec.exposure * sample.scale) * mean, 2 * half_spp, is_reference=False)
+
+
+def read_references(folder: Path, samples: Samples) -> dict[int, Merged]:
+    """The references there are, by the first row that shows their view; raises SpecError for one of another size."""
+    film = samples.source.spec.film
+    found: dict[int, Merged] = {}
+    for key, row in dict(zip(reversed(samples.view_keys), reversed(samples.rows), strict=True)).items():
+        if (file := folder / f"{key.hex()}.npz").is_file():
+            found[row] = Merged.read(file)
+            if (shape := found[row].mean.shape) != (film.height, film.width, 3):
+                raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
+    if not found:
+        raise SpecError(
+            f"{folder}: holds no reference of the {len(set(samples.view_keys))} held-out views; "
+            "`photonfarm store merge --out` writes them, named by their views' keys"
+        )
+    return dict(sorted(found.items()))

@@ -1,0 +1,228 @@
+"""The grid search over optimisers, rates and decays [supplement 3.1]: short runs that differ in nothing else.
+
+A cell is one combination of the axes. All cells see the same samples in the same order from the same first weights and
+are measured on the same held-out samples, so that they are compared in pairs. The best of many cells looks better than
+it is on whatever it was picked by; so it is picked by one half of the held-out configurations, and the errors that are
+told are those on the other half.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.estimate import Estimate, group_means, stated
+from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.scene import sentences
+from photonfarm.shared.store import store_errors
+from photonfarm.trainer.dataset import SampleSource, rows_held_out, units_of
+from photonfarm.trainer.evaluation import HeldOut, batches, measure
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.learner import DivergedError
+from photonfarm.trainer.loop import train
+from photonfarm.trainer.markdown import markdown_table
+from photonfarm.trainer.run_folder import held
+from photonfarm.trainer.settings import MOST_HELD_OUT, TrainSettings
+from photonfarm.trainer.trained import TrainedRun
+
+Axes = Mapping[str, Sequence[Any]]
+"""The values that each key of the settings takes."""
+
+AXES: Axes = {
+    "optimiser": ("adam", "rmsprop"),
+    "learning_rate": (1e-4, 5e-4, 1e-3, 2e-3),
+    "decay": (0.95, 0.99, 1.0),
+}
+"""What the supplement searched; its values are not told, and these are ours, about those that it found best."""
+
+STEPS = 1000
+"""Steps of a cell unless told otherwise."""
+
+JSON = "grid.json"
+MARKDOWN = "grid.md"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """How one combination ended."""
+
+    changes: dict[str, Any]  # the axes' values
+    picked_by: tuple[float, ...]  # held-out error of each configuration of one half, noise removed; and of…
+    per_unit: tuple[float, ...]  # …each one of the other half, which nothing was picked by; empty: training diverged
+
+    @property
+    def rank(self) -> float:
+        """What the best has the least of: the mean error on the first half; infinite if training diverged."""
+        return float(np.mean(self.picked_by)) if self.picked_by else math.inf
+
+    @property
+    def error(self) -> Estimate | None:
+        """The error over the configurations of the second half; None if training diverged."""
+        return Estimate.of(np.array(self.per_unit)) if self.per_unit else None
+
+    def behind(self, best: Cell) -> Estimate:
+        """How much larger that is than another cell's: the mean over pairs, one for each configuration."""
+        return Estimate.of(np.array(self.per_unit) - np.array(best.per_unit))
+
+
+def run_grid(
+    make_source: Callable[[], SampleSource],
+    settings: TrainSettings,
+    folder: Path,
+    axes: Axes = AXES,
+    *,
+    stop: threading.Event | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> list[Cell]:
+    """Train and measure every cell; returns those that are finished, all of them unless `stop` was set.
+
+    Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Cells
+    that are finished there are kept, and one that is not goes on from its last checkpoint. `make_source` opens the same
+    complete samples each time; `tell` gets a line for every cell. Raises IncompleteError while samples are missing and
+    where fewer than two configurations are held out; SpecError for an axis that the settings do not have, and for a
+    folder that holds a grid over other samples or settings; what a run raises, besides DivergedError.
+    """
+    stop = stop or threading.Event()
+    wanted = _cells(settings, axes)
+    about = {**_about(make_source(), settings), "settings": settings.model_dump(mode="json")}
+    with held(folder):
+        finished = _read(folder / JSON, about)
+        for changes, changed in wanted:
+            if not any(cell.changes == changes for cell in finished):
+                cell = _run_cell(make_source, changed, changes, folder / _name(changes), stop)
+                if cell is None:
+                    break
+                finished.append(cell)
+                _write(folder, about, finished)
+                if tell:
+                    tell(f"{len(finished)}: {_name(changes)}: {_stated(cell.error)}")
+    return finished
+
+
+def table(cells: Sequence[Cell]) -> str:
+    """The cells as a Markdown table, the best first; differences from it are of pairs of configurations."""
+    ranked = sorted(cells, key=lambda cell: cell.rank)
+    keys = list(dict.fromkeys(key for cell in cells for key in cell.changes))
+    rows = []
+    for cell in ranked:
+        behind = _stated(cell.behind(ranked[0])) if cell.per_unit and cell is not ranked[0] else ""
+        picked = f"{cell.rank:.5f}" if cell.picked_by else ""
+        rows.append([*(str(cell.changes.get(key, "")) for key in keys), picked, _stated(cell.error), behind])
+    return markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
+
+
+def _cells(settings: TrainSettings, axes: Axes) -> list[tuple[dict[str, Any], TrainSettings]]:
+    """Every combination, with the settings that it makes."""
+    try:
+        combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
+        return [(c, TrainSettings.model_validate({**settings.model_dump(), **c})) for c in combinations]
+    except ValidationError as error:
+        raise SpecError(f"the axes of the grid: {'; '.join(sentences(error))}") from error
+
+
+def _about(source: SampleSource, settings: TrainSettings) -> dict[str, Any]:
+    """What all cells have in common: scene and number of samples; IncompleteError where these do not suffice."""
+    if not source.ready():
+        raise IncompleteError("the scene has no samples yet; a grid compares runs over samples that are there")
+    rows = source.refresh().tolist()
+    if len(rows) < source.planned():
+        raise IncompleteError(
+            f"{len(rows)} of {source.planned()} planned samples are complete; "
+            "a grid compares runs over the same samples: wait for the workers"
+        )
+    sides = zip(rows, rows_held_out(source, rows, settings.hold_out), strict=True)
+    held_out = [row for row, is_held_out in sides if is_held_out][:MOST_HELD_OUT]
+    if len(set(units_of(source, held_out))) < 2:
+        raise IncompleteError(
+            f"hold_out = {settings.hold_out:g}: holds out fewer than two configurations, and a grid needs one to pick "
+            "the best by and another to say how good that is; raise it, or plan more"
+        )
+    return {"scene_id": source.spec.scene_id, "samples": len(rows)}
+
+
+def _name(changes: Mapping[str, Any]) -> str:
+    """A cell's folder."""
+    return "-".join(str(value) for value in changes.values())
+
+
+def _stated(estimate: Estimate | None) -> str:
+    return "diverged" if estimate is None else stated(estimate.mean, estimate.standard_error)
+
+
+# ------------------------------------------------------------------------------------------------------------- one cell
+
+
+def _run_cell(
+    make_source: Callable[[], SampleSource],
+    settings: TrainSettings,
+    changes: dict[str, Any],
+    run: Path,
+    stop: threading.Event,
+) -> Cell | None:
+    """Train a cell to its end and measure it; None if it was stopped before."""
+    try:
+        if train(make_source(), settings, run, stop=stop).reason == "stopped":
+            return None
+    except DivergedError:
+        return Cell(changes, (), ())
+    picked_by, per_unit = _halves(_held_out(make_source(), settings, run))
+    return Cell(changes, picked_by, per_unit) if np.isfinite([*picked_by, *per_unit]).all() else Cell(changes, (), ())
+
+
+def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldOut:
+    """The error of a run's last network on what is held out."""
+    with Feed(source, settings) as feed:
+        arrived, _ = feed.arrivals()
+        rows = [row for row, is_held_out in arrived if is_held_out][:MOST_HELD_OUT]
+        predict = TrainedRun.load(run).predictor(feed.spec, (feed.geometry, feed.cloud), settings.device)
+        return measure(predict, batches(feed, rows, settings.batch))
+
+
+def _halves(found: HeldOut) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """The errors of the configurations, in two halves by a hash of their keys; the second has the odd one."""
+    errors = group_means(found.per_sample, found.units).tolist()
+    ordered = sorted(zip(map(_place, dict.fromkeys(found.units)), errors, strict=True))
+    values = tuple(error for _, error in ordered)
+    return values[: len(values) // 2], values[len(values) // 2 :]
+
+
+def _place(unit: Key) -> Key:
+    """By which configurations are put in order: nothing to do with the hash by which they are held out."""
+    return make_key("half of a grid", unit)
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
+    """The finished cells of a grid; SpecError unless it was about the same."""
+    if not path.exists():
+        return []
+    with store_errors("read the grid", path):
+        written = json.loads(path.read_text())
+    before, now = ({**document, **document["settings"]} for document in (written, about))
+    for key in now:
+        if key != "settings" and before.get(key) != now[key]:
+            raise SpecError(f"{path}: has {key} = {before.get(key)!r}, now {now[key]!r}; use another run folder")
+    return [Cell(cell["changes"], tuple(cell["picked_by"]), tuple(cell["per_unit"])) for cell in written["cells"]]
+
+
+def _write(folder: Path, about: Mapping[str, Any], cells: Sequence[Cell]) -> None:
+    """Write grid.json and grid.md, each whole or not at all."""
+    described = [{**asdict(cell), **(asdict(cell.error) if cell.error else {})} for cell in cells]
+    document = json.dumps({**about, "cells": described}, indent=2)
+    with store_errors("write the grid", folder):
+        for name, text in ((JSON, document), (MARKDOWN, table(cells))):
+            partial = folder / f"{name}.partial"
+            partial.write_text(text + "\n")
+            partial.replace(folder / name)

@@ -1,0 +1,86 @@
+"""A row of the tables: all metrics of one predictor's images against their references [supplement 4, Tables 1 and 2].
+
+Shape letters: N images, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from photonfarm.shared.estimate import Estimate
+from photonfarm.shared.records import F32
+from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
+from photonfarm.trainer.metrics.fid import FEWEST, Fid, fid, kid
+from photonfarm.trainer.metrics.flip import flip
+from photonfarm.trainer.metrics.inception import Features, Inception
+from photonfarm.trainer.metrics.inception_weights import InceptionWeights
+from photonfarm.trainer.metrics.intervals import PerImage
+from photonfarm.trainer.metrics.metric_space import check_pairs, metric_space
+from photonfarm.trainer.metrics.mse import mse
+from photonfarm.trainer.metrics.mssim import mssim
+
+CHUNK = 8  # images at a time
+NOT_AVAILABLE = "n/a"
+
+
+@dataclass(frozen=True, slots=True)
+class ImageMetrics:
+    """Metrics in the metric space; `dataclasses.asdict` makes JSON of it."""
+
+    images: int
+    mse: PerImage
+    mssim: PerImage
+    flip: PerImage
+    feature_l1: tuple[PerImage, ...] | None  # of Inception blocks 0 to 3; None without Inception's weights
+    fid: Fid | None  # None without them, or below three images
+    kid: Estimate | None
+    inception: InceptionWeights | None  # which the three were computed with
+
+    def columns(self) -> dict[str, str]:
+        """Column heads and what stands below them, `n/a` where a metric is not available."""
+        headline = None if self.feature_l1 is None else self.feature_l1[HEADLINE_BLOCK].estimate.mean
+        return {
+            "MSE": f"{self.mse.estimate.mean:.5f}",
+            "MSSIM": f"{self.mssim.estimate.mean:.4f}",
+            "FID": NOT_AVAILABLE if self.fid is None else f"{self.fid.value:.2f}",
+            "KID": NOT_AVAILABLE if self.kid is None else f"{self.kid.mean:.5f}",
+            "Feature L1": NOT_AVAILABLE if headline is None else f"{headline:.4f}",
+            "FLIP": f"{self.flip.estimate.mean:.4f}",
+        }
+
+
+def image_metrics(
+    predictions: F32 | Tensor,
+    references: F32 | Tensor,
+    inception: Inception | None,
+    groups: Sequence[Hashable] | None = None,
+) -> ImageMetrics:
+    """All metrics of exposed linear images, 2 × (N, H, W, 3), N ≥ 1; reference i is the converged view of prediction i.
+
+    Intervals are over images, or over `groups` of them such as configurations, where one is named per image. Raises
+    ValueError for shapes that do not fit, SpecError for values that are not numbers.
+    """
+    shown, wanted = metric_space(predictions), metric_space(references)
+    check_pairs(shown, wanted)
+
+    def each(metric: Callable[[Tensor, Tensor], NDArray[np.float64]]) -> PerImage:
+        chunks = (slice(start, start + CHUNK) for start in range(0, len(shown), CHUNK))
+        return PerImage.of(np.concatenate([metric(shown[chunk], wanted[chunk]) for chunk in chunks]), groups)
+
+    if inception is None:
+        return ImageMetrics(len(shown), each(mse), each(mssim), each(flip), None, None, None, None)
+    of_shown, of_wanted = (inception.features(images, CHUNK) for images in (shown, wanted))
+    blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
+    sets = _set_metrics(of_shown, of_wanted)
+    return ImageMetrics(len(shown), each(mse), each(mssim), each(flip), blocks, *sets, inception.weights)
+
+
+def _set_metrics(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:
+    if len(predictions.pool3) < FEWEST:
+        return None, None
+    return fid(predictions.pool3, references.pool3), kid(predictions.pool3, references.pool3)

@@ -1,0 +1,56 @@
+"""The constants of a scene that its network is built with.
+
+Shape letters: P points.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonfarm.shared.records import F32, BasePointCloud, Geometry
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.trainer.projection import Optics
+from photonfarm.trainer.settings import NetworkSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFrame:
+    """The constants of a scene by which inputs are brought near 1; all ours, as the supplement is silent.
+
+    Positions are taken about the centre of the geometry's bounding box and, like depths, divided by half its diagonal.
+    Emission is divided by the largest in the cloud. Normals, rays and albedo are near 1 as they are.
+    """
+
+    optics: Optics
+    centre: F32  # (3,)
+    scale: float  # half the diagonal, scene units
+    appearance: F32  # (P, 9) what never changes of each point: normal, albedo, emission
+    photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
+    photon_depth: int  # hits stored of each at most
+    photon_scale: float  # what makes of a photon's power over the number emitted a feature near 1
+
+    @classmethod
+    def of(cls, spec: SceneSpec, geometry: Geometry, cloud: BasePointCloud, settings: NetworkSettings) -> SceneFrame:
+        """The frame of a scene, for the first `settings.points` points of its cloud (uniform draws, as all are).
+
+        A photon's power is stored over the number emitted, so that more photons are weaker ones. Times that number it
+        is the flux a photon would stand for alone, whatever their number; spread over a disc of the scene's radius, and
+        exposed, it is of the order of what the light makes the scene look like.
+        """
+        low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
+        used = slice(settings.points)
+        emission = cloud.emission[used] / max(float(cloud.emission.max()), 1e-30)
+        appearance = np.concatenate([cloud.normal[used], cloud.albedo[used], emission], axis=1)
+        scale = max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
+        return cls(
+            optics=Optics.of(spec, settings.occlusion, settings.occlusion_tolerance),
+            centre=(0.5 * (low + high)).astype(np.float32),
+            scale=scale,
+            appearance=appearance.astype(np.float32),
+            photon_paths=spec.photons.paths,
+            photon_depth=spec.photons.depth,
+            photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
+        )

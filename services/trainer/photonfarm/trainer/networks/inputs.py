@@ -1,0 +1,116 @@
+"""What a predictor sees of a batch of samples: camera and buffers always, all else only if it needs it.
+
+Shape letters: B batch, P points, K photon slots, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from photonfarm.shared.scene import SceneSpec
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+M = TypeVar("M")
+T = TypeVar("T", bound="DataclassInstance")
+
+Memory = Callable[..., Tensor]
+"""An empty tensor of this shape behind the batch's axis; `dtype=` where it is not float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a predictor reads beside camera and buffers, be it trained or not."""
+
+    points: bool = True
+    photons: bool = False
+    kept: int | None = None  # one of so many pixels is seen in the noisy colour of half A; None: no colour is seen
+
+
+POINTS_ONLY = Needs()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointInputs:
+    """The point cloud of each sample's configuration."""
+
+    position: Tensor  # (B, P, 3) world, scene units
+    visible: Tensor  # (B, P) bool; False: of a removed group
+    seen: Tensor  # (B, P) bool; in this view, as rendered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotonInputs:
+    """The photons of each sample's configuration, in the store's fixed number of slots."""
+
+    position: Tensor  # (B, K, 3) world, scene units
+    direction: Tensor  # (B, K, 3) unit, the way the light travels
+    normal: Tensor  # (B, K, 3) unit
+    power: Tensor  # (B, K, 3) flux over the number of paths emitted, as stored
+    bounce: Tensor  # (B, K) float: surfaces met before; −1: an empty slot
+    present: Tensor  # (B, K) bool; False: an empty slot
+    seen: Tensor  # (B, K) bool; in this view, as rendered
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoisyColour:
+    """The pixels of one half-estimate that were kept."""
+
+    colour: Tensor  # (B, H, W, 3) linear radiance × exposure, zero where not kept
+    kept: Tensor  # (B, H, W) bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """What a predictor sees of a batch of samples; what it does not need is None."""
+
+    world_to_camera: Tensor  # (B, 3, 4)
+    depth: Tensor  # (B, H, W) along the forward axis, 0: nothing hit
+    albedo: Tensor  # (B, H, W, 3)
+    normal: Tensor  # (B, H, W, 3)
+    points: PointInputs | None = None
+    photons: PhotonInputs | None = None
+    noisy: NoisyColour | None = None
+
+    @classmethod
+    def empty(cls, memory: Memory, points: int, spec: SceneSpec, needs: Needs) -> Inputs:
+        """Inputs that are still to be filled, of `points` points where points are needed."""
+        film, slots = (spec.film.height, spec.film.width), spec.photons.slots
+
+        def flags(*shape: int) -> Tensor:
+            return memory(*shape, dtype=torch.bool)
+
+        inputs = cls(memory(3, 4), memory(*film), memory(*film, 3), memory(*film, 3))
+        if needs.points:
+            inputs = replace(inputs, points=PointInputs(memory(points, 3), flags(points), flags(points)))
+        if needs.photons:
+            vectors = memory(slots, 3), memory(slots, 3), memory(slots, 3), memory(slots, 3)
+            inputs = replace(inputs, photons=PhotonInputs(*vectors, memory(slots), flags(slots), flags(slots)))
+        if needs.kept:
+            inputs = replace(inputs, noisy=NoisyColour(memory(*film, 3), flags(*film)))
+        return inputs
+
+
+def given(member: M | None) -> M:
+    """A member of the inputs that is needed; raises ValueError where it was not filled."""
+    if member is None:
+        raise ValueError("inputs: lack what the network needs; make them with the `Needs` of its architecture")
+    return member
+
+
+def map_tensors(change: Callable[..., Tensor], record: T, *others: T) -> T:
+    """The record with `change` of each tensor and its like in others of its kind; what is None stays so."""
+
+    def changed(values: list[Any]) -> Any:
+        if isinstance(values[0], Tensor):
+            return change(*values)
+        return None if values[0] is None else map_tensors(change, *values)
+
+    records = (record, *others)
+    return replace(record, **{f.name: changed([getattr(r, f.name) for r in records]) for f in fields(record)})

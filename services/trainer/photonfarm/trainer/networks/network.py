@@ -1,0 +1,77 @@
+"""What all networks have in common: features of each pixel, then image synthesis [supplement 1.3].
+
+Shape letters: B batch, P points, H W image, C channels.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from photonfarm.trainer.image_synthesis import ImageSynthesisLayer
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.projection import footprint, project_mean
+from photonfarm.trainer.settings import NetworkSettings
+
+IMAGE_CHANNELS = 10
+"""View ray 3, depth 1, albedo 3, normal 3 [supplement 1.3]."""
+
+
+DESCRIPTOR_SIZE = 0.1
+"""Standard deviation of descriptors at first. At 1 they would drown position and emission in the maximum over the
+points, and it would take far longer to learn where lights are."""
+
+
+def descriptors(points: int, settings: NetworkSettings) -> nn.Parameter:
+    """The learnable numbers of each point, (P, descriptor), before any step."""
+    return nn.Parameter(DESCRIPTOR_SIZE * torch.randn(points, settings.descriptor))
+
+
+class Network(nn.Module):
+    """Image synthesis from the image-space channels, and from whatever further ones a kind of network puts before."""
+
+    centre: Tensor
+
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, share: int = 1) -> None:
+        """`further` channels beside the image-space ones; a U-Net of one `share`-th of the width that is set."""
+        super().__init__()
+        self.optics = frame.optics
+        self.scale = frame.scale
+        self.demodulation = settings.demodulation
+        self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
+        width = max(settings.width // share, 1)
+        self.image_synthesis = ImageSynthesisLayer(further + IMAGE_CHANNELS, width, settings.precision)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """The image, (B, H, W, 3), linear radiance × exposure.
+
+        With demodulation, which is ours, the output × (albedo + ε): the network predicts what falls on a surface. ε
+        lets lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets stay as they are:
+        dividing them by albedo would weight their noise by a factor per pixel.
+        """
+        output = self.synthesise(torch.cat([*self.further(inputs), self.image_space(inputs)], dim=-1))
+        return output if self.demodulation is None else output * (inputs.albedo + self.demodulation)
+
+    def further(self, inputs: Inputs) -> list[Tensor]:  # noqa: ARG002 - what the kinds see
+        """What this kind of network puts before the image-space channels, each (B, H, W, C)."""
+        return []
+
+    def image_space(self, inputs: Inputs) -> Tensor:
+        """View ray, depth, albedo and normal as one tensor, (B, H, W, 10)."""
+        depth = inputs.depth[..., None] / self.scale
+        return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
+
+    def synthesise(self, channels: Tensor) -> Tensor:
+        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, which is what convolutions on CPUs like."""
+        return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+
+    def normalised(self, position: Tensor) -> Tensor:
+        """World positions about the scene's centre, over half its diagonal; (B, P, 3)."""
+        return (position - self.centre) / self.scale
+
+    def project(self, features: Tensor, position: Tensor, visible: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
+        """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""
+        view = inputs.world_to_camera, inputs.depth, inputs.normal
+        kept = footprint(position, visible, seen, *view, self.optics)
+        return project_mean(features, kept, self.optics.height, self.optics.width)

@@ -1,0 +1,87 @@
+"""What a network consists of: parameters and work of its parts, counted while it makes one image.
+
+Shape letters: P points, K photon slots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.projection import Optics
+from photonfarm.trainer.settings import NetworkSettings
+
+MODULES = {"light_transport": "point branch", "photon_transport": "photon branch", "image_synthesis": "U-Net"}
+"""The part that each module of a network is; whatever lies in none is projection, and each point's descriptor."""
+
+PARTS = ("point branch", "photon branch", "projection", "U-Net")
+DESCRIPTOR = "descriptor"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a network."""
+
+    name: str
+    parameters: int
+    gmacs: float  # 10⁹ multiply-adds of matrix products and convolutions, for one image
+
+
+def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
+    """The parts of a scene's network, those that it has. It makes one image of points and buffers made up for this.
+
+    A multiply-add is two of the operations that torch's FlopCounterMode counts, which are those of convolutions and
+    matrix products; sums, such as the mean over the points in a pixel, are not counted.
+    """
+    network = build(settings, _frame(spec, settings), seed=0)
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        network(_inputs(spec, settings))
+    counts = {name: sum(ops.values()) / 2e9 for name, ops in counter.get_flop_counts().items()}
+    root = type(network).__name__
+    gmacs = {part: counts.get(f"{root}.{module}", 0.0) for module, part in MODULES.items()}
+    gmacs["projection"] = counts["Global"] - sum(gmacs.values())
+    parameters = _parameters(network)
+    return [Part(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
+
+
+def table(parts: list[Part]) -> str:
+    """The parts and their sum, a line each."""
+    total = Part("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
+    lines = [f"{part.name:<14}{part.parameters:>12,}{part.gmacs:>10.3f}" for part in (*parts, total)]
+    return "\n".join([f"{'part':<14}{'parameters':>12}{'GMAC':>10}", *lines])
+
+
+def _parameters(network: Network) -> dict[str, int]:
+    """The number of parameters of each part; descriptors belong to the points."""
+    found = dict.fromkeys(PARTS, 0)
+    for name, parameter in network.named_parameters():
+        module = name.split(".")[0]
+        found["point branch" if module == DESCRIPTOR else MODULES[module]] += parameter.numel()
+    return found
+
+
+def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
+    """A frame with as many points and photons as the scene's; their values do not matter."""
+    points = min(settings.points or spec.points, spec.points)
+    appearance = np.zeros((points, 9), np.float32)
+    optics = Optics.of(spec, settings.occlusion, settings.occlusion_tolerance)
+    return SceneFrame(optics, np.zeros(3, np.float32), 1.0, appearance, spec.photons.paths, spec.photons.depth, 1.0)
+
+
+def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
+    """Inputs of one image that are zero throughout: all points lie in the eye, and none is projected."""
+
+    def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(1, *shape, dtype=dtype)
+
+    points = min(settings.points or spec.points, spec.points)
+    return Inputs.empty(memory, points, spec, ARCHITECTURES[settings.architecture].needs)

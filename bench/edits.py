@@ -3,9 +3,10 @@
 
     python bench/edits.py [--spec room living-room-2] [--modifications 40] [--warm-up 2] [--out DIR]
 
-One thread, as in a worker. Every modification is brought about, seen in its buffers and photons, and rendered as two
-half-estimates in one launch, all twice over: with Dr.Jit's history of kernels, which says what each was and how long
-it was generated, compiled and run, and without it, as a worker does. The last column is what the history costs.
+One thread, as in a worker. Every modification is brought about, seen in its buffers, photons and visibility, and
+rendered as two half-estimates in one launch, all twice over: with Dr.Jit's history of kernels, which says what each was
+and how long it was generated, compiled and run, and without it, as a worker does. The last column is what the history
+costs.
 
 Exit code 0 if no kernel was new after the warm-up, 1 otherwise.
 """
@@ -21,6 +22,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import results
 
@@ -77,6 +80,7 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
 
     from photonfarm.renderer.scenes import LoadedScene, integrator_of
     from photonfarm.shared.modification import rest, sample_modification
+    from photonfarm.shared.pointcloud import rebuild
     from photonfarm.shared.view import sample_view
 
     spec = load_spec_of(name)
@@ -86,15 +90,18 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
         scene = LoadedScene.load(spec)
         unseen(dr.kernel_history(), seen)
     scene._integrator = watch = Stopwatch(integrator_of(spec.transport))
-    figures = Figures()
+    figures, cloud = Figures(), scene.base()[1]
     for i in range(modifications):
         modification = sample_modification(spec, 0, i)
         before = sample_modification(spec, 0, i - 1) if i else rest(spec)
         view = sample_view(spec, modification.key(spec.scene_id), 0, 0)
+        position, _ = rebuild(cloud, modification)
+        points = np.resize(position, (len(position) + spec.photons.slots, 3))  # as many as with photons
         works = {
             "edit": lambda m=modification: scene.apply(m),
             "buffers": lambda v=view: scene.buffers(v),
             "photons": lambda i=i: scene.photons(i),
+            "visibility": lambda v=view, p=points: scene.sees(v, p),
         }
         # blocking, so that kernels run while they are waited for and not beside the tracing of the next one
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.scoped_set_flag(dr.JitFlag.LaunchBlocking, True):
@@ -186,12 +193,14 @@ def line(spec: Any, figures: Figures) -> list[Any]:
         results.median_and_mean(plain["image"]),
         results.median_and_mean(plain["buffers"]),
         results.median_and_mean(plain["photons"]),
+        results.median_and_mean(plain["visibility"]),
         f"×{history_cost:.2f}",
     ]
 
 
 def page(lines: list[list[Any]], modifications: int, warm_up: int) -> str:
-    header = ["spec", "image", "new kernels", "edit", *PARTS, "image in all", "buffers", "photons", "history"]
+    header = ["spec", "image", "new kernels", "edit", *PARTS, "image in all"]
+    header += ["buffers", "photons", "visibility", "history"]
     return f"""# Editing in place
 
 {modifications} modifications of each spec, the first {warm_up} of them as warm-up; one thread; milliseconds as median
@@ -200,7 +209,8 @@ warm-up; each would be compiled, or fetched from the cache on disk. **Edit**: br
 into the next, Embree's update included. **Trace**: recording the image's kernels, in Python and Dr.Jit. **Compile**:
 generating their code anew to find it in the cache, and the compiler itself where it is not there. **Kernel**: running.
 **Download**: from Dr.Jit to numpy. **Image in all** is measured by itself, without Dr.Jit's kernel history and without
-waiting for each kernel; **history** is what these two cost, as a factor on the image.
+waiting for each kernel; **visibility** is which points of the cloud the view sees; **history** is what the kernel
+history and the waiting cost, as a factor on the image.
 
 {results.table(header, lines)}
 

@@ -3,14 +3,15 @@
 
     python bench/soak.py [--share 1] [--workers 3] [--seed 1] [--out DIR]
 
-The one of tests/faults/soak.py, whose short form is among the tests; `--share 0.1` does a tenth of it. Exit code 0 if
-all that must hold held. What does not hold on the way ends it at once; what does not in the end is told line by line.
+The one of tests/faults/soaking.py, whose short form is among the tests; `--share 0.1` does a tenth of it. Exit code 0
+if all that must hold held. What does not hold on the way ends it at once; what does not in the end is told line by
+line.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import importlib
 import sys
 import tempfile
 from dataclasses import asdict
@@ -32,16 +33,7 @@ PAUSE_S = 0.05  # for each half of a sample: a job takes some tenths of a second
 PACE_S = (0.4, 1.6)  # between one thing and the next
 
 
-def load_soak() -> Any:
-    """The module of the tests."""
-    path = Path(__file__).parents[1] / "tests/faults/soak.py"
-    spec = importlib.util.spec_from_file_location("soak", path)
-    if spec is None or spec.loader is None:
-        raise SystemExit(f"{path}: cannot be loaded")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["soak"] = module  # its dataclasses look for it there
-    spec.loader.exec_module(module)
-    return module
+TESTS = Path(__file__).parents[1] / "tests/faults"
 
 
 def page(found: Any, workers: int, outage_s: float) -> str:
@@ -80,7 +72,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     results.add_options(parser)
     options = parser.parse_args()
-    soak = load_soak()
+    sys.path.insert(0, str(TESTS))
+    soak = importlib.import_module("soaking")
     jobs, kills, supervisor_kills, races, redis_kills, flushes, submitters = (
         ceil(options.share * count)
         for count in (JOBS, KILLS, SUPERVISOR_KILLS, RACES, REDIS_KILLS, FLUSHES, SUBMITTERS)

@@ -7,7 +7,7 @@
 Reading: random batches of 32 samples into memory that is used again, all of it in the page cache, by the reader of the
 store, by zarr-python, and out of plain numpy memmaps of the same values. Writing: whole jobs, handed over as fast as
 they are taken, against the same bytes written, synced and linked file by file. Both sides by turns, in one process and
-in two at once; every process reads on one thread where no other number is said. Exit code 0.
+in two at once; every process reads on one thread. Exit code 0.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,9 +31,8 @@ import store_bytes
 from store_contents import Contents, EncodedPool, Pool, commit, commit_encoded
 
 BATCH = 32
-BUFFERS = ("depth", "albedo", "normal")
-THREADS = 2
-READING = {"ours": "read {}", "threads": f"read {{}}, {THREADS} threads", "checked": "memmaps, {} with checksums"}
+VIEW = ("depth", "albedo", "normal", "point_seen", "photon_seen")
+READING = {"ours": "read {}", "checked": "memmaps, {} with checksums"}
 WRITING = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
 
 
@@ -78,14 +76,13 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
     from photonfarm.shared.store import SceneReader
     from photonfarm.shared.store.batch import Batch
 
-    threads = ThreadPoolExecutor(THREADS)
     reader = SceneReader(store, scene_id)
     rows = reader.refresh()
     memory = {"radiance": Batch.empty(reader.spec, BATCH, buffers=False), "all": Batch.empty(reader.spec, BATCH)}
-    maps = {name: np.load(bare / f"{name}.npy", mmap_mode="r") for name in ("radiance", *BUFFERS)}
-    into = {"radiance": memory["all"].radiance, **memory["all"].buffers}
+    maps = {name: np.load(bare / f"{name}.npy", mmap_mode="r") for name in ("radiance", *VIEW)}
+    into = {"radiance": memory["all"].radiance, **memory["all"].buffers, **memory["all"].seen}
     arrays: Any = zarr.open_group(store / "scenes" / scene_id / "plans/000000", mode="r")
-    names = {"radiance": ("radiance",), "all": ("radiance", *BUFFERS)}
+    names = {"radiance": ("radiance",), "all": ("radiance", *VIEW)}
 
     def bare_copy(what: str, seed: int, batches: int) -> None:
         for batch in draws(rows, seed, batches):
@@ -96,10 +93,6 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
     def ours(what: str, seed: int, batches: int) -> None:
         for batch in draws(rows, seed, batches):
             reader.read_batch(batch, memory[what])
-
-    def by_threads(what: str, seed: int, batches: int) -> None:
-        for batch in draws(rows, seed, batches):
-            reader.read_batch(batch, memory[what], threads)
 
     def bare_checked(what: str, seed: int, batches: int) -> None:
         for batch in draws(rows, seed, batches):
@@ -119,7 +112,7 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
         for name, values in maps.items():
             for row in rows:
                 into[name][0] = values[row]
-    return {"bare": bare_copy, "checked": bare_checked, "ours": ours, "threads": by_threads, "zarr": by_zarr}
+    return {"bare": bare_copy, "checked": bare_checked, "ours": ours, "zarr": by_zarr}
 
 
 def draws(rows: Any, seed: int, batches: int) -> Iterator[list[int]]:
@@ -209,7 +202,7 @@ def row_of(
 def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Namespace) -> list[Row]:
     """Batches with and without buffers, in one and two processes."""
     workers = Processes(2, "reading", store, scene_id, bare)
-    sizes = {name: np.load(bare / f"{name}.npy", mmap_mode="r")[0].nbytes for name in ("radiance", *BUFFERS)}
+    sizes = {name: np.load(bare / f"{name}.npy", mmap_mode="r")[0].nbytes for name in ("radiance", *VIEW)}
     found: list[Row] = []
     for what, size in (("radiance", sizes["radiance"]), ("all", sum(sizes.values()))):
         for processes in (1, 2):
@@ -280,14 +273,14 @@ def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
     rows = reader.refresh()
     folder.mkdir()
     batch = reader.read_batch(rows[:1])
-    shapes = {"radiance": batch.radiance, **batch.buffers}
+    shapes = {"radiance": batch.radiance, **batch.buffers, **batch.seen}
     out = {
         name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", values.dtype, (len(rows), *values.shape[1:]))
         for name, values in shapes.items()
     }
     for place, row in enumerate(rows):
         batch = reader.read_batch([row], batch)
-        for name, values in {"radiance": batch.radiance, **batch.buffers}.items():
+        for name, values in {"radiance": batch.radiance, **batch.buffers, **batch.seen}.items():
             out[name][place] = values[0]
 
 
@@ -330,8 +323,8 @@ def page(
 
 `{options.spec}` at {film}. Everything is in the page cache when it is read. **Bare** reading: the rows copied out of
 plain numpy memmaps of the same values, unchecked and uncompressed; **store**: `SceneReader.read_batch` into the same
-kind of reused memory, every byte checked, on one thread or with {THREADS}; **memmaps with checksums**: the bare way,
-with the CRC-32C taken of what has arrived and compared with nothing. MB/s are those of the decoded values. *All* is
+kind of reused memory, every byte checked; **memmaps with checksums**: the bare way, with the CRC-32C taken of what has
+arrived and compared with nothing. MB/s are those of the decoded values. *All* is
 radiance (stored raw) with depth, albedo and normal (compressed).
 
 **Bare** writing: files of the same names and sizes as the job's, each written at once, synced and linked, then their

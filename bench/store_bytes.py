@@ -20,7 +20,7 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import SceneStore, Store, schema
 from photonfarm.shared.store.schema import ArraySchema
 from photonfarm.shared.store.shards import ShardWriter, encode
-from store_contents import Contents, Pool, commit
+from store_contents import Contents, Pool, commit, view_row
 
 COUNTS = (1, 2, 4, 8)
 
@@ -41,7 +41,7 @@ class Whole:
     """Bytes of one sample that holds all it is trained on, in the same shards with the same codecs."""
 
     radiance: float
-    buffers: float
+    buffers: float  # with what the view sees
     cloud: float
     photons: float
 
@@ -112,7 +112,8 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
             position, visible = rebuild(base, modification)
             photons = contents.photons(modification) if spec.photons.paths else None
             kept["radiance"].append({"radiance": contents.halves(modification, view)})
-            kept["buffers"].append(arrays_of(contents.buffers(modification, view)))
+            shown = contents.buffers(modification, view), contents.visibility(modification, view)
+            kept["buffers"].append(view_row(*shown))
             kept["cloud"].append(
                 {"position": position, "normal": base.normal, "albedo": base.albedo, "emission": base.emission,
                  "visible": visible}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ import numpy as np
 
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
+from photonfarm.shared.pointcloud import rebuild
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.shared.store.schema import Kind, output_arrays
@@ -45,6 +47,14 @@ class Contents:
         """The image-space buffers."""
         return self._get("buffers", modification, view, lambda: self._scene.buffers(view))
 
+    def visibility(self, modification: Modification, view: View) -> Visibility:
+        """What the view sees."""
+        from photonfarm.renderer.jobs import visibility_of
+
+        photons = self.photons(modification) if self.spec.photons.paths else None
+        points = rebuild(self.base[1], modification)
+        return self._get("visibility", modification, view, partial(visibility_of, self._scene, view, points, photons))
+
     def photons(self, modification: Modification) -> Photons:
         """The photons."""
         return self._get("photons", modification, None, lambda: self._scene.photons(3))
@@ -62,17 +72,19 @@ class Contents:
     def pool(self) -> Pool:
         """All that has been made so far, in no relation to each other."""
         of = {what: [value for (kind, _), value in self._made.items() if kind == what] for what in _KINDS}
-        return Pool(of["halves"], of["buffers"], of["photons"])
+        return Pool(**of)
 
 
-_KINDS = ("halves", "buffers", "photons")
+_KINDS = ("halves", "buffers", "visibility", "photons")
 
 
 class Pool:
     """Contents for any number of samples, dealt in turn; goes through a file, for other processes."""
 
-    def __init__(self, halves: list[F32], buffers: list[ViewBuffers], photons: list[Photons]) -> None:
-        self._of: dict[str, list[Any]] = {"halves": halves, "buffers": buffers, "photons": photons}
+    def __init__(
+        self, halves: list[F32], buffers: list[ViewBuffers], visibility: list[Visibility], photons: list[Photons]
+    ) -> None:
+        self._of: dict[str, list[Any]] = dict(zip(_KINDS, (halves, buffers, visibility, photons), strict=True))
         self._dealt = dict.fromkeys(self._of, 0)
 
     def halves(self, *_: Any) -> F32:
@@ -83,6 +95,10 @@ class Pool:
         """The next buffers."""
         return self._next("buffers")
 
+    def visibility(self, *_: Any) -> Visibility:
+        """What the next view sees."""
+        return self._next("visibility")
+
     def photons(self, *_: Any) -> Photons:
         """The next photons."""
         return self._next("photons")
@@ -92,13 +108,13 @@ class Pool:
         return self._of[what][self._dealt[what] % len(self._of[what])]
 
     def count(self, what: str) -> int:
-        """How many different halves, buffers or photons there are."""
+        """How many different ones there are of a kind."""
         return len(self._of[what])
 
     def save(self, path: Path) -> None:
         """Write all into one .npz file."""
         arrays = {f"halves/{i}": values for i, values in enumerate(self._of["halves"])}
-        for what in ("buffers", "photons"):
+        for what in _KINDS[1:]:
             for i, record in enumerate(self._of[what]):
                 arrays |= {f"{what}/{i}/{field.name}": getattr(record, field.name) for field in fields(record)}
         np.savez(path, **arrays)
@@ -114,7 +130,8 @@ class Pool:
                 yield kind(**{field.name: arrays[f"{what}/{i}/{field.name}"] for field in fields(kind)})
 
         halves = [values for name, values in arrays.items() if name.startswith("halves/")]
-        return cls(halves, list(records("buffers", ViewBuffers)), list(records("photons", Photons)))
+        kinds = (("buffers", ViewBuffers), ("visibility", Visibility), ("photons", Photons))
+        return cls(halves, *(list(records(*kind)) for kind in kinds))
 
 
 def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
@@ -126,7 +143,7 @@ def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
             if kind == "modification" and scene.spec.photons.paths:
                 out.photons(row, contents.photons(modification))
             elif kind == "view":
-                out.buffers(row, contents.buffers(modification, view))
+                out.view(row, contents.buffers(modification, view), contents.visibility(modification, view))
             elif kind == "sample":
                 out.radiance(row, contents.halves(modification, view))
         out.commit(FIGURES)
@@ -154,7 +171,7 @@ class EncodedPool:
         photons = [pool.photons() for _ in range(pool.count("photons"))]
         rows: dict[Kind, list[Mapping[str, Any]]] = {
             "sample": [_radiance(pool.halves(), spec) for _ in range(pool.count("halves"))],
-            "view": [arrays_of(pool.buffers()) for _ in range(pool.count("buffers"))],
+            "view": [view_row(pool.buffers(), pool.visibility()) for _ in range(pool.count("buffers"))],
             "modification": [
                 {f"photon_{name}": values for name, values in arrays_of(record).items()} for record in photons
             ],
@@ -168,6 +185,13 @@ class EncodedPool:
     def next(self, kind: Kind) -> Mapping[str, memoryview]:
         """The next row of each array of a kind."""
         return next(self._of[kind])
+
+
+def view_row(buffers: ViewBuffers, visibility: Visibility) -> dict[str, Any]:
+    """What is stored of a view, by array."""
+    seen = {"point_seen": visibility.points, "photon_seen": visibility.photons}
+    bits = {name: np.packbits(values, bitorder="little") for name, values in seen.items() if len(values)}
+    return arrays_of(buffers) | bits
 
 
 def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:

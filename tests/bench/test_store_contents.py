@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Photons, ViewBuffers
+from photonfarm.shared.records import Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.store import SceneStore, Store
 from store_contents import EncodedPool, Pool, commit, commit_encoded
@@ -37,7 +37,8 @@ def pool(scale: float) -> Pool:
     halves = [scale * random(2, SIZE, SIZE, 3) for _ in range(3)]
     buffers = [ViewBuffers(random(SIZE, SIZE), *random(2, SIZE, SIZE, 3)) for _ in range(2)]
     photons = [Photons(*random(4, SLOTS, 3), bounce=np.zeros(SLOTS, np.int8)) for _ in range(2)]
-    return Pool(halves, buffers, photons)
+    visibility = [Visibility(random(16) < 0.5, random(SLOTS) < 0.5) for _ in range(2)]
+    return Pool(halves, buffers, visibility, photons)
 
 
 def planned(folder: Path, spec: SceneSpec) -> SceneStore:

@@ -1,6 +1,5 @@
 """Every fault that a user can cause gives one sentence on stderr and its exit code, and nothing stored is lost."""
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -18,16 +17,6 @@ from photonfarm.shared.store import Store
 from photonfarm.shared.submission import request_of, submit
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.store_source import StoreSource
-
-
-@pytest.fixture(scope="module")
-def analytic() -> ModuleType:
-    """The module `faults/analytic_scene`."""
-    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
-    spec = importlib.util.spec_from_file_location("analytic_scene_of_bad_input", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_an_unknown_spec_is_exit_code_3(photonfarm) -> None:

@@ -1,6 +1,5 @@
 """The compose file, run for real. It builds images and takes minutes, so it waits to be asked: make test-compose."""
 
-import importlib.util
 import json
 import os
 import shutil
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import s3_server
 
 ROOT = Path(__file__).parents[2]
 PROJECT = "photonfarm-test"
@@ -111,9 +111,6 @@ def test_a_plan_completes_while_a_container_is_killed_every_few_seconds(
 
 @pytest.mark.timeout(2400)
 def test_a_farm_with_its_store_in_a_bucket_completes_a_plan(photonfarm, data: Path, small_room: Path) -> None:
-    spec = importlib.util.spec_from_file_location("s3_server_of_compose", ROOT / "tests/shared/s3_server.py")
-    s3_server = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(s3_server)
     (data / "s3").mkdir()
     bridge = json.loads(subprocess.check_output(["docker", "network", "inspect", "bridge"]))[0]
     gateway = bridge["IPAM"]["Config"][0]["Gateway"]  # this machine, as containers reach it

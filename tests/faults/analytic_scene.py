@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.shared.errors import BackendError
 from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
 from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.view import View
+
+FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
 
 
 def small_spec(**changes: Any) -> SceneSpec:
@@ -69,8 +72,11 @@ class AnalyticScene:
         depth = np.full(size, self._level(view), np.float32)
         return ViewBuffers(depth, np.full((*size, 3), 0.5, np.float32), np.full((*size, 3), 0.6, np.float32))
 
+    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
+        return np.asarray(np.floor(position @ np.array([7.1, 13.7, 29.3]) + self._level(view)) % 2 == 0)
+
     def photons(self, seed: int) -> Photons | None:
-        count = self.spec.photons.paths * self.spec.photons.depth
+        count = self.spec.photons.slots
         if not count:
             return None
         values = np.random.default_rng(seed).random((4, count, 3), dtype=np.float32)

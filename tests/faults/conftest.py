@@ -1,28 +1,11 @@
-import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
 from photonfarm.shared.plan import Request
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
-
-
-@pytest.fixture(scope="session")
-def analytic() -> ModuleType:
-    """The module `analytic_scene`."""
-    spec = importlib.util.spec_from_file_location("analytic_scene", Path(__file__).with_name("analytic_scene.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def redis_server(tmp_path: Path) -> Iterator[EmbeddedRedis]:
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        yield server
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 `differences` puts all of it into sentences; none is what a soak must end with.
 """
 
-import importlib.util
 import random
 import sys
 import threading
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import analytic_scene as analytic
 import numpy as np
 import zarr
 
@@ -19,16 +19,11 @@ from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.markers import name_of
 
-_spec = importlib.util.spec_from_file_location("analytic_scene", Path(__file__).with_name("analytic_scene.py"))
-analytic = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(analytic)
-
 CHILD = """
-import importlib.util, os, sys
+import os, sys
 from photonfarm.renderer import jobs, worker_child
-spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
-analytic = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(analytic)
+sys.path.append(sys.argv[1])
+import analytic_scene as analytic
 analytic.AnalyticScene.pause_s = float(sys.argv[3])
 journal = os.open(f"{sys.argv[2]}/{os.getpid()}", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 plain = jobs.ShardRenderer.render
@@ -59,7 +54,7 @@ class Journal:
 
     def command(self, pause_s: float) -> tuple[str, ...]:
         """The command of a child that writes here; each half of a sample takes `pause_s`."""
-        return (sys.executable, "-c", CHILD, analytic.__spec__.origin, str(self._folder), str(pause_s))
+        return (sys.executable, "-c", CHILD, str(analytic.FOLDER), str(self._folder), str(pause_s))
 
     def in_hand(self, child: int) -> int | None:
         """The job that a child has begun and not ended."""

@@ -5,7 +5,6 @@ alone, so that a few lines of C are loaded before it, which Python, Redis' clien
 those that call `time.time`. Files are stamped by the file system, whose clock is right, as a file server's would be.
 """
 
-import importlib.util
 import json
 import os
 import shutil
@@ -19,16 +18,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.queue import beat, connect, hosts, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).parents[1] / "shared/store_samples.py")
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
 
@@ -69,7 +65,7 @@ time_t time(time_t *now) {
 """
 
 MACHINE = """
-import importlib.util, sys
+import sys
 from pathlib import Path
 from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.plan import Request
@@ -77,9 +73,8 @@ from photonfarm.shared.queue import beat, connect, queue_status, reconcile
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.top_up import TopUp
-spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
-analytic = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(analytic)
+sys.path.append(sys.argv[1])
+import analytic_scene as analytic
 root, url = sys.argv[2:4]
 store = Store(root)
 """
@@ -108,7 +103,7 @@ def machine(clock: Path, analytic: ModuleType) -> Machine:
 
     def at(skew_s: int, root: Path, code: str, url: str = "") -> str:
         told = os.environ | {"LD_PRELOAD": str(clock), "CLOCK_SKEW_S": str(skew_s)}
-        command = [sys.executable, "-c", MACHINE + code, analytic.__spec__.origin, str(root), url]
+        command = [sys.executable, "-c", MACHINE + code, str(analytic.FOLDER), str(root), url]
         done = subprocess.run(command, env=told, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stderr
         return done.stdout.strip()
@@ -167,7 +162,7 @@ def test_a_sweep_by_a_machine_with_a_wrong_clock_leaves_what_living_writers_need
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():
-            out.buffers(row, buffers)
+            out.view(row, buffers, given.visibility[row])
         first, *others = given.radiance
         out.radiance(first, given.radiance[first])
         assert machine(skew_s, root_of(scene), "print(store.sweep(), store.sweep(stray_age_s=0))") == "0 0"
@@ -220,7 +215,7 @@ def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():
-            out.buffers(row, buffers)
+            out.view(row, buffers, given.visibility[row])
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
         foreign = scene.storage.part().with_name("another-machine-1a2b3c4d5e-17-0-0.partial")

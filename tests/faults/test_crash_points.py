@@ -20,12 +20,11 @@ from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """
-import importlib.util, os, sys
+import os, sys
 from photonfarm.shared.store import JobWriter, Store
 from photonfarm.renderer.jobs import ShardRenderer
-spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
-analytic = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(analytic)
+sys.path.append(sys.argv[1])
+import analytic_scene as analytic
 
 function, count, when = sys.argv[4], int(sys.argv[5]), sys.argv[6]
 owner = JobWriter if function == "commit" else os
@@ -52,7 +51,7 @@ else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)
 """
 
-# A commit of this job writes 9 arrays and the marker: a link each, once what it links is synced.
+# A commit of this job writes 11 arrays and the marker: a link each, once what it links is synced.
 POINTS = {
     "after render, before the commit": ("commit", "commit", 1, "before"),
     "after the temporary files, before the first is synced": ("commit", "fdatasync", 1, "before"),
@@ -60,8 +59,8 @@ POINTS = {
     "in the middle, before a link": ("commit", "link", 5, "before"),
     "in the middle, after a link": ("commit", "link", 5, "after"),
     "after all files, before the folders are synced": ("commit", "fsync", 1, "before"),
-    "before the marker": ("commit", "link", 10, "before"),
-    "after the marker": ("commit", "link", 10, "after"),
+    "before the marker": ("commit", "link", 12, "before"),
+    "after the marker": ("commit", "link", 12, "after"),
     "while the base is written": ("base", "fsync", 3, "before"),
     "before the base gets its name": ("base", "rename", 1, "before"),
     "after the base has got its name": ("base", "rename", 1, "after"),
@@ -71,15 +70,15 @@ POINTS = {
 NAMED = {
     "in the middle, before a link": 4,
     "in the middle, after a link": 5,
-    "after all files, before the folders are synced": 9,
-    "before the marker": 9,
-    "after the marker": 9,
+    "after all files, before the folders are synced": 11,
+    "before the marker": 11,
+    "after the marker": 11,
 }
 """Files of the job that have their names by then; at all other points none has."""
 
 
 def crash(analytic: ModuleType, store: Path, *point: object) -> None:
-    command = [sys.executable, "-c", COMMIT, analytic.__spec__.origin, str(store), *map(str, point)]
+    command = [sys.executable, "-c", COMMIT, str(analytic.FOLDER), str(store), *map(str, point)]
     assert subprocess.run(command, timeout=60).returncode == -signal.SIGKILL
 
 
@@ -110,11 +109,10 @@ def test_a_writer_killed_at_any_point_leaves_all_or_nothing(
 
 
 CHILD = """
-import importlib.util, os, sys
+import os, sys
 from photonfarm.renderer import jobs, worker_child
-spec = importlib.util.spec_from_file_location("analytic_scene", sys.argv[1])
-analytic = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(analytic)
+sys.path.append(sys.argv[1])
+import analytic_scene as analytic
 plain = jobs.ShardRenderer.render
 
 def dying(*args):
@@ -129,7 +127,7 @@ sys.exit(worker_child.child(analytic.AnalyticScene.load))
 def kill_before_acknowledgement(analytic: ModuleType, root: Path, url: str) -> None:
     """A worker's child, with nobody who would start it again, dies once it has committed its first job."""
     settings = WorkerSettings(store=str(root), redis_url=url, name="doomed", heartbeat_ttl_s=1.0, reserve_bytes=0)
-    command = [sys.executable, "-c", CHILD, analytic.__spec__.origin]
+    command = [sys.executable, "-c", CHILD, str(analytic.FOLDER)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as child:
         child.stdin.write(settings.model_dump_json().encode() + b"\n")
         child.stdin.flush()  # and left open: its end would tell the child that its supervisor is gone

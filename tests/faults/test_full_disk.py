@@ -283,7 +283,9 @@ def test_a_worker_waits_for_a_full_disk_says_so_and_goes_on_and_no_job_fails(
         committed = scene.committed_jobs()
         assert bool(committed) == bool(pages)
         assert len(committed) < 6
-        assert len(read_all(scene)) == 2 * len(committed)
+        complete = scene.progress().committed_samples  # a job may fit where the earlier one with its view does not
+        assert len(read_all(scene)) == complete
+        assert bool(complete) == bool(pages)
         assert running.poll() is None
         assert queue_status(connection).failed == {}
         disk.make_room()

@@ -237,10 +237,10 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
 @pytest.mark.parametrize(
     ("overdue", "reason"),
     [
-        (4, "it was started 5 times, and each time it took longer than --deadline 2 s and was ended"),
+        (4, "it was started 5 times, and each time it took longer than --deadline 1 s and was ended"),
         (
             0,
-            "each time its worker died or lost Redis, or it took longer than --deadline 2 s and was ended (1 times)",
+            "each time its worker died or lost Redis, or it took longer than --deadline 1 s and was ended (1 times)",
         ),
     ],
 )
@@ -259,7 +259,7 @@ def test_a_job_that_is_given_up_after_its_last_deadline_has_the_deadline_as_its_
         connection.set(f"{STARTS}{scene.scene_id}-{job}", 4)
         connection.set(f"{OVERDUE}{scene.scene_id}-{job}", overdue)
     running = start(
-        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=2.0, until_complete=True
+        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=1.0, until_complete=True
     )
     assert running.wait(60) == 7
     assert reason in queue_status(connection).failed[name].reason

@@ -1,7 +1,6 @@
 """Answers of the bucket are lost, requests come late, submitters and workers die or sleep at every step."""
 
 import contextlib
-import importlib.util
 import io
 import itertools
 import os
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import obstore
 import pytest
+import s3_server
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
@@ -25,27 +25,9 @@ from photonfarm.shared.errors import StoreError
 from photonfarm.shared.plan import PlannedRows, Request
 from photonfarm.shared.queue import connect, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.store import SceneStore, Store, objects
+from photonfarm.shared.store import SceneStore, Store, object_requests
 from photonfarm.shared.store.objects import ObjectStorage
 from photonfarm.trainer.store_source import StoreSource
-
-_spec = importlib.util.spec_from_file_location("s3_server", Path(__file__).parents[1] / "shared/s3_server.py")
-s3_server = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(s3_server)
-
-
-@pytest.fixture(scope="session")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    with s3_server.running(tmp_path_factory.mktemp("s3")) as found:
-        yield found
-
-
-@pytest.fixture
-def url(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    for name, value in s3_server.environment(port).items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("PHOTONFARM_CACHE", str(tmp_path / "cache"))
-    return f"s3://photonfarm/{tmp_path.name}"
 
 
 def stored(url: str) -> dict[str, bytes]:
@@ -89,7 +71,7 @@ def test_a_replacement_that_arrives_late_does_not_undo_a_later_one(
 ) -> None:
     storage = ObjectStorage(url)
     storage.adopt(part_of(storage, b"damaged"), "name")
-    monkeypatch.setattr(objects, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(object_requests, "PATIENCE_S", 0.0)
     late = threading.Event()
     with s3_server.faulty_way(port, lambda method, _: late if method == "PUT" else None) as way:
         monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{way}")
@@ -284,7 +266,7 @@ def test_workers_behind_a_lossy_way_and_under_kills_lose_and_double_nothing(
     assert source.ready()
     rows = source.refresh()
     assert rows.size == 12
-    assert all(np.isfinite(source.read(int(row)).radiance).all() for row in rows)
+    assert all(np.isfinite(sample.radiance).all() for sample in source.read_batch(rows.tolist()))
     assert len(source.base()[1].position) == scene.spec.points
     keys: PlannedRows = scene.plans()[0].rows
     assert len({keys.sample_key[row].tobytes() for row in rows}) == 12

@@ -1,12 +1,12 @@
 """A short soak, and that a soak tells what is wrong; the long one of the same kind is `make bench-soak`."""
 
-import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import soaking
 
 from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.store import SceneStore, Store
@@ -15,19 +15,10 @@ from photonfarm.shared.store.markers import name_of
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
 
-@pytest.fixture(scope="module")
-def soak() -> ModuleType:
-    """The module `soak`."""
-    spec = importlib.util.spec_from_file_location("soak", Path(__file__).with_name("soak.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.timeout(300)
-def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(soak: ModuleType, tmp_path: Path) -> None:
-    wanted = soak.Toll(kills=4, supervisor_kills=1, races=2, redis_kills=2, flushes=1, submitters=1)
-    found = soak.Soak(tmp_path, jobs=40, workers=3, pause_s=0.02, seed=1).run(
+def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(tmp_path: Path) -> None:
+    wanted = soaking.Toll(kills=4, supervisor_kills=1, races=2, redis_kills=2, flushes=1, submitters=1)
+    found = soaking.Soak(tmp_path, jobs=40, workers=3, pause_s=0.02, seed=1).run(
         wanted, pace_s=(0.1, 0.4), long_outage_s=2.0
     )
     assert found.differences == []
@@ -79,7 +70,6 @@ def take_a_marker(scene: SceneStore, folder: Path) -> None:
     ids=["nothing", "a marker replaced", "two commits", "a bit flipped", "a part left", "a marker gone"],
 )
 def test_a_soak_tells_every_difference(
-    soak: ModuleType,
     analytic: ModuleType,
     planned: Callable[..., SceneStore],
     tmp_path: Path,
@@ -87,14 +77,14 @@ def test_a_soak_tells_every_difference(
     told: list[str],
 ) -> None:
     scene = planned(2)
-    journal = soak.evidence.Journal(tmp_path / "journal")
-    with soak.evidence.Watcher(tmp_path / "store", scene.scene_id) as watcher:
+    journal = soaking.evidence.Journal(tmp_path / "journal")
+    with soaking.evidence.Watcher(tmp_path / "store", scene.scene_id) as watcher:
         for job in scene.missing_jobs():
             ShardRenderer(Store(tmp_path / "store"), worker="first", load=analytic.AnalyticScene.load).render(
                 scene.scene_id, job
             )
     watcher.check()
     harm(scene, tmp_path)
-    found = soak.evidence.differences(scene, tmp_path / "clean", journal, watcher)
+    found = soaking.evidence.differences(scene, tmp_path / "clean", journal, watcher)
     assert len(found) == len(told)
     assert all(sentence in difference for sentence, difference in zip(told, found, strict=True))

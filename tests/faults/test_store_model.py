@@ -9,7 +9,6 @@ A step that fails is printed with those before it, shrunk to a few, as a program
 """
 
 import hashlib
-import importlib.util
 import itertools
 import os
 import signal
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import store_samples as samples
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
@@ -27,15 +27,11 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import UNUSED, Known, Request, expand, sample_key
-from photonfarm.shared.records import BasePointCloud, Geometry, ViewBuffers, arrays_of
+from photonfarm.shared.records import BasePointCloud, Geometry, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.top_up import TopUp, spp_per_pass
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).parents[1] / "shared/store_samples.py")
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
 STEPS = int(os.environ.get("PHOTONFARM_MODEL_STEPS", "30"))
@@ -69,6 +65,10 @@ def buffers_of(spec: SceneSpec, modification: bytes, view: bytes) -> ViewBuffers
     size = (spec.film.height, spec.film.width)
     seed = _seed(modification + view)
     return ViewBuffers(*(samples.values(seed + i, shape) for i, shape in enumerate([size, (*size, 3), (*size, 3)])))
+
+
+def visibility_of(spec: SceneSpec, modification: bytes, view: bytes) -> Visibility:
+    return samples.visibility(spec, _seed(modification + view))
 
 
 def photons_of(spec: SceneSpec, modification: bytes) -> Any:
@@ -150,9 +150,12 @@ class Writer:
         for row in sorted(rows.new_modifications if scene.spec.photons.paths else ()):
             self.left.append((self.out.photons, row, lambda row=row: photons_of(self.spec, vectors[row])))
         for row in sorted(rows.new_views):
-            self.left.append((self.out.buffers, row, lambda row=row: buffers_of(self.spec, *views[row])))
+            self.left.append((self._view, row, lambda row=row: views[row]))
         for s in rows.samples:
             self.left.append((self.out.radiance, s.row, lambda key=s.key: radiance_of(self.spec, key)))
+
+    def _view(self, row: int, view: tuple[bytes, bytes]) -> None:
+        self.out.view(row, buffers_of(self.spec, *view), visibility_of(self.spec, *view))
 
     def give(self, count: int, choose: int = 0) -> None:
         """Hand over so many of the rows, in some order."""
@@ -519,7 +522,7 @@ class StoreMachine(RuleBasedStateMachine):
                     self._read(following, row)
             report = check_store(Store(self.root), when="now")
             assert report.exit_code == 0
-            assert self.stores[0].sweep(stray_age_s=0) <= 12 * len(self.dead)
+            assert self.stores[0].sweep(stray_age_s=0) <= 14 * len(self.dead)
             assert self._parts() == set()
         finally:
             for writer in self.writers:

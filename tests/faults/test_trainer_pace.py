@@ -113,7 +113,7 @@ def test_a_worker_leaves_a_scene_that_is_ahead_says_so_and_renders_the_others(
     code = """
 import runpy, sys
 from photonfarm.renderer import backpressure
-backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0.1
+backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0  # a look before each job, however fast they are
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

@@ -1,11 +1,9 @@
 """What holds a worker back, and lets it go again: a nearly full disk, a trainer far behind. No job fails for it."""
 
 import errno
-import importlib.util
 import os
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -19,21 +17,6 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import connect, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
-
-
-@pytest.fixture(scope="module")
-def analytic() -> ModuleType:
-    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
-    spec = importlib.util.spec_from_file_location("analytic_scene_of_backpressure", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[EmbeddedRedis]:
-    with EmbeddedRedis(tmp_path / "redis") as running:
-        yield running
 
 
 @pytest.fixture
@@ -123,7 +106,7 @@ def test_the_trainers_first_samples_are_never_held_back() -> None:
 
 
 def test_a_worker_waits_for_space_says_so_once_and_goes_on(
-    analytic: ModuleType, store: Store, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, store: Store, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     """A file of 2 GB takes the space and gives it back; whatever else is written here meanwhile is less than 1 GB."""
     ballast = tmp_path / "ballast"
@@ -135,20 +118,20 @@ def test_a_worker_waits_for_space_says_so_once_and_goes_on(
     reserve = shutil.disk_usage(tmp_path).free + 10**9
     log = tmp_path / "log"
     with analytic.start_worker(
-        store.root, server.url, analytic.command(), log, until_complete=True, reserve_bytes=reserve
+        store.root, redis_server.url, analytic.command(), log, until_complete=True, reserve_bytes=reserve
     ) as running:
         analytic.wait_for(lambda: "takes no jobs" in log.read_text(), 120)
-        analytic.wait_for(lambda: queue_status(connect(server.url)).queued == 4, 60)
+        analytic.wait_for(lambda: queue_status(connect(redis_server.url)).queued == 4, 60)
         assert scene.committed_jobs() == set()
         ballast.unlink()
         assert running.wait(120) == 0
     assert scene.missing_jobs() == []
     assert log.read_text().count("takes no jobs") == log.read_text().count("takes jobs again") == 1
-    assert queue_status(connect(server.url)).failed == {}
+    assert queue_status(connect(redis_server.url)).failed == {}
 
 
 def test_a_commit_that_finds_the_disk_full_fails_no_job_and_ends_no_worker(
-    analytic: ModuleType, store: Store, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, store: Store, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     """The first two commits find no space, whatever the reserve."""
     code = """
@@ -167,10 +150,10 @@ sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
     log, child = tmp_path / "log", (sys.executable, "-c", code, *analytic.command()[1:])
-    with analytic.start_worker(store.root, server.url, child, log, until_complete=True) as running:
+    with analytic.start_worker(store.root, redis_server.url, child, log, until_complete=True) as running:
         assert running.wait(240) == 0
     assert scene.missing_jobs() == []
     said = log.read_text()
     assert "takes no jobs: the disk is full" in said
     assert "starting again" not in said
-    assert queue_status(connect(server.url)).failed == {}
+    assert queue_status(connect(redis_server.url)).failed == {}

@@ -1,6 +1,5 @@
 """One job: the scene edited least, every half with its own seed, bad luck drawn again, wrong scenes refused."""
 
-import importlib.util
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
@@ -14,17 +13,9 @@ from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError
 from photonfarm.shared.keys import seed_of
 from photonfarm.shared.plan import Request
+from photonfarm.shared.records import Visibility
 from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
 from photonfarm.shared.store.check import check_store
-
-
-@pytest.fixture(scope="module")
-def analytic() -> ModuleType:
-    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
-    spec = importlib.util.spec_from_file_location("analytic_scene_of_jobs", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -105,6 +96,50 @@ def test_passes_added_later_render_neither_buffers_nor_photons_again(
     render_all(scene, store, recorded)
     assert len(asked(recorded, "half")) == 12
     assert asked(recorded, "buffers") == asked(recorded, "photons") == []
+
+
+@pytest.mark.parametrize("shard_rows", [1, 3])
+def test_photons_that_another_job_stores_are_traced_again_and_seen_the_same(
+    analytic: ModuleType, scene: SceneStore, store: Store, recorded: type, tmp_path: Path, shard_rows: int
+) -> None:
+    """The same 12 samples in jobs of 8 and in smaller ones, where views and modification of many are apart."""
+    render_all(scene, store, recorded)
+    split = Store(tmp_path / "split", create=True)
+    request = Request(modifications=3, views_per_modification=2, passes=2)
+    apart = split.scene(split.plan(analytic.small_spec(), request, shard_rows=shard_rows).scene_id)
+    recorded.calls.clear()
+    render_all(apart, split, recorded)
+    traced = asked(recorded, "photons")
+    assert len(set(traced)) == 3 < len(traced)
+    whole, parts = seen_in(store, scene), seen_in(split, apart)
+    assert whole.keys() == parts.keys()
+    for name in ("points", "photons"):
+        bits, again = (np.stack([getattr(of[key], name) for key in sorted(whole)]) for of in (whole, parts))
+        assert 0.1 < bits.mean() < 0.9
+        np.testing.assert_array_equal(bits, again, err_msg=name)
+
+
+def seen_in(store: Store, scene: SceneStore) -> dict[bytes, Visibility]:
+    """What each view sees, by its content key."""
+    reader = SceneReader(store.root, scene.scene_id)
+    return {reader.view_key(row): reader.read(row).visibility for row in reader.refresh().tolist()}
+
+
+def test_points_of_a_removed_group_are_not_seen_even_if_the_scene_says_so(
+    analytic: ModuleType, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All points of the analytic scene are of its one object."""
+    monkeypatch.setattr(recorded, "sees", lambda _self, _view, position: np.ones(len(position), np.bool_))
+    (movable,) = analytic.small_spec().model_dump()["objects"]
+    spec = analytic.small_spec(objects=[{**movable, "removal_probability": 0.5}])
+    scene = store.scene(store.plan(spec, Request(modifications=16), shard_rows=16).scene_id)
+    render_all(scene, store, recorded)
+    reader = SceneReader(store.root, scene.scene_id)
+    samples = [reader.read(row) for row in reader.refresh().tolist()]
+    assert {bool(sample.modification.present[0]) for sample in samples} == {True, False}
+    for sample in samples:
+        assert (sample.visibility.points == sample.modification.present[0]).all()
+        assert sample.visibility.photons.all()
 
 
 def test_every_half_has_its_own_seed_which_follows_from_the_samples_key(

@@ -1,11 +1,9 @@
 """The worker as a whole: real queue, real store, real processes; only the scene is analytic."""
 
-import importlib.util
 import json
 import re
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -14,7 +12,6 @@ import pytest
 from photonfarm.renderer.heartbeat import Heart
 from photonfarm.renderer.worker import check, render_job, run_worker
 from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.renderer.worker_talk import Talk, Tally
 from photonfarm.shared import queue, show
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.plan import Request
@@ -23,21 +20,6 @@ from photonfarm.shared.queue import connect, job_name, queue_status
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import Source
 from photonfarm.shared.store import SceneStore, Store, store_status
-
-
-@pytest.fixture(scope="module")
-def analytic() -> ModuleType:
-    path = Path(__file__).parents[1] / "faults/analytic_scene.py"
-    spec = importlib.util.spec_from_file_location("analytic_scene_of_worker", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[EmbeddedRedis]:
-    with EmbeddedRedis(tmp_path / "redis") as running:
-        yield running
 
 
 @pytest.fixture
@@ -51,55 +33,69 @@ QUICK = {"until_complete": True, "idle_s": 1, "heartbeat_ttl_s": 2.0, "reserve_b
 
 
 def test_a_worker_fills_an_empty_queue_from_the_store_and_stops_when_nothing_is_missing(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    run_worker(tmp_path / "store", server.url, name="ada", child=analytic.command(), **QUICK)
+    run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
     assert scene.has_base()
     assert {scene.marker(job)["figures"]["worker"] for job in range(2)} == {"ada"}
-    status = queue_status(connect(server.url))
+    status = queue_status(connect(redis_server.url))
     assert (status.queued, status.running, status.failed, status.workers) == (0, 0, {}, 0)
     assert store_status(Store(tmp_path / "store"))[0].core_s > 0
-    assert not list(connect(server.url).scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
+    assert not list(connect(redis_server.url).scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
 
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_worker_says_at_its_end_what_all_its_children_have_done(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, quiet: bool
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, quiet: bool
 ) -> None:
     said: list[str] = []
     run_worker(
-        tmp_path / "store", server.url, name="ada", child=analytic.command(), say=said.append, max_jobs=1, quiet=quiet,
+        tmp_path / "store",
+        redis_server.url,
+        name="ada",
+        child=analytic.command(),
+        say=said.append,
+        max_jobs=1,
+        quiet=quiet,
         **QUICK,
-    )  # fmt: skip
+    )
     summary = r"worker ada: ended: 2 jobs done, 6 samples, \d+ s"
     assert [bool(re.fullmatch(summary, line)) for line in said] == ([] if quiet else [True])
 
 
 @pytest.mark.parametrize("limit", [{"max_jobs": 1}, {"max_rss_bytes": 1}])
 def test_a_child_is_replaced_after_so_many_jobs_or_bytes(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, limit: dict[str, int]
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, limit: dict[str, int]
 ) -> None:
     starts = tmp_path / "starts"
     code = "import sys, runpy; open(sys.argv[1], 'a').write('x'); sys.argv = sys.argv[2:]; "
     code += "runpy.run_path(sys.argv[0], run_name='__main__')"
     child = (sys.executable, "-c", code, str(starts), *analytic.command()[1:])
-    run_worker(tmp_path / "store", server.url, child=child, **QUICK, **limit)
+    run_worker(tmp_path / "store", redis_server.url, child=child, **QUICK, **limit)
     assert scene.missing_jobs() == []
     assert len(starts.read_text()) == 3
 
 
 def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and_can_be_repeated(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    analytic: ModuleType,
+    scene: SceneStore,
+    redis_server: EmbeddedRedis,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    connection, root, names = connect(server.url), tmp_path / "store", [job_name(scene.scene_id, j) for j in range(2)]
+    connection, root, names = (
+        connect(redis_server.url),
+        tmp_path / "store",
+        [job_name(scene.scene_id, j) for j in range(2)],
+    )
     for _ in range(2):  # it has failed before
         queue.record_failure(connection, names[0], "earlier")
     queue.forget_failures(connection, set_aside=False)
     with pytest.raises(
         IncompleteError, match=r"2 jobs have failed; .*: half A of sample .* came out non-finite 3 times"
     ):
-        run_worker(root, server.url, child=analytic.command(0, "broken"), **QUICK)
+        run_worker(root, redis_server.url, child=analytic.command(0, "broken"), **QUICK)
     failed = queue_status(connection).failed
     assert {name: (failure.times, failure.set_aside) for name, failure in failed.items()} == {
         names[0]: (3, True),
@@ -108,12 +104,12 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 
-    show.status(root, server.url, as_json=True)
+    show.status(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert cause["cause"] == "IncompleteError: half A of sample … came out non-finite … times"
     assert (cause["failed"], cause["set_aside"]) == (2, 1)
     assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
-    show.status(root, server.url, as_json=False)
+    show.status(root, redis_server.url, as_json=False)
     shown = capfd.readouterr().out
     assert "2 failed, of which 1 are set aside until `photonfarm submit --retry`" in shown
     assert "2 × IncompleteError: half A of sample … came out non-finite … times" in shown
@@ -127,7 +123,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
         analytic.AnalyticScene.broken = False
     assert render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
     assert not render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
-    show.status(root, server.url, as_json=True)
+    show.status(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert [job["name"] for job in cause["jobs"]] == names[1:], "what has been committed since has not failed"
     assert queue.reconcile(Store(root), connection, retry_failed=True) == 1
@@ -145,36 +141,40 @@ def test_a_job_that_is_not_planned_cannot_be_rendered(
 
 
 def test_a_machine_without_a_backend_ends_the_worker_and_fails_no_job(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     with pytest.raises(BackendError, match="no libLLVM was found; install LLVM 19"):
-        run_worker(tmp_path / "store", server.url, child=analytic.command(0, "no backend"), **QUICK)
-    assert queue_status(connect(server.url)).failed == {}
+        run_worker(tmp_path / "store", redis_server.url, child=analytic.command(0, "no backend"), **QUICK)
+    assert queue_status(connect(redis_server.url)).failed == {}
 
 
 def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     store = Store(tmp_path / "store")
     other = store.scene(store.plan(analytic.small_spec(points=17), Request(modifications=6), shard_rows=3).scene_id)
-    queue.reconcile(store, connect(server.url), scene_id=other.scene_id)
-    run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
+    queue.reconcile(store, connect(redis_server.url), scene_id=other.scene_id)
+    run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1]
-    status = queue_status(connect(server.url))
+    status = queue_status(connect(redis_server.url))
     assert (status.queued, status.failed) == (2, {})
 
 
 def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_else_from_being_rendered(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    analytic: ModuleType,
+    scene: SceneStore,
+    redis_server: EmbeddedRedis,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    store, connection = Store(tmp_path / "store"), connect(server.url)
+    store, connection = Store(tmp_path / "store"), connect(redis_server.url)
     elsewhere = analytic.small_spec().model_copy(update={"scene": Source(file="gone.xml")})
     other = store.scene(store.plan(elsewhere, Request(modifications=9), shard_rows=3).scene_id)
     for told in (other, scene):
         queue.reconcile(store, connection, scene_id=told.scene_id)
     with pytest.raises(BackendError, match=r"this machine cannot render .*'gone.xml' is not there"):
-        run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
+        run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1, 2]
     status = queue_status(connection)
@@ -187,22 +187,22 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
 
 
 def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
-    scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    connection = connect(server.url)
-    settings = settings_of(store=str(tmp_path / "store"), redis_url=server.url)
+    connection = connect(redis_server.url)
+    settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
     heart = Heart(settings, Store(tmp_path / "store"), None)
     heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
     heart.start()
-    show.status(tmp_path / "store", server.url, as_json=False)
+    show.status(tmp_path / "store", redis_server.url, as_json=False)
     said = capsys.readouterr().out
     assert "analytic: left by 1 of 1 workers: gone.xml is not there" in said
     assert "worker ada takes no jobs: the disk is full" in said
     assert "stranger" not in said
-    show.status(tmp_path / "store", server.url, as_json=True)
+    show.status(tmp_path / "store", redis_server.url, as_json=True)
     assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
     heart.end()
-    show.status(tmp_path / "store", server.url, as_json=False)
+    show.status(tmp_path / "store", redis_server.url, as_json=False)
     assert "takes no jobs" not in capsys.readouterr().out
     queue.bury(connection, "ada")
 
@@ -211,22 +211,22 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
 
 
 def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    connection, store = connect(server.url), Store(tmp_path / "store")
+    connection, store = connect(redis_server.url), Store(tmp_path / "store")
     queue.reconcile(store, connection)
     other = Store(tmp_path / "typo", create=True)
     with pytest.raises(QueueError, match=f"id {store.store_id}, and .*typo has the id {other.store_id}"):
-        run_worker(tmp_path / "typo", server.url, child=analytic.command(), **QUICK)
+        run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
     assert queue_status(connection).queued == 2
     assert queue_status(connection).workers == 0
 
 
 @pytest.mark.parametrize("in_its_place", ["nothing", "an empty folder", "another store"])
 def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jobs(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, in_its_place: str
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, in_its_place: str
 ) -> None:
-    root, connection = tmp_path / "store", connect(server.url)
+    root, connection = tmp_path / "store", connect(redis_server.url)
     queue.reconcile(Store(root), connection)
     code = f"""
 import runpy, sys
@@ -248,27 +248,29 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
     said = "now another one lies there" if in_its_place == "another store" else "photonfarm.json is missing"
     with pytest.raises(StoreError, match=said):
-        run_worker(root, server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
+        run_worker(root, redis_server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
     assert queue_status(connection).failed == {}
     assert [name.decode() for name in connection.lrange(queue.open_queue(connection).key, 0, -1)] == [
         job_name(scene.scene_id, job) for job in range(2)
     ]
 
 
-def test_a_store_that_is_not_there_is_not_made(analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path) -> None:
+def test_a_store_that_is_not_there_is_not_made(
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
     with pytest.raises(StoreError, match="typo: there is no store; `photonfarm submit` makes one"):
-        run_worker(tmp_path / "typo", server.url, child=analytic.command(), **QUICK)
+        run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
     assert not (tmp_path / "typo").exists()
 
 
 def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
-    analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    log, connection = tmp_path / "log", connect(server.url)
-    with analytic.start_worker(tmp_path / "later", server.url, analytic.command(), log, name="ada") as running:
+    log, connection = tmp_path / "log", connect(redis_server.url)
+    with analytic.start_worker(tmp_path / "later", redis_server.url, analytic.command(), log, name="ada") as running:
         analytic.wait_for(lambda: queue.hosts(connection), 60)
         time.sleep(3)  # longer than its heartbeat lasts
-        check(server.url)
+        check(redis_server.url)
         assert not (tmp_path / "later").exists()
         store = Store(tmp_path / "later", create=True)
         scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=3), shard_rows=3).scene_id)
@@ -281,33 +283,54 @@ def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", log.read_text()), "a supervisor tells the time as well"
 
 
+def test_a_worker_ends_when_told_while_its_child_is_talking(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    """Three times, as a signal is only lost if it comes between two things that the child says."""
+    code = """
+import os, sys, time
+sys.stdin.readline()
+until = time.monotonic() + 1
+while time.monotonic() < until:
+    os.write(1, b"x" * 100)
+time.sleep(60)
+"""
+    child, log = (sys.executable, "-c", code), tmp_path / "log"
+    for _ in range(3):
+        with analytic.start_worker(tmp_path / "store", redis_server.url, child, log) as running:
+            analytic.wait_for(lambda: analytic.child_of(running) is not None, 60)
+            time.sleep(0.5)
+            running.terminate()
+            assert running.wait(20) == 0
+
+
 def test_a_worker_that_waits_for_a_store_ends_when_told(
-    analytic: ModuleType, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     log = tmp_path / "log"
-    with analytic.start_worker(tmp_path / "never", server.url, analytic.command(), log) as running:
+    with analytic.start_worker(tmp_path / "never", redis_server.url, analytic.command(), log) as running:
         analytic.wait_for(lambda: "waiting for a store" in log.read_text(), 60)
         running.terminate()
         assert running.wait(20) == 0
-    assert queue_status(connect(server.url)).workers == 0
+    assert queue_status(connect(redis_server.url)).workers == 0
 
 
 @pytest.mark.parametrize("named", ["analytic", "beginning"])
 def test_a_scene_goes_by_its_name_and_by_how_its_id_begins(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path, named: str
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, named: str
 ) -> None:
     text = scene.scene_id[:6] if named == "beginning" else named
-    run_worker(tmp_path / "store", server.url, child=analytic.command(), scene_id=text, **QUICK)
+    run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), scene_id=text, **QUICK)
     assert scene.missing_jobs() == []
     assert not render_job(tmp_path / "store", text, 0, load=analytic.AnalyticScene.load)[0]
 
 
 def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_alone(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    connection, said = connect(server.url), []
+    connection, said = connect(redis_server.url), []
     queue.beat(connection, "ada", "another-machine", None, ttl_s=60, process=7)
-    run_worker(tmp_path / "store", server.url, name="ada", child=analytic.command(), say=said.append, **QUICK)
+    run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), say=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
     assert said[0] == "worker ada: another one of this name is alive, so this one goes by ada-2"
@@ -327,71 +350,23 @@ def test_a_store_that_cannot_be_opened_is_told_before_anything_is_started(tmp_pa
 
 
 def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
-    analytic: ModuleType, scene: SceneStore, server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     scene.write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
     scene.storage.local("tmp").rmdir()
     scene.storage.local("tmp").write_text("a file where the folder should be")
     with pytest.raises(StoreError, match="cannot commit job"):
-        run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
-    assert queue_status(connect(server.url)).failed == {}
+        run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
+    assert queue_status(connect(redis_server.url)).failed == {}
     scene.storage.local("tmp").unlink()
-    run_worker(tmp_path / "store", server.url, child=analytic.command(), **QUICK)
+    run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
 
 
-def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(server: EmbeddedRedis) -> None:
-    connection = connect(server.url)
+def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(redis_server: EmbeddedRedis) -> None:
+    connection = connect(redis_server.url)
     queue.beat(connection, "far", "another-machine", None, ttl_s=60)
     with pytest.raises(IncompleteError, match=r"no worker of .* is alive"):
-        check(server.url)
+        check(redis_server.url)
     queue.beat(connection, "near", process_space(), None, ttl_s=60)
-    check(server.url)
-
-
-# ------------------------------------------------------------------------------------------------------- what it says
-
-
-def settings_of(**changes: object) -> WorkerSettings:
-    return WorkerSettings.model_validate({"store": "s", "redis_url": "redis://u:hunter2@h/0", "name": "ada"} | changes)
-
-
-def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:
-    talk = Talk(settings_of(report_s=3600))
-    for job in range(5):
-        with talk.timing(f"job-{job}"):
-            pass
-    assert [record.getMessage() for record in caplog.records] == [
-        "worker ada: 1 job in 0 s, 0.00 s each; the last was job-0"
-    ]
-    caplog.clear()
-    talk = Talk(settings_of(report_s=1e-9))
-    for job in range(5):
-        with talk.timing(f"job-{job}"):
-            pass
-    assert len(caplog.records) == 5
-
-
-def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() -> None:
-    both = Tally.of(Tally(3, 1, 96, 10.25).line) + Tally(1, 0, 32, 2.0)
-    assert both == Tally(4, 1, 128, 12.25)
-    assert str(both) == "4 jobs done, 1 failed, 128 samples, 12 s"
-
-
-def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:
-    talk = Talk(settings_of(quiet=True))
-    with talk.timing("job"):
-        pass
-    for reason in (None, "the disk is full", "the disk is fuller", None, None):
-        talk.pausing(reason)
-    assert [record.getMessage() for record in caplog.records] == [
-        "worker ada: takes no jobs: the disk is full",
-        "worker ada: takes jobs again",
-    ]
-
-
-def test_settings_show_no_password_and_wrong_ones_neither() -> None:
-    assert "hunter2" not in repr(settings_of())
-    with pytest.raises(ValueError, match="max_jobs") as caught:
-        settings_of(max_jobs="hunter2")
-    assert "hunter2" not in str(caught.value)
+    check(redis_server.url)

@@ -1,19 +1,15 @@
 """A small store to damage and check, and what the tests of `photonfarm store check` do with it."""
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check import StoreReport, check_store
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 
 @pytest.fixture

@@ -40,6 +40,7 @@ def with_tensorstore(folder: Path):
 
 READERS = {"zarr": with_zarr, "tensorstore": with_tensorstore}
 BUFFERS = ("depth", "albedo", "normal")
+SEEN = ("point_seen", "photon_seen")
 PHOTONS = ("photon_position", "photon_direction", "photon_normal", "photon_power", "photon_bounce")
 
 
@@ -49,7 +50,7 @@ def document(path: Path):
 
 def main(store: Path, backend: str, out: Path) -> None:
     stated = document(store / "photonfarm.json")
-    assert (stated["format"], stated["version"]) == ("photonfarm store", 2)
+    assert (stated["format"], stated["version"]) == ("photonfarm store", 3)
     arrays = {}
     for folder in sorted((store / "scenes").iterdir()):
         if re.fullmatch("[0-9a-f]{32}", folder.name):
@@ -113,6 +114,10 @@ class Scene:
         assert key == self.stored("sample_key", row).tobytes()
         read = {"radiance": self.radiance(row), "modification": modification, "view": view, "pass": number}
         read |= {name: self.stored(name, view_row) for name in BUFFERS}
+        slots = self.spec["photons"]["paths"] * self.spec["photons"]["depth"]
+        for name, count in zip(SEEN, (self.spec["points"], slots), strict=True):
+            if count:
+                read[name] = np.unpackbits(self.stored(name, view_row), bitorder="little")[:count]
         if self.spec["photons"]["paths"]:
             read |= {name: self.stored(name, modification_row) for name in PHOTONS}
         read["rays"] = rays(view.astype("f8"), self.spec)
@@ -141,7 +146,7 @@ class Plan:
     def __init__(self, folder: Path, read) -> None:
         self.folder = folder
         attributes = document(folder / "zarr.json")["attributes"]
-        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 2)
+        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 3)
         self.shard_rows = attributes["shard_rows"]
         self.first_row = attributes["first_job"] * self.shard_rows
         self.rows = attributes["jobs"] * self.shard_rows

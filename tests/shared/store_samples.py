@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.store import Figures, SceneStore
 
@@ -18,6 +18,7 @@ class Outputs:
 
     radiance: dict[int, F32]
     buffers: dict[int, ViewBuffers]
+    visibility: dict[int, Visibility]
     photons: dict[int, Photons]
 
 
@@ -43,6 +44,7 @@ def outputs(scene: SceneStore, job: int) -> Outputs:
             row: ViewBuffers(values(row, size), values(row + 1, (*size, 3)), values(row + 2, (*size, 3)))
             for row in rows.new_views
         },
+        {row: visibility(spec, row) for row in rows.new_views},
         {row: photons(spec, row) for row in rows.new_modifications if spec.photons.paths},
     )
 
@@ -54,13 +56,20 @@ def values(seed: int, shape: tuple[int, ...]) -> F32:
 
 def photons(spec: SceneSpec, row: int) -> Photons:
     """Photons of which the last slot is empty."""
-    count = spec.photons.paths * spec.photons.depth
+    count = spec.photons.slots
     position, direction, normal, power = (values(row + i, (count, 3)) for i in range(4))
     bounce = np.zeros(count, np.int8)
     for array in (position, direction, normal, power):
         array[-1] = 0
     bounce[-1] = -1
     return Photons(position, direction, normal, power, bounce)
+
+
+def visibility(spec: SceneSpec, row: int) -> Visibility:
+    """Half of the points and photons seen, but for the last slot, which is empty."""
+    points, photons = (values(row + i, (count,)) < 0.5 for i, count in enumerate((spec.points, spec.photons.slots)))
+    photons[-1:] = False
+    return Visibility(points, photons)
 
 
 def base() -> tuple[Geometry, BasePointCloud]:
@@ -77,7 +86,7 @@ def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGUR
         for row, photons_ in given.photons.items():
             out.photons(row, photons_)
         for row, buffers in given.buffers.items():
-            out.buffers(row, buffers)
+            out.view(row, buffers, given.visibility[row])
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
         return out.commit(figures, **options)

@@ -1,44 +1,19 @@
 """A bucket that is gone, and commits past copies of its objects on this machine that are damaged."""
 
-import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import obstore
 import pytest
+import store_samples as samples
 from obstore.store import from_url
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
-
-
-def beside(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-samples, s3_server = beside("store_samples"), beside("s3_server")
-
-
-@pytest.fixture(scope="session")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    with s3_server.running(tmp_path_factory.mktemp("s3")) as found:
-        yield found
-
-
-@pytest.fixture
-def url(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    for name, value in s3_server.environment(port).items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("PHOTONFARM_CACHE", str(tmp_path / "cache"))
-    return f"s3://photonfarm/{tmp_path.name}"
 
 
 @pytest.fixture

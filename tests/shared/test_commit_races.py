@@ -1,6 +1,5 @@
 """A commit among others that change the job's files meanwhile: what is announced is what is there."""
 
-import importlib.util
 import json
 import threading
 from collections.abc import Callable
@@ -11,16 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.store.local import LocalStorage
 from photonfarm.shared.store.quarantine import Quarantine
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """A reader made from docs/store-format.md alone reads a whole store, through zarr-python and through tensorstore."""
 
-import importlib.util
 import shutil
 import subprocess
 import sys
@@ -9,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import plain_reader
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.keys import seed_of
 from photonfarm.shared.plan import Request, sample_key
@@ -20,12 +21,6 @@ from photonfarm.shared.view import Camera
 ROOT = Path(__file__).parents[2]
 PLAIN_READER = Path(__file__).with_name("plain_reader.py")
 
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
-_spec = importlib.util.spec_from_file_location("plain_reader", PLAIN_READER)
-plain_reader = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(plain_reader)
 
 WIDE_ROWS = (1, 9)
 Arrays = dict[str, np.ndarray[Any, Any]]
@@ -82,7 +77,7 @@ def plainly(store: Store, by: str, out: Path) -> Arrays:
 def test_zarr_and_tensorstore_read_the_same_bytes_of_every_array(store: Store, read: dict[str, Arrays]) -> None:
     arrays = {path.parent for path in Path(store.root).rglob("zarr.json") if '"array"' in path.read_text()}
     assert {f"{store.root}/scenes/{name}" for name in read["zarr"] if "/samples/" not in name} == set(map(str, arrays))
-    assert len(arrays) == (6 + 10 + 6 + 10 + 10) + (6 + 5) + (6 + 10)
+    assert len(arrays) == (6 + 12 + 6 + 12 + 10) + (6 + 6) + (6 + 12)
     assert read["zarr"].keys() == read["tensorstore"].keys()
     for name, values in read["zarr"].items():
         other = read["tensorstore"][name]
@@ -109,9 +104,10 @@ def names(scene: SceneStore) -> list[str]:
 def same(reader: SceneReader, row: int, plain: Arrays) -> None:
     sample = reader.read(row)
     expected = {"radiance": sample.radiance, "view": sample.view.vector, "modification": sample.modification.vector}
-    expected |= arrays_of(sample.buffers)
+    expected |= arrays_of(sample.buffers) | {"point_seen": sample.visibility.points}
     if reader.spec.photons.paths:
         expected |= {f"photon_{name}": values for name, values in arrays_of(reader.read_photons(row)).items()}
+        expected["photon_seen"] = sample.visibility.photons
     for name, values in expected.items():
         np.testing.assert_array_equal(plain[name], values, err_msg=name)
     assert plain["pass"] == sample.pass_

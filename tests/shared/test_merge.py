@@ -1,6 +1,5 @@
 """Passes merge exactly: the truth is Python's fractions, and neither order nor grouping leaves a trace."""
 
-import importlib.util
 import json
 from dataclasses import fields
 from fractions import Fraction
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import store_samples as samples
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,10 +19,6 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.merge import MAX_PASSES, Merged, Moments, merge_rows, merge_view
 from photonfarm.shared.top_up import TopUp
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 HALF = np.float32(np.finfo(np.float16).smallest_subnormal)
 TINY, HUGE = np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max

@@ -1,6 +1,5 @@
 """Requests become rows and jobs; what is planned stays, and is not planned again."""
 
-import importlib.util
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import store_samples as samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,10 +21,6 @@ from photonfarm.shared.plan import MAX_SAMPLES, UNUSED, Known, PlannedRows, Requ
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.view import sample_view
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 Triple = tuple[bytes, bytes, int]
 

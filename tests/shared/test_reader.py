@@ -1,22 +1,18 @@
 """Batches in reused memory are the samples that were committed, from any number of threads and with few open files."""
 
-import importlib.util
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import arrays_of
 from photonfarm.shared.store import SceneReader, SceneStore, Store, reader
 from photonfarm.shared.store.batch import Batch
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 WIDE = (5, 6)  # rows with a value beyond float16
 BRIGHT = np.float32(1e9)
@@ -51,6 +47,8 @@ def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
         np.testing.assert_array_equal(batch.linear(place), sample.radiance)
         for name, values in arrays_of(sample.buffers).items():
             np.testing.assert_array_equal(batch.buffers[name][place], values)
+        for name, seen in arrays_of(sample.visibility).items():
+            np.testing.assert_array_equal(getattr(batch.visibility(place), name), seen)
         assert batch.modification_rows[place] == source.modification_row(row)
 
 
@@ -63,34 +61,13 @@ def test_batches_in_any_order_and_with_repeats_are_the_samples_read_one_by_one(s
         check(source.read_batch(np.array(rows)), source, rows)
 
 
-def test_a_batch_that_several_threads_read_is_the_same(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "_PART", 2)
-    memory = Batch.empty(source.spec, 7)
-    with ThreadPoolExecutor(3) as threads:
-        for rows in ([0, 1, 2, 3, 4, 5, 6], [5, 5, 7], [3], []):  # 5 and 6 are wide
-            for _ in range(3):
-                check(source.read_batch(rows, memory, threads), source, rows)
-
-
-def test_an_error_of_one_thread_is_raised_once_all_have_ended(
-    scene: SceneStore, source: SceneReader, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(reader, "_PART", 1)
-    (scene.folder / "plans/000000/depth/c.0.0.0").unlink()
-    memory = Batch.empty(source.spec, 8)
-    with ThreadPoolExecutor(4) as threads:
-        with pytest.raises(CorruptError, match="depth"):
-            source.read_batch(range(8), memory, threads)
-        memory.radiance[:] = 7
-    assert (memory.radiance == 7).all()
-
-
 def test_a_batch_is_in_the_memory_that_was_given_and_in_the_types_that_are_stored(source: SceneReader) -> None:
     memory = Batch.empty(source.spec, 4)
     batch = source.read_batch([3, 1], memory)
     assert len(batch) == 2
     assert np.shares_memory(batch.radiance, memory.radiance)
     assert all(np.shares_memory(batch.buffers[name], memory.buffers[name]) for name in ("depth", "albedo", "normal"))
+    assert all(np.shares_memory(batch.seen[name], memory.seen[name]) for name in ("point_seen", "photon_seen"))
     types = {name: values.dtype.name for name, values in batch.buffers.items()}
     assert types == {"depth": "float32", "albedo": "float16", "normal": "float16"}
     expected = source.read(3).radiance * 2.0**source.spec.radiance_exponent
@@ -115,7 +92,7 @@ def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: S
     for file in scene.folder.glob("plans/*/depth/c.*"):
         file.unlink()
     batch = source.read_batch([0, 1], Batch.empty(source.spec, 2, buffers=False))
-    assert batch.buffers == {}
+    assert batch.buffers == batch.seen == {}
     with pytest.raises(CorruptError, match="depth"):
         source.read_batch([0, 1], Batch.empty(source.spec, 2))
 

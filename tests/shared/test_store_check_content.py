@@ -1,10 +1,10 @@
 """`photonfarm store check` looks at pictures and views: repeated seeds, and halves that differ."""
 
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import checked_store as stores
 import numpy as np
 import pytest
 
@@ -14,9 +14,6 @@ from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store, r
 from photonfarm.shared.store.check import StoreReport, said
 from photonfarm.shared.view import Camera
 
-_spec = importlib.util.spec_from_file_location("checked_store", Path(__file__).with_name("checked_store.py"))
-stores = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(stores)
 store, scene = stores.store, stores.scene
 samples, outputs, checked, found = stores.samples, stores.outputs, stores.checked, stores.found
 noted, shard, marker, recommitted = stores.noted, stores.shard, stores.marker, stores.recommitted
@@ -189,6 +186,29 @@ def test_a_half_that_is_biased_somewhere_is_found(tmp_path: Path) -> None:
     assert found(report) == {"halves-differ": 1}
     assert report.exit_code == 4
     assert report.scenes[0].halves.statistic > report.scenes[0].halves.limit
+
+
+@pytest.mark.parametrize("name", ["point_seen", "photon_seen"])
+def test_a_bit_of_a_point_or_photon_that_the_scene_does_not_have_is_found(
+    store: Store, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """13 points and 5 photons, and a writer that sets the bit above them in one view of two."""
+    spec = samples.small_spec(points=13, photons={"paths": 5, "depth": 1})
+    scene = store.scene(store.plan(spec, Request(views_per_modification=2), shard_rows=2).scene_id)
+    put = JobWriter._put
+
+    def with_one_more(self: JobWriter, row: int, array: str, values: np.ndarray) -> None:
+        if (row, array) == (1, name):
+            values[-1] |= 1 << (13 if name == "point_seen" else 5) % 8
+        put(self, row, array, values)
+
+    monkeypatch.setattr(JobWriter, "_put", with_one_more)
+    stores.commit_all(scene)
+    scene.write_base(*samples.base())
+    report = checked(store)
+    assert found(report) == {"unused-bit": 1}
+    (group,) = [group for group in report.scenes[0].groups if group.cause.label == "unused-bit"]
+    assert (group.first[0].row, group.first[0].detail.partition(" ")[0]) == (1, name)
 
 
 def test_views_of_nothing_and_views_from_behind_are_noted_and_are_no_error(store: Store, scene: SceneStore) -> None:

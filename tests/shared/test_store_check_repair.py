@@ -1,6 +1,5 @@
 """`photonfarm store check --repair` sets damaged jobs aside, losing nothing, and they are rendered again."""
 
-import importlib.util
 import json
 import os
 import signal
@@ -8,8 +7,10 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import checked_store as stores
 import numpy as np
 import pytest
 
@@ -17,9 +18,6 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, check
 from photonfarm.shared.store.quarantine import Quarantine
 
-_spec = importlib.util.spec_from_file_location("checked_store", Path(__file__).with_name("checked_store.py"))
-stores = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(stores)
 store, scene, outputs = stores.store, stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data
 shard, flip, marker, recommitted = stores.shard, stores.flip, stores.marker, stores.recommitted
@@ -50,13 +48,11 @@ def test_repair_sets_damaged_jobs_aside_with_a_record_and_rendering_them_again_g
     assert found(checked(store, repair=True)) == {}
 
 
-def test_workers_render_again_what_a_repair_has_set_aside_bit_for_bit_and_with_it_the_base(store: Store) -> None:
+def test_workers_render_again_what_a_repair_has_set_aside_bit_for_bit_and_with_it_the_base(
+    store: Store, analytic: ModuleType
+) -> None:
     from photonfarm.renderer.jobs import ShardRenderer
 
-    file = Path(__file__).parents[1] / "faults/analytic_scene.py"
-    loader = importlib.util.spec_from_file_location("analytic_scene", file)
-    analytic = importlib.util.module_from_spec(loader)
-    loader.loader.exec_module(analytic)
     scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=8), shard_rows=4).scene_id)
     worker = ShardRenderer(store, worker="worker", load=analytic.AnalyticScene.load)
     for job in scene.missing_jobs():

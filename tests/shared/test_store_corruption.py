@@ -1,17 +1,13 @@
 """Bytes that are not what was committed are never returned, and the error names the file."""
 
-import importlib.util
 from pathlib import Path
 
 import pytest
+import store_samples as samples
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 
 @pytest.fixture

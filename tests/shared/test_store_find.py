@@ -1,6 +1,5 @@
 """`photonfarm store find` finds samples by what they are, and says where they lie."""
 
-import importlib.util
 import json
 import time
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import store_samples as samples
 import zarr
 from click.testing import CliRunner
 
@@ -17,10 +17,6 @@ from photonfarm.shared.plan import PlannedRows, Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.find import Matches, Query, find_samples, scene_named
 from photonfarm.shared.store.plans import StoredPlan
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 
 @pytest.fixture

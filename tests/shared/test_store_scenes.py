@@ -1,6 +1,5 @@
 """What is wrong with one scene of a store stays with it, and what is wrong with the store is told as that."""
 
-import importlib.util
 import logging
 import re
 import shutil
@@ -8,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import store_samples as samples
 from click.testing import CliRunner
 
 from photonfarm.shared.cli import umbrella
@@ -19,10 +19,6 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.store.find import Query, find_samples, scene_named
 from photonfarm.shared.store.local import LocalStorage
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +189,7 @@ def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
             for row, photons in given.photons.items():
                 out.photons(row, photons)
             for row, buffers in given.buffers.items():
-                out.buffers(row, buffers)
+                out.view(row, buffers, given.visibility[row])
             for row, halves in given.radiance.items():
                 out.radiance(row, halves)
             out._join()
@@ -255,6 +251,6 @@ def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_a
 @pytest.mark.parametrize("content", ["", "{}", "[]"])
 def test_a_format_file_that_is_empty_says_what_it_should_hold(store: Store, content: str) -> None:
     (store.root / "photonfarm.json").write_text(content)
-    said = re.escape('{"format": "photonfarm store", "version": 2')
+    said = re.escape('{"format": "photonfarm store", "version": 3')
     with pytest.raises(CorruptError, match=f"is not the document of a store: .* {said}"):
         Store(store.root)

@@ -1,6 +1,5 @@
 """Top-up: more passes of what is planned, never one twice, and nothing but radiance rendered for them."""
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import store_samples as samples
 from click.testing import CliRunner, Result
 
 from photonfarm.shared.cli import umbrella
@@ -18,10 +18,6 @@ from photonfarm.shared.plan import MAX_SAMPLES, Request, sample_key
 from photonfarm.shared.scene import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.top_up import TopUp, spp_per_pass
-
-_spec = importlib.util.spec_from_file_location("store_samples", Path(__file__).with_name("store_samples.py"))
-samples = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(samples)
 
 SPP = 8  # of a pass of the small spec: two halves of half_spp = 4
 

@@ -1,21 +1,24 @@
 """What is read, held out and kept in memory."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.store import Store
+from photonfarm.shared.records import ViewBuffers, Visibility
+from photonfarm.shared.store import Figures, Store
 from photonfarm.shared.store.check import check_store
 from photonfarm.shared.view import Camera
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import Compact, rows_held_out
+from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import train
+from photonfarm.trainer.loop import CHECKPOINT, train
 from photonfarm.trainer.store_source import StoreSource
 
 
@@ -51,8 +54,9 @@ def test_a_batch_holds_the_samples_exactly(make_source, tiny) -> None:
             camera = Camera.of(sample.view, source.spec).world_to_camera
             for found, wanted in (
                 (batch.target, sample.radiance * np.float32(source.spec.exposure)),
-                (batch.inputs.position, position),
-                (batch.inputs.visible, visible),
+                (batch.inputs.points.position, position),
+                (batch.inputs.points.visible, visible),
+                (batch.inputs.points.seen, sample.visibility.points),
                 (batch.inputs.world_to_camera, camera.astype(np.float32)),
                 (batch.inputs.depth, sample.buffers.depth),
                 (batch.inputs.albedo, sample.buffers.albedo),
@@ -61,26 +65,26 @@ def test_a_batch_holds_the_samples_exactly(make_source, tiny) -> None:
                 np.testing.assert_array_equal(found[place].numpy(), wanted)
 
 
-@pytest.mark.parametrize(("scale", "dtype"), [(1.0, np.float16), (1e6, np.float32), (1 / 3, np.float32)])
-def test_keeping_a_sample_in_memory_changes_no_bit(make_source, scale: float, dtype: type) -> None:
-    source = make_source(1)
-    sample = source.read(0)
-    sample.radiance[:] = np.float32(scale) * np.round(64 * sample.radiance) / 64
-    kept = Compact.of(sample, source.spec)
-    assert kept.radiance.dtype == dtype
-    np.testing.assert_array_equal(kept.radiance.astype(np.float32), sample.radiance)
-
-
-def test_memory_is_used_up_to_its_budget_and_not_beyond(make_source, tiny) -> None:
-    source = make_source(6)
-    each = Compact.of(source.read(0), source.spec).nbytes
-    source.reads.clear()
-    with Feed(source, tiny(cache_bytes=int(2.5 * each))) as feed:
-        for _ in range(3):
-            for rows in ([0, 1, 2], [3, 4, 5]):
-                feed.ask(rows)
-                feed.take()
-    assert sorted(source.reads) == sorted([0, 1] + 3 * [2, 3, 4, 5])
+@pytest.mark.parametrize("brightest", [60.0, 1e6])
+def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scene, tiny, brightest: float) -> None:
+    scene.plan(Request(modifications=2), shard_rows=2)
+    rows = scene.job_rows(0)
+    bright = np.zeros((2, 16, 16, 3), np.float32)
+    bright[1, 3, 4] = brightest
+    buffers = ViewBuffers(*(np.full((16, 16, *more), 0.25, np.float32) for more in ((), (3,), (3,))))
+    seen = np.random.default_rng(0).random(256) < 0.5
+    with scene.job_writer(0) as out:
+        for sample in rows.samples:
+            out.radiance(sample.row, bright if sample.row == 1 else 0 * bright + 0.5)
+            out.view(sample.view_row, buffers, Visibility(seen, np.zeros(0, bool)))
+        out.commit(Figures(core_s=1, wall_s=1, redrawn=0, worker="test", versions={"test": "1"}))
+    with Feed(StoreSource(scene.storage.root, scene.scene_id), tiny()) as feed:
+        feed.ask([1, 0])
+        batch = feed.take()
+        np.testing.assert_array_equal(batch.target[0], bright * np.float32(scene.spec.exposure))
+        assert torch.equal(batch.target[1], torch.full((2, 16, 16, 3), 0.5 * scene.spec.exposure))
+        assert torch.equal(batch.inputs.normal, torch.full((2, 16, 16, 3), 0.25))
+        np.testing.assert_array_equal(batch.inputs.points.seen, [seen, seen])
 
 
 def test_batches_use_the_same_memory_again(make_source, tiny) -> None:
@@ -143,13 +147,10 @@ def until(feed: Feed, rows: list[int], wanted: tuple[int, ...]) -> None:
         assert time.monotonic() < deadline, found
 
 
-@pytest.mark.parametrize("cached", [0, 1 << 30])
-def test_rows_that_a_repair_takes_back_are_left_out_until_they_are_rendered_again(
-    repaired, commit, tiny, cached: int
-) -> None:
+def test_rows_that_a_repair_takes_back_are_left_out_until_they_are_rendered_again(repaired, commit, tiny) -> None:
     scene, repair = repaired
     source = StoreSource(scene.storage.root, scene.scene_id)
-    with Feed(source, tiny(cache_bytes=cached)) as feed:
+    with Feed(source, tiny()) as feed:
         told = feed.arrivals()
         until(feed, [0, 1, 4], (0, 1, 4))
         repair(0)
@@ -177,21 +178,21 @@ def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothi
 ) -> None:
     scene, repair = repaired
     source = StoreSource(scene.storage.root, scene.scene_id)
-    settings = tiny(max_steps=60, cache_bytes=0, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
+    settings = tiny(max_steps=60, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
     read = [0]
-    plain = source.read
+    plain = source.read_batch
 
-    def counted(row: int) -> Any:
+    def counted(rows: Sequence[int]) -> Any:
         read[0] += 1
-        if read[0] == 30:
+        if read[0] == 10:
             repair(0)
-        if read[0] == 90:
+        if read[0] == 30:
             commit(scene, 0)
-        return plain(row)
+        return plain(rows)
 
-    source.read = counted
+    source.read_batch = counted
     assert train(source, settings, run).reason == "steps"
-    state = checkpoint.load(run / "checkpoint.pt")["following"]
-    visits = np.array(state["sampler"]["visits"])
+    state = checkpoint.load(run / CHECKPOINT)["following"]
+    visits = state["sampler"]["visits"]
     assert sorted(state["arrived"]) == [*range(16)]
     assert visits.max() - visits.min() <= 1 + 2

@@ -1,14 +1,11 @@
-"""The layers and the network: sizes, invariances, masks."""
+"""The layers: sizes, invariances, masks, precision."""
 
 import pytest
 import torch
 from torch.nn import functional
 
-from photonfarm.trainer.dataset import Batch, Compact, fill
 from photonfarm.trainer.image_synthesis import ImageSynthesisLayer
 from photonfarm.trainer.light_transport import LightTransportLayer, ResidualBlock, masked_max
-from photonfarm.trainer.model import SceneFrame, build
-from photonfarm.trainer.settings import NetworkSettings
 
 
 def parameters(module: torch.nn.Module) -> int:
@@ -86,61 +83,21 @@ def test_an_image_keeps_its_size_and_may_be_negative(shape: tuple[int, int]) -> 
     assert image.min() < 0
 
 
-# ------------------------------------------------------------------------------------------------- the whole network
+def test_in_bfloat16_the_image_is_nearly_the_same_and_stays_float32() -> None:
+    torch.manual_seed(0)
+    plain, short = ImageSynthesisLayer(7, 8), ImageSynthesisLayer(7, 8, "bfloat16")
+    short.load_state_dict(plain.state_dict())
+    x = torch.randn(2, 7, 16, 16)
+    wanted, found = plain(x), short(x)
+    assert found.dtype == torch.float32
+    difference = (found - wanted).square().mean().sqrt() / wanted.std()
+    assert 0 < difference < 0.02
+    found.square().mean().backward()
+    assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in short.parameters())
 
 
-def batch_of(source, rows: tuple[int, ...]) -> Batch:
-    _, cloud = source.base()
-    batch = Batch.empty(len(rows), len(cloud.position), source.spec)
-    samples = [Compact.of(source.read(row), source.spec) for row in rows]
-    for place, sample in enumerate(samples):
-        fill(batch, place, sample, source.spec, cloud)
-    return batch.filled(rows, tuple(sample.unit for sample in samples))
-
-
-def network(source, seed: int = 0, **settings: object):
-    chosen = NetworkSettings(width=4, **settings)
-    return build(chosen, SceneFrame.of(source.spec, *source.base(), chosen), seed)
-
-
-def test_the_seed_makes_the_weights_and_leaves_torchs_generator_alone(make_source) -> None:
-    source = make_source(1)
-    before = torch.get_rng_state()
-    one, same, other = (network(source, seed).state_dict() for seed in (0, 0, 1))
-    assert torch.equal(torch.get_rng_state(), before)
-    assert all(torch.equal(one[name], same[name]) for name in one)
-    assert not torch.equal(one["descriptor"], other["descriptor"])
-
-
-def test_a_batch_gives_what_its_samples_give_one_by_one(make_source) -> None:
-    source = make_source(3)
-    made = network(source)
-    with torch.no_grad():
-        together = made(batch_of(source, (0, 1, 2)).inputs)
-        alone = torch.cat([made(batch_of(source, (row,)).inputs) for row in range(3)])
-    assert together.shape == (3, 16, 16, 3)
-    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
-
-
-def test_every_weight_of_the_network_gets_a_gradient(make_source) -> None:
-    source = make_source(4)
-    made = network(source)
-    for block in made.light_transport.blocks:
-        torch.nn.init.normal_(block.out.weight)
-    made(batch_of(source, (0, 1, 2, 3)).inputs).square().sum().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in made.parameters())
-
-
-def test_points_beyond_those_used_are_left_out(make_source) -> None:
-    source = make_source(1, points=256)
-    assert network(source, points=100).descriptor.shape == (100, 32)
-
-
-def test_the_network_without_points_does_not_look_at_them(make_source) -> None:
-    source = make_source(2)
-    made = network(source, architecture="cnn")
-    batch = batch_of(source, (0, 1))
-    with torch.no_grad():
-        image = made(batch.inputs)
-        batch.inputs.position.add_(1)
-        assert torch.equal(made(batch.inputs), image)
+def test_pointnet_takes_points_of_which_nothing_is_the_same_in_all_samples() -> None:
+    """As photons are: all of them differ."""
+    torch.manual_seed(0)
+    made, points, visible = LightTransportLayer(5, 0), torch.randn(2, 50, 5), torch.rand(2, 50) < 0.7
+    torch.testing.assert_close(made(points, torch.zeros(50, 0), visible), as_drawn(made, points, visible))

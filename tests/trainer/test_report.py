@@ -16,6 +16,7 @@ from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.loop import SETTINGS, train
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.waits import bottleneck
 
 
 def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, run, tmp_path) -> None:
@@ -23,20 +24,29 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     scene.plan(Request(modifications=10, views_per_modification=2, passes=2, seed=0), shard_rows=8)
     assert scene.jobs() == 5
 
+    begun = threading.Event()
+
     def fill() -> None:
+        assert begun.wait(60)
         for job in range(5):
+            time.sleep(0.4)
             commit(scene, job)
-            time.sleep(0.2)
 
     worker = threading.Thread(target=fill)
     worker.start()
-    outcome = train(StoreSource(store, scene.scene_id), tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0), run)
+    settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
+    outcome = train(StoreSource(store, scene.scene_id), settings, run, count=lambda *_: begun.set())
     worker.join()
     figures = write_report(store, run, tmp_path / "out")
 
     assert json.loads((tmp_path / "out/report.json").read_text()) == figures
     assert figures["samples_committed"] == figures["samples_planned"] == 40
     assert figures["train_steps"] == outcome.step == 40
+    waited_s, total_s = figures["seconds"]["wait_data"], sum(figures["seconds"].values())
+    assert 0.35 < waited_s < total_s, "of the first job, at least, there was nothing but to wait"
+    assert figures["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
+    assert figures["bottleneck"] == bottleneck(figures["waits"])
+    assert figures["samples_per_used"] == 1.0
     assert figures["samples_per_core_second"] == pytest.approx(40 / (5 * 0.5))
     assert figures["val_error_last"] < figures["val_error_first"]
     assert figures["noise_floor"] > 0
@@ -58,7 +68,7 @@ def test_the_samples_of_a_store_reach_the_trainer(scene, commit) -> None:
     assert commit(scene, 0)
     rows = source.refresh()
     assert (len(rows), source.planned()) == (8, 16)
-    one, other = source.read(int(rows[0])), source.read(int(rows[1]))
+    one, other = source.read_batch(rows[:2].tolist())
     assert one.radiance.shape == (2, 16, 16, 3)
     assert not np.array_equal(one.radiance[0], one.radiance[1])
     keys = source.view_keys(rows.tolist())

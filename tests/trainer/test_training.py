@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -11,25 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.trainer import checkpoint, metrics_log, service
-from photonfarm.trainer.figures import evaluate
+from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.trainer import checkpoint, loop, metrics_log, service
+from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.device import described, usable_device
+from photonfarm.trainer.figures import run_figures
 from photonfarm.trainer.following import Growth
+from photonfarm.trainer.learner import DivergedError
 from photonfarm.trainer.loop import CHECKPOINT, METRICS, read_settings, stop_on_signals, train
 from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import NetworkSettings, small
-
-
-class KilledError(Exception):
-    """Stands for a kill between two checkpoints: nothing runs after it that would tidy up."""
-
-
-def kill_at(step: int):
-    def listen(record: dict[str, Any]) -> None:
-        if record["kind"] == "validation" and record["step"] == step:
-            raise KilledError
-
-    return listen
 
 
 def weights(run) -> dict[str, torch.Tensor]:
@@ -41,48 +33,40 @@ def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
 
 
 def test_the_held_out_error_falls_fivefold_and_below_the_mean_colours(make_source, run) -> None:
-    source = make_source(256, size=32, points=1024, noise=0.7)
-    how = {"batch": 4, "epoch_samples": 50_000, "max_steps": 700, "validate_every": 700, "poll_seconds": 0.05}
-    settings = small(network=NetworkSettings(width=8), **how)
-    outcome = train(source, settings, run)
-    found = evaluate(make_source(256, size=32, points=1024, noise=0.7), settings, run)
+    how = {"batch": 4, "epoch_samples": 50_000, "learning_rate": 2e-3, "poll_seconds": 0.05}
+    settings = small(network=NetworkSettings(width=8), max_steps=450, validate_every=450, **how)
+    outcome = train(make_source(256, noise=0.7), settings, run)
+    found = run_figures(make_source(256, noise=0.7), settings, run)
     assert outcome.last_error == pytest.approx(found.last.error.mean, rel=1e-5)
     assert found.first.error.mean > 5 * found.last.error.mean
     assert found.mean_colour.error.mean > 2 * found.last.error.mean
     assert found.last.error.count >= 16
 
 
-def test_a_killed_run_goes_on_to_the_same_weights_to_the_bit(make_source, tiny, run, tmp_path) -> None:
-    train(make_source(24), tiny(), run)
-    broken = tmp_path / "broken"
-    with pytest.raises(KilledError):
-        train(make_source(24), tiny(), broken, listen=kill_at(10))
-    assert checkpoint.load(broken / CHECKPOINT)["step"] == 8
-    train(make_source(24), tiny(), broken)
-    assert same(weights(run), weights(broken))
-    steps = [[(r["kind"], r["step"]) for r in metrics_log.read(path / METRICS)] for path in (run, broken)]
-    assert steps[0] == steps[1]
-
-
-@pytest.mark.parametrize("per_look", [1, 2, 3, 6])
-def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_even_if_killed(
-    make_source, tiny, run, tmp_path, per_look: int
+def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_and_another_growth_is_another_run(
+    make_source, tiny, run, tmp_path
 ) -> None:
-    growing = {"replay_ratio": 1.0, "replay_buffer": 0, "minimum_samples": 8, "poll_seconds": 0.1 * per_look / 6}
-    settings = tiny(max_steps=20, **growing)
-    train(make_source(60, per_look=per_look), settings, run)
-    state = checkpoint.load(run / CHECKPOINT)["following"]
-    script = Growth(state["arrived"], [tuple(entry) for entry in state["growth"]])
-    assert len(script.log) > 3, "rows arrived between steps"
+    """12 rows are there at first, and 6 more after each step; what was drawn by then allows no more without them."""
+    source, allowed = make_source(60), [12]
+    release = source.refresh
 
-    again = tmp_path / "again"
-    with pytest.raises(KilledError):
-        train(make_source(60), settings, again, script=script, listen=kill_at(10))
-    train(make_source(60), settings, again, script=script)
-    assert same(weights(run), weights(again))
-    other = tmp_path / "other"
-    train(make_source(60), settings, other)
-    assert not same(weights(run), weights(other)), "another growth is another run"
+    def refresh() -> Any:
+        source._per_look = max(allowed[0] - source._released, 0)
+        return release()
+
+    def count(draws: int, _samples: int) -> None:
+        allowed[0] = 12 + 2 * draws
+
+    source.refresh = refresh
+    rare = {"validate_every": 100, "checkpoint_every": 100}
+    settings = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, **rare)
+    train(source, settings, run, count=count)
+    script = Growth.of(checkpoint.load(run / CHECKPOINT)["following"])
+    assert len(script.log) >= 3
+    train(make_source(60), settings, tmp_path / "again", script=script)
+    assert same(weights(run), weights(tmp_path / "again"))
+    train(make_source(60), settings, tmp_path / "other")
+    assert not same(weights(run), weights(tmp_path / "other"))
 
 
 def test_other_seeds_are_other_runs(make_source, tiny, run, tmp_path) -> None:
@@ -92,35 +76,47 @@ def test_other_seeds_are_other_runs(make_source, tiny, run, tmp_path) -> None:
 
 
 def test_a_store_that_is_empty_at_first_is_trained_on_as_it_grows(make_source, tiny, run) -> None:
-    source = make_source(30, per_look=0)
-    looks = 0
+    """Nothing arrives until training has begun, and then for 0.4 s, which it can only wait through."""
+    source, begun = make_source(30, per_look=0), threading.Event()
     release = source.refresh
 
     def refresh() -> Any:
-        nonlocal looks
-        looks += 1
-        source._per_look = 0 if looks < 5 else 3
+        if begun.is_set() and not source._per_look:
+            time.sleep(0.4)
+            source._per_look = 3
         return release()
 
     source.refresh = refresh
-    outcome = train(source, tiny(replay_ratio=1.0, replay_buffer=0), run)
+    settings = tiny(replay_ratio=1.0, replay_buffer=0)
+    outcome = train(source, settings, run, count=lambda *_: begun.set())
     records = metrics_log.read(run / METRICS)
     assert outcome.step == 12
     assert records[0]["kind"] == "validation"
     assert records[0]["step"] == 0
     assert records[0]["samples"] < records[-1]["samples"] == 30
-    assert records[-1]["seconds"]["wait_data"] > 0.02
+    assert records[0]["seconds"]["wait_data"] > 0.35
+    assert records[0]["waits"]["samples"] == pytest.approx(share_of("wait_data", records[0]["seconds"]), abs=0.05)
 
 
-def test_draws_stay_below_the_replay_ratio_while_more_is_to_come(make_source, tiny, run) -> None:
-    source = make_source(1000, per_look=24)
-    source.planned = lambda: 2000
-    settings = tiny(max_steps=1000, max_seconds=3.0, replay_ratio=0.5, replay_buffer=6, poll_seconds=0.5)
-    outcome = train(source, settings, run)
-    following = checkpoint.load(run / CHECKPOINT)["following"]
-    arrived = len(following["sampler"]["rows"])
-    assert outcome.reason == "seconds"
-    assert 0.5 * arrived + 6 - 3 < following["drawn"] * 3 <= 0.5 * arrived + 6
+def share_of(kind: str, seconds: dict[str, float]) -> float:
+    return seconds[kind] / sum(seconds.values())
+
+
+def test_draws_come_up_to_the_replay_ratio_and_no_further_while_more_is_to_come(make_scarce, tiny, run) -> None:
+    source, stop = make_scarce(1000, lot=24, patience=40), threading.Event()
+    release = source.refresh
+
+    def refresh() -> Any:
+        if len(source.stalls) == 4:
+            stop.set()
+        return release()
+
+    source.refresh = refresh
+    settings = tiny(max_steps=1000, replay_ratio=0.5, replay_buffer=6, poll_seconds=0.02, validate_every=1000)
+    assert train(source, settings, run, stop=stop, count=source.count).reason == "stopped"
+    for lots, draws in enumerate(source.stalls[1:4], 1):
+        training = rows_held_out(source, range(24 * lots), settings.hold_out).count(False)
+        assert 0.5 * training + 6 - 3 < draws <= 0.5 * training + 6
 
 
 def test_validation_comes_first_then_regularly_and_at_the_end(make_source, tiny, run) -> None:
@@ -134,9 +130,10 @@ def test_validation_comes_first_then_regularly_and_at_the_end(make_source, tiny,
 def test_held_out_rows_are_never_trained_on(make_source, tiny, run) -> None:
     train(make_source(60, views=3), tiny(), run)
     following = checkpoint.load(run / CHECKPOINT)["following"]
-    assert len(following["held_out"]) >= 3
-    assert not set(following["held_out"]) & set(following["sampler"]["rows"])
-    assert set(following["held_out"]) | set(following["sampler"]["rows"]) == set(range(60))
+    held_out, trained_on = set(following["held_out"].tolist()), set(following["sampler"]["rows"].tolist())
+    assert len(held_out) >= 3
+    assert not held_out & trained_on
+    assert held_out | trained_on == set(range(60))
 
 
 @pytest.mark.parametrize("name", [signal.SIGTERM, signal.SIGINT])
@@ -171,17 +168,55 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(make_so
         return sample
 
     source.read = read
-    with pytest.raises(IncompleteError, match="step 4: the loss is nan on rows"):
+    with pytest.raises(DivergedError, match="step 4: the loss is nan on rows") as diverged:
         train(source, tiny(), run)
+    assert diverged.value.exit_code == 8, "apart from work that a new start would finish"
     assert same(before, weights(run))
 
 
-@pytest.mark.parametrize("change", [{"seed": 2}, {"batch": 2}, {"network": NetworkSettings(width=5)}])
-def test_a_run_is_not_continued_as_another_one(make_source, tiny, run, change: dict[str, Any]) -> None:
+def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:
     train(make_source(24), tiny(max_steps=2), run)
-    with pytest.raises(SpecError, match=r"checkpoint\.pt: was trained with .* use another run directory"):
-        train(make_source(24), tiny(**change), run)
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"seed": 2}, "seed = 0, and 2 is asked for now"),
+        ({"batch": 2}, "batch = 3, and 2 is asked for now"),
+        ({"loss": "relative"}, "loss = 'linear', and 'relative' is asked for now"),
+        ({"optimiser": "rmsprop"}, "optimiser = 'adam', and 'rmsprop' is asked for now"),
+        ({"hold_out": 0.5}, "hold_out = 0.25, and 0.5 is asked for now"),
+        ({"network": {"width": 4, "demodulation": 0.5}}, "network.demodulation = None, and 0.5 is asked for now"),
+        (
+            {"network": {"width": 5}, "loss": "relative", "max_steps": 3},
+            "network.width = 4, and 5 is asked for now; loss = 'linear', and 'relative' is asked for now",
+        ),
+    ]
+    for change, found in changes:
+        whole = rf"checkpoint\.safetensors: was trained with {re.escape(found)}; use another run directory"
+        with pytest.raises(SpecError, match=whole):
+            train(make_source(24), tiny(**change), run)
     assert read_settings(run) == tiny(max_steps=2)
+
+
+def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
+    train(make_source(24), tiny(max_steps=5), run, listen=service._tell)
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, listen=service._tell)
+    changed = [record for record in metrics_log.read(run / METRICS) if record["kind"] == "changes"]
+    wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
+    assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]
+    said = "goes on from step 5 with learning_rate = 0.001 (before 0.0005), max_steps = 7 (before 5)"
+    assert capsys.readouterr().err.splitlines().count(said) == 1
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run)
+    assert [r["kind"] for r in metrics_log.read(run / METRICS)].count("changes") == 1
+
+
+def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
+    run.mkdir()
+    with pytest.raises(SpecError, match=rf"{run}: is not a training run: it holds no settings\.json$"):
+        read_settings(run)
+    (run / "settings.json").write_text("{")
+    with pytest.raises(SpecError, match=r"settings\.json: is not the JSON that a training run leaves there"):
+        read_settings(run)
+    (run / "settings.json").write_text('{"network": {"widht": 8}, "batch": 0}')
+    with pytest.raises(SpecError, match=r"network\.widht: unknown key; nearest: width.*; batch = 0: Input should be"):
+        read_settings(run)
 
 
 def test_a_hold_out_that_leaves_nothing_to_validate_on_is_refused(make_source, tiny, run) -> None:
@@ -243,13 +278,16 @@ def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path, caps
     began = time.monotonic()
     service.run(None, tmp_path / "store", run, "small", {"max_seconds": 0.3})
     assert time.monotonic() - began < 5
-    assert "no scene to train on has come" in capsys.readouterr().err
+    first, *said = capsys.readouterr().err.splitlines()
+    assert first == f"training on {described(usable_device('auto'))}"
+    assert any("no scene to train on has come" in line for line in said)
 
 
-def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run) -> None:
-    train(make_source(24), tiny(max_steps=50, batch=2, epoch_samples=20), run)
+def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run, monkeypatch) -> None:
+    monkeypatch.setattr(loop, "LOG_EVERY", 10)
+    train(make_source(24), tiny(max_steps=10, batch=2, epoch_samples=4), run)
     (record,) = [r for r in metrics_log.read(run / METRICS) if r["kind"] == "train"]
-    assert record["rate"] == pytest.approx(5e-4 * 0.99**4)  # steps 40…49 draw samples 80…99: epoch 4
+    assert record["rate"] == pytest.approx(5e-4 * 0.99**4)  # steps 0…9 draw samples 0…19: at last epoch 4
 
 
 def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(make_source, tiny, run) -> None:
@@ -266,5 +304,5 @@ def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(make_source, tiny, ru
 )
 def test_bytes_that_are_no_checkpoint_are_refused(tmp_path, content: bytes) -> None:
     (tmp_path / CHECKPOINT).write_bytes(content)
-    with pytest.raises(StoreError, match=r"checkpoint\.pt: (is not a readable checkpoint|has format None)"):
+    with pytest.raises(StoreError, match=r"checkpoint\.safetensors: (is not a readable checkpoint|has format None)"):
         checkpoint.load(tmp_path / CHECKPOINT)

@@ -1,40 +1,11 @@
-"""Noisy targets: the gradient they give, and the errors measured against them. Seeds are fixed; limits are 3 σ."""
+"""Noisy targets: where they lead, and the errors measured against them. Seeds are fixed; limits are 3 σ."""
 
 import numpy as np
 import pytest
 import torch
 
 from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
-from photonfarm.trainer.dataset import Batch, Compact, fill
 from photonfarm.trainer.losses import LOSSES, linear_loss
-from photonfarm.trainer.model import SceneFrame, build
-from photonfarm.trainer.settings import NetworkSettings
-
-
-@pytest.mark.parametrize("loss", sorted(LOSSES))
-def test_averaged_over_noisy_targets_the_gradient_is_the_clean_one(make_source, loss: str) -> None:
-    """Lemma 1 [supplement 3.2], along 16 random directions in the space of all weights."""
-    source = make_source(1)
-    settings = NetworkSettings(width=4)
-    network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
-    batch = Batch.empty(1, 256, source.spec)
-    fill(batch, 0, Compact.of(source.read(0), source.spec), source.spec, source.base()[1])
-    weights = list(network.parameters())
-    generator = torch.Generator().manual_seed(0)
-    directions = [[torch.randn(p.shape, generator=generator) for p in weights] for _ in range(16)]
-
-    def along(target: np.ndarray) -> list[float]:
-        value = LOSSES[loss](network(batch.inputs), torch.from_numpy(target)[None])
-        gradient = torch.autograd.grad(value, weights)
-        return [sum(float((g * d).sum()) for g, d in zip(gradient, way, strict=True)) for way in directions]
-
-    clean = source.clean(0)
-    wanted = along(np.stack([clean, clean]))
-    rng = np.random.default_rng(1)
-    found = np.array([along((clean * rng.gamma(0.5, 2, (2, *clean.shape))).astype(np.float32)) for _ in range(200)])
-    z = (found.mean(axis=0) - wanted) / (found.std(axis=0, ddof=1) / np.sqrt(len(found)))
-    assert np.abs(z).max() < 3
-    assert np.abs(found.std(axis=0) / wanted).max() > 0.05, "the noise is large enough for a bias to show"
 
 
 def test_the_relative_loss_is_least_at_the_mean_of_the_noisy_targets() -> None:

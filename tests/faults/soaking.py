@@ -6,7 +6,6 @@ is the one that was seen first.
 """
 
 import contextlib
-import importlib.util
 import os
 import random
 import signal
@@ -18,18 +17,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import analytic_scene as analytic
 import redis
+import soak_evidence as evidence
 
 from photonfarm.renderer.worker_settings import GRACE_S
 from photonfarm.shared.plan import Request
 from photonfarm.shared.queue import connect, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
-
-_spec = importlib.util.spec_from_file_location("soak_evidence", Path(__file__).with_name("soak_evidence.py"))
-evidence = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(evidence)
-analytic = evidence.analytic
 
 HEARTBEAT_TTL_S = 2.0
 STOPPED_S = 20.0  # at most, where nobody takes the job meanwhile

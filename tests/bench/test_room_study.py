@@ -1,0 +1,200 @@
+"""What the studies on `room` are made of: samples of several spp, errors against noisy references, intervals."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import noise_budget
+from noise_budget import Arm, slices_of
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.store import Store
+from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.store_source import StoreSource
+from room_study import Errors, References
+from store_contents import Pool, commit
+
+SIZE, SLOTS, BUDGET = 8, 8, 16
+Root = tuple[Path, str]
+
+
+def small_spec() -> SceneSpec:
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit}
+    described = {
+        "name": "random", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
+        "view": {"origin": unit, "look_at": unit}, "film": {"width": SIZE, "height": SIZE},
+        "photons": {"paths": 4, "depth": 2}, "transport": {"half_spp": noise_budget.HALF_SPP},
+    }  # fmt: skip
+    return parse_spec(described, where="test")
+
+
+def pool() -> Pool:
+    rng = np.random.default_rng(1)
+
+    def random(*shape: int) -> Any:
+        return rng.random(shape, np.float32)
+
+    halves = [random(2, SIZE, SIZE, 3) for _ in range(7)]
+    buffers = [ViewBuffers(random(SIZE, SIZE), *random(2, SIZE, SIZE, 3))]
+    position, direction, normal, power = random(4, SLOTS, 3)
+    photons = [Photons(position, direction, normal, power, np.zeros(SLOTS, np.int8))]
+    return Pool(halves, buffers, [Visibility(random(16) < 0.5, random(SLOTS) < 0.5)], photons)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
+    """Samples of a budget of 16 spp for two seeds: passes of 2 spp, 8 of the first views, then 2, then 1."""
+    spec, store = small_spec(), Store(tmp_path_factory.mktemp("study") / "store", create=True)
+    scene = store.add(spec)
+    for modifications, passes in ((8, 8), (20, 2), (40, 1)):
+        scene.plan(Request(modifications=modifications, passes=passes), shard_rows=16)
+    for job in scene.missing_jobs():
+        commit(scene, job, pool())
+    return Path(store.root), spec.scene_id
+
+
+def configurations(arm: Arm) -> set[bytes]:
+    return set(arm.modification_keys(arm.rows))
+
+
+@pytest.mark.parametrize("spp", [4, 16])
+def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
+    arm, source = Arm(*root, spp, BUDGET), StoreSource(*root)
+    complete = source.refresh().tolist()
+    (key,) = arm.view_keys(arm.rows[:1])
+    passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
+    (sample,) = arm.read_batch(arm.rows[:1])
+
+    read = source.read_batch(passes)
+    expected = np.mean([one.radiance.astype(np.float64) * one.scale for one in read], axis=0)
+    assert len(read) == spp // 2
+    np.testing.assert_allclose(sample.radiance.astype(np.float64) * sample.scale, expected, rtol=1e-6)
+
+
+def test_a_sample_of_one_spp_is_half_a_twice(root: Root) -> None:
+    arm, source = Arm(*root, 1, BUDGET), StoreSource(*root)
+    source.refresh()
+    (sample,), (read,) = arm.read_batch(arm.rows[:1]), source.read_batch(arm.rows[:1])
+    half_a = read.radiance[0].astype(np.float32) * read.scale
+
+    np.testing.assert_array_equal(sample.radiance * sample.scale, np.stack([half_a, half_a]))
+    assert np.any(read.radiance[0] != read.radiance[1])
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root: Root, number: int) -> None:
+    arms = [Arm(*root, spp, BUDGET, (number % slices_of(spp, 2), slices_of(spp, 2))) for spp in (1, 4, 16)]
+    noisy, medium, clean = map(configurations, arms)
+
+    assert [len(noisy), len(medium), len(clean)] == [16, 4, 1]
+    assert clean < medium < noisy
+
+
+def test_slices_share_no_configuration(root: Root) -> None:
+    first, second = (configurations(Arm(*root, 4, BUDGET, (number, 2))) for number in (0, 1))
+    assert len(first) == len(second) == 4
+    assert not first & second
+
+
+def test_an_arm_of_more_samples_than_there_are_is_refused(root: Root) -> None:
+    with pytest.raises(ValueError, match="views have 8 passes, and 64 are needed"):
+        Arm(*root, 16, 64 * 16)
+
+
+# ------------------------------------------------------------------------------------------------------------- errors
+
+
+def noisy_references(noise: float) -> tuple[References, F32]:
+    """Sixteen views of halves with normal noise, and the clean images, in the middle of what a display shows."""
+    rng = np.random.default_rng(2)
+    clean = rng.uniform(0.4, 0.6, (16, 32, 32, 3))
+    halves = clean[:, None] + rng.normal(0, noise, (16, 2, 32, 32, 3))
+    units = tuple(bytes([number]) * 16 for number in range(16))
+    return References(tuple(range(16)), units, halves.astype(np.float32), 64), clean.astype(np.float32)
+
+
+def shown(image: F32) -> NDArray[np.float64]:
+    """What a display shows of values between 0 and 1."""
+    values: NDArray[np.float64] = image.astype(np.float64) ** (1 / 2.2)
+    return values
+
+
+def test_noise_is_taken_out_of_shown_errors() -> None:
+    references, clean = noisy_references(0.01)
+    made = clean + np.float32(0.02)
+    true, against_mean = (np.mean((shown(made) - shown(of)) ** 2) for of in (clean, references.mean))
+
+    assert references.shown_errors(made).mean() == pytest.approx(true, rel=0.02)
+    assert against_mean > 1.1 * true
+
+
+def test_what_the_displays_curve_makes_of_noise_stays() -> None:
+    references, clean = noisy_references(0.03)
+    made, power = clean + np.float32(0.02), 1 / 2.2
+    shift = power * (power - 1) / 2 * clean.astype(np.float64) ** (power - 2) * 0.03**2  # δ, to second order
+    apart = shown(made) - shown(clean)
+
+    found = references.shown_errors(made)
+    expected, reach = np.mean((apart - shift) ** 2), 4 * found.std(ddof=1) / math.sqrt(len(found))  # 4 standard errors
+    assert abs(found.mean() - expected) < reach
+    assert abs(found.mean() - np.mean(apart**2)) > reach
+
+
+def test_a_pixels_noise_falls_with_the_root_of_its_samples() -> None:
+    references, _ = noisy_references(0.03)
+    assert references.noise(32) == pytest.approx(0.03, rel=0.02)  # of one half; 98 304 of its values are known
+    assert references.noise(2) == pytest.approx(4 * references.noise(32))
+
+
+# ---------------------------------------------------------------------------------------------------------- intervals
+
+UNITS = (b"a" * 16, b"a" * 16, b"b" * 16, b"c" * 16)
+"""Four views of three configurations."""
+
+
+def errors(*seeds: list[float]) -> Errors:
+    values: NDArray[np.float64] = np.array(seeds)
+    return Errors(values, UNITS)
+
+
+def test_one_seed_has_the_error_over_configurations_alone() -> None:
+    found = errors([1.0, 3.0, 4.0, 6.0])  # of configurations: 2, 4, 6
+    low, high = found.interval()
+
+    assert found.estimate().mean == pytest.approx(4)
+    assert found.estimate().standard_error == pytest.approx(2 / math.sqrt(3))
+    assert high - 4 == pytest.approx(4 - low) == pytest.approx(t_975(2) * 2 / math.sqrt(3))
+
+
+def test_the_variance_of_seeds_is_added_to_that_of_configurations() -> None:
+    found = errors([1.0, 3.0, 4.0, 6.0], [3.0, 5.0, 6.0, 8.0])  # means 4 and 6: var / S = 2 / 2
+    low, high = found.interval()
+
+    assert found.estimate().mean == pytest.approx(5)
+    assert found.estimate().standard_error == pytest.approx(math.sqrt(4 / 3 + 1))
+    freedom = (4 / 3 + 1) ** 2 / ((4 / 3) ** 2 / 2 + 1**2 / 1)  # 2.88
+    assert high - low == pytest.approx(2 * t_975(int(freedom)) * math.sqrt(4 / 3 + 1))
+
+
+def test_seeds_alone_leave_as_little_freedom_as_there_are_seeds() -> None:
+    low, high = errors([2.0] * 4, [4.0] * 4).interval()
+    assert high - low == pytest.approx(2 * t_975(1))
+
+
+def test_what_all_kinds_of_networks_share_drops_out_of_their_differences() -> None:
+    hard = np.array([[1.0, 3.0, 4.0, 6.0], [3.0, 5.0, 6.0, 8.0]])
+    less = Errors(hard + 0.5, UNITS).less(Errors(hard, UNITS))
+    assert less.interval() == pytest.approx((0.5, 0.5))
+
+
+def test_one_configuration_has_no_interval() -> None:
+    with pytest.raises(ValueError, match="two configurations"):
+        Errors(np.ones((2, 1)), UNITS[:1]).interval()

@@ -1,0 +1,57 @@
+"""What tests of several packages start or render."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import analytic_scene
+import pytest
+import redis
+import s3_server
+
+from photonfarm.shared.queue import connect
+from photonfarm.shared.redis_server import EmbeddedRedis
+
+
+@pytest.fixture(scope="session")
+def analytic() -> ModuleType:
+    """The module `analytic_scene`."""
+    return analytic_scene
+
+
+@pytest.fixture
+def redis_server(tmp_path: Path) -> Iterator[EmbeddedRedis]:
+    """A server of its own for each test, which may do with it what it likes."""
+    with EmbeddedRedis(tmp_path / "redis") as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def common_redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedRedis]:
+    """A server for tests that change nothing but its keys."""
+    with EmbeddedRedis(tmp_path_factory.mktemp("redis")) as server:
+        yield server
+
+
+@pytest.fixture
+def connection(common_redis: EmbeddedRedis) -> Iterator[redis.Redis]:
+    """To a Redis that is empty."""
+    with connect(common_redis.url) as connected:
+        connected.flushall()
+        yield connected
+
+
+@pytest.fixture(scope="session")
+def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Of an S3 server."""
+    with s3_server.running(tmp_path_factory.mktemp("s3")) as found:
+        yield found
+
+
+@pytest.fixture
+def url(port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A place of its own for each test, in a bucket."""
+    for name, value in s3_server.environment(port).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PHOTONFARM_CACHE", str(tmp_path / "cache"))
+    return f"s3://photonfarm/{tmp_path.name}"

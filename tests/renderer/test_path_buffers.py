@@ -1,0 +1,84 @@
+"""`photonfarm buffers`: the same numbers as in the store, for views that are in no store."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.path_buffers import frames_of
+from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.shared.cli import umbrella
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.frames import Frames
+from photonfarm.shared.modification import rest
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import arrays_of
+from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.store import SceneReader, Store
+
+
+@pytest.fixture
+def spec(small: Callable[..., SceneSpec]) -> SceneSpec:
+    return small(load_spec("room"))
+
+
+def test_what_views_show_is_what_the_store_has_of_the_same_views(tmp_path: Path, spec: SceneSpec) -> None:
+    """The store rounds it to the types that it declares. Each view is of a job of its own, and the first has traced
+    the photons that the second sees.
+    """
+    store = Store(tmp_path / "store", create=True)
+    scene_id = store.plan(spec, Request(modifications=1, views_per_modification=2), shard_rows=1).scene_id
+    for job in (1, 0):
+        ShardRenderer(store, worker="test").render(scene_id, job)
+    reader = SceneReader(store.root, scene_id)
+    samples = [reader.read(int(row)) for row in reader.refresh()]
+    frames = frames_of(spec, samples[0].modification, [sample.view for sample in samples])
+    assert frames.scene_id == scene_id
+    stored_types = {name: array.dtype for name, array in reader.read_batch([0]).buffers.items()}
+    for place, sample in enumerate(samples):
+        for name, stored in arrays_of(sample.visibility).items():
+            np.testing.assert_array_equal(getattr(frames.visibility(place), name), stored, err_msg=name)
+            assert 0.02 < stored.mean() < 0.5
+        for name, stored in arrays_of(sample.buffers).items():
+            made = getattr(frames.buffers(place), name)
+            assert np.array_equal(made.astype(stored_types[name]).astype(np.float32), stored), name
+    for name, stored in arrays_of(reader.read_photons(0)).items():
+        np.testing.assert_allclose(getattr(frames.photons, name), stored, rtol=2e-3, atol=1e-3, err_msg=name)
+
+
+def test_the_verb_writes_a_path_and_leaves_the_store_as_it_is(tmp_path: Path, spec: SceneSpec) -> None:
+    store = Store(tmp_path / "store", create=True)
+    store.add(spec)
+    before = sorted(tmp_path.rglob("*"))
+    place = ["buffers", "--store", str(store.root), "--scene", "room", "--out", str(tmp_path / "out.npz")]
+    result = CliRunner().invoke(umbrella, [*place, "--orbit", "3"], catch_exceptions=False)
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'out.npz'}: 3 frames\n")
+    frames = Frames.read(tmp_path / "out.npz")
+    assert frames.depth.shape == (3, spec.film.height, spec.film.width)
+    assert frames.point_seen.shape == (3, spec.points)
+    assert frames.photon_seen.shape == (3, spec.photons.slots)
+    np.testing.assert_array_equal(frames.modification.vector, rest(spec).vector)
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, tmp_path / "out.npz"])
+    for arguments in ([], ["--orbit", "3", "--camera-path", "file"]):
+        assert (
+            "one of --camera-path and --orbit is required" in CliRunner().invoke(umbrella, [*place, *arguments]).output
+        )
+    result = CliRunner().invoke(umbrella, [*place, "--orbit", "3", "--modification", "0 0 0 1"])
+    assert isinstance(result.exception, SpecError)
+
+
+def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: LoadedScene, somewhere) -> None:
+    class Broken:
+        def apply(self, _) -> None: ...
+
+        def photons(self, _) -> None: ...
+
+        def buffers(self, view):
+            return replace(room.buffers(view), depth=np.full((16, 24), np.nan, np.float32))
+
+    with pytest.raises(IncompleteError, match="depth of these views came out non-finite"):
+        frames_of(spec, rest(spec), [somewhere], load=lambda _: Broken())

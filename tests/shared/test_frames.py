@@ -1,0 +1,75 @@
+"""The buffers of a camera path as a file, and configurations as users name them."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.configuration import named_configuration
+from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.frames import Frames
+from photonfarm.shared.modification import Modification, rest, sample_modification
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import Photons
+from photonfarm.shared.scene import load_spec
+from photonfarm.shared.store import Store
+from photonfarm.shared.view import View
+
+
+def made(*, photons: bool) -> Frames:
+    rng = np.random.default_rng(0)
+    values = [rng.random((5, 3), np.float32) for _ in range(4)]
+    traced = Photons(*values, np.array([0, 1, -1, 0, 1], np.int8)) if photons else None
+    images = [rng.random((2, 4, 6, *more), np.float32) for more in ((), (3,), (3,))]
+    moved = Modification(rng.random((3, 3), np.float32), np.array([True, False, True]))
+    seen = [rng.random((2, count)) < 0.5 for count in (7, 5 if photons else 0)]
+    return Frames("abc", moved, tuple(View(*rng.random((2, 3), np.float32)) for _ in range(2)), *images, *seen, traced)
+
+
+@pytest.mark.parametrize("photons", [True, False])
+def test_frames_come_back_as_they_were_written(tmp_path: Path, photons: bool) -> None:
+    frames = made(photons=photons)
+    frames.write(tmp_path / "new/frames.npz")
+    again = Frames.read(tmp_path / "new/frames.npz")
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["frames.npz"]
+    assert (again.scene_id, len(again)) == ("abc", 2)
+    np.testing.assert_array_equal(again.modification.vector, frames.modification.vector)
+    for view, other in zip(again.views, frames.views, strict=True):
+        np.testing.assert_array_equal(view.vector, other.vector)
+    for name in ("depth", "albedo", "normal"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(frames, name))
+        np.testing.assert_array_equal(getattr(again.buffers(1), name), getattr(frames, name)[1])
+    for name, seen in (("points", frames.point_seen), ("photons", frames.photon_seen)):
+        np.testing.assert_array_equal(getattr(again.visibility(1), name), seen[1])
+        assert getattr(again.visibility(1), name).dtype == np.bool_
+    assert (again.photons is None) == (not photons)
+    for field in fields(Photons) if photons else ():
+        np.testing.assert_array_equal(getattr(again.photons, field.name), getattr(frames.photons, field.name))
+        assert getattr(again.photons, field.name).dtype == getattr(frames.photons, field.name).dtype
+
+
+def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.npz").write_text("no archive")
+    np.savez(tmp_path / "other.npz", depth=np.zeros(3))
+    made(photons=False).write(tmp_path / "cut.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:-40])
+    for name in ("text", "other", "cut", "missing"):
+        with pytest.raises(StoreError, match=f"{name}.npz: holds no buffers that `photonfarm buffers` wrote"):
+            Frames.read(tmp_path / f"{name}.npz")
+    with pytest.raises(StoreError, match="cannot write the buffers"):
+        made(photons=False).write(tmp_path / "text.npz" / "below.npz")
+
+
+def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_rest(tmp_path: Path) -> None:
+    store, spec = Store(tmp_path / "store", create=True), load_spec("room")
+    scene = store.scene(store.plan(spec, Request(modifications=3), shard_rows=8).scene_id)
+    planned = sample_modification(spec, 0, 1)
+    key = planned.key(spec.scene_id).hex()
+    vector = " ".join(map(str, planned.vector.ravel()))
+    for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
+        np.testing.assert_array_equal(named_configuration(store, scene, text).vector, wanted.vector)
+    with pytest.raises(SpecError, match="has 4 numbers; 44 are required, 4 for each of the 11 movable groups of room"):
+        named_configuration(store, scene, "0 0 0 1")
+    with pytest.raises(StoreError, match="has a configuration of this key"):
+        named_configuration(store, scene, "0" * 32)

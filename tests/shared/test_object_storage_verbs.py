@@ -1,0 +1,55 @@
+"""The command line takes the URL of a store in a bucket; the library for it is loaded there alone."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from photonfarm.shared.cli import umbrella
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.store.storage import open_storage
+
+
+def test_verbs_take_a_url_and_the_plan_they_write_is_found_again(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*arguments: str) -> Any:
+        result = CliRunner().invoke(umbrella, [*arguments, "--json"], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)
+
+    request = ["submit", "cornell", "--modifications", "2", "--views", "2", "--store", url]
+    assert run(*request, "--dry-run")["planned"] == 4
+    assert run(*request, "--no-queue")["planned"] == 4
+    assert run(*request, "--dry-run")["planned"] == 0
+    monkeypatch.setenv("PHOTONFARM_STORE", url)
+    assert run("status", "--redis", "redis://127.0.0.1:1/0")["scenes"][0]["samples_planned"] == 4
+
+
+@pytest.mark.parametrize("wrong", ["ftp://bucket/store", "s3://"])
+def test_a_url_that_is_not_a_buckets_is_wrong_usage(wrong: str) -> None:
+    result = CliRunner().invoke(umbrella, ["status", "--store", wrong])
+    assert result.exit_code == 2
+    assert "neither a folder nor s3://" in result.stderr
+
+
+def test_without_the_library_a_url_is_refused_with_what_to_install() -> None:
+    code = """
+import sys
+sys.modules["obstore"] = None
+from photonfarm.shared.cli import main
+main(["status", "--store", "s3://bucket/store"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == StoreError.exit_code
+    assert "needs the package obstore" in done.stderr
+    assert "photonfarm-shared[objects]" in done.stderr
+
+
+def test_a_folders_store_does_not_load_the_library(tmp_path: Path) -> None:
+    code = "import sys; from photonfarm.shared.store import Store; Store(sys.argv[1], create=True); " \
+        "assert 'obstore' not in sys.modules"  # fmt: skip
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")], check=True)
+    assert open_storage(tmp_path / "store").exists("photonfarm.json")

@@ -1,0 +1,190 @@
+"""Stores that are missing, damaged, full or of another version: one sentence, and nothing is lost."""
+
+import errno
+import os
+import resource
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import store_samples as samples
+
+from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store", create=True)
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """Three jobs of 4, 4 and 2 samples: 5 modifications, 2 views each."""
+    request = Request(modifications=5, views_per_modification=2)
+    return store.scene(store.plan(samples.small_spec(), request, shard_rows=4).scene_id)
+
+
+def reader_of(scene: SceneStore) -> SceneReader:
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    reader.refresh()
+    return reader
+
+
+def test_a_missing_store_and_a_folder_that_is_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="is not a store"):
+        Store(tmp_path)
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(StoreError, match=r"neither empty nor a store .*thesis\.tex"):
+        Store(tmp_path, create=True)
+
+
+def test_a_store_of_another_version_is_refused_and_says_which(store: Store) -> None:
+    (store.root / "photonfarm.json").write_text('{"format": "photonfarm store", "version": 99}')
+    with pytest.raises(StoreError, match=r"version 99; this program reads and writes .* version 3"):
+        Store(store.root, create=True)
+
+
+def test_a_store_under_a_file_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot make a store here: Not a directory"):
+        Store(tmp_path / "file" / "store", create=True)
+
+
+def test_a_disk_that_is_full_in_the_middle_is_a_store_error_and_leaves_no_trace(scene: SceneStore) -> None:
+    """A limit on the size of files stands for the full disk: the shard of radiance does not fit."""
+    given = samples.outputs(scene, 0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        with pytest.raises(StoreError, match="cannot commit job 0: File too large"):
+            samples.commit(scene, 0, given)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert list(scene.storage.local("tmp").iterdir()) == []
+    assert samples.commit(scene, 0, given)
+    assert reader_of(scene).read(0).radiance.shape == (2, 8, 8, 3)
+
+
+def test_a_commit_that_the_disk_refuses_is_a_store_error_and_leaves_the_job_missing(scene: SceneStore) -> None:
+    given = samples.outputs(scene, 0)
+    scene.storage.local("tmp").rename(scene.folder / "elsewhere")
+    scene.storage.local("tmp").write_text("a file where the folder should be")
+    with pytest.raises(StoreError, match="cannot commit job 0"):
+        samples.commit(scene, 0, given)
+    scene.storage.local("tmp").unlink()
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert samples.commit(scene, 0, given)
+
+
+def test_a_disk_that_turns_read_only_in_the_middle_of_a_job_is_a_store_error(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its files can then be neither named nor removed; a sweep removes them, once the disk can be written."""
+
+    def refuse(path: Any, *_: Any, **__: Any) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", refuse)
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(StoreError, match="cannot commit job 0: Read-only file system"):
+            samples.commit(scene, 0, samples.outputs(scene, 0))
+    assert scene.missing_jobs() == [0, 1, 2]
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+
+
+def test_a_leftover_file_on_a_bad_sector_is_replaced(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    (scene.folder / "committed/000000000000.json").unlink()
+    bad, preadv = (scene.folder / "plans/000000/radiance/c.0.0.0.0.0").stat().st_ino, os.preadv
+
+    def failing(descriptor: int, *rest: Any) -> int:
+        if os.fstat(descriptor).st_ino == bad:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return preadv(descriptor, *rest)
+
+    monkeypatch.setattr(os, "preadv", failing)
+    assert samples.commit(scene, 0, samples.outputs(scene, 0))
+    assert reader_of(scene).read(0).row == 0
+
+
+# ------------------------------------------------------------------------------------------------- plans that are lost
+
+
+LOSSES: dict[str, Callable[[Path], None]] = {
+    "zarr.json of the first": lambda plans: (plans / "000000/zarr.json").unlink(),
+    "zarr.json of the last": lambda plans: (plans / "000002/zarr.json").unlink(),
+    "all files of the last": lambda plans: [shutil.rmtree(plans / "000002"), (plans / "000002").mkdir()],
+    "one between others": lambda plans: shutil.rmtree(plans / "000001"),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_a_plan_that_is_lost_is_an_error_that_names_it_and_nothing_is_read_or_planned_without_it(
+    store: Store, scene: SceneStore, loss: Callable[[Path], None]
+) -> None:
+    requests = [Request(modifications=n, views_per_modification=2) for n in (6, 7, 8)]
+    for request in requests[:2]:
+        scene.plan(request)
+    samples.commit_all(scene)
+    loss(scene.folder / "plans")
+    said = r"plans/00000\d: the plan is missing, .* put the folder back"
+    with pytest.raises(CorruptError, match=said):
+        reader_of(scene)
+    with pytest.raises(CorruptError, match=said):
+        scene_of(store).jobs()
+    with pytest.raises(CorruptError, match=said):
+        scene_of(store).plan(requests[2])
+
+
+def scene_of(store: Store) -> SceneStore:
+    """As a new process sees it."""
+    (scene,) = Store(store.root).scenes()
+    return scene
+
+
+def test_no_plan_takes_the_number_of_jobs_that_are_committed(store: Store, scene: SceneStore) -> None:
+    """The folder of the last plan is gone, and only the marker of its job tells of it."""
+    scene.plan(Request(modifications=6, views_per_modification=2))
+    samples.commit_all(scene)
+    shutil.rmtree(scene.folder / "plans/000001")
+    with pytest.raises(CorruptError, match=r"committed/000000000003\.json: no plan has this job"):
+        scene_of(store).plan(Request(modifications=7, views_per_modification=2))
+    assert not (scene.folder / "plans/000001").exists()
+
+
+def test_a_plan_that_is_claimed_and_not_written_yet_is_not_there_yet(store: Store, scene: SceneStore) -> None:
+    """As it may lie in a bucket, for a moment."""
+    (scene.folder / "plans/000001/view").mkdir(parents=True)
+    (scene.folder / "plans/000001.claim").write_bytes(b"")
+    (scene.folder / "plans/7").mkdir()  # not a plan's name
+    assert len(scene_of(store).plans()) == 1
+    assert reader_of(scene).planned == 10
+
+
+# ----------------------------------------------------------------------------------------------------------- sweeping
+
+
+def test_a_part_that_cannot_be_removed_is_left_alone_and_not_counted(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of another user, say, whose folder is not ours to empty."""
+    theirs, ours = store.storage.part(), store.storage.part()
+    for part in (theirs, ours):
+        part.mkdir()
+        os.utime(part, (1, 1))
+    remove = shutil.rmtree
+
+    def refusing(path: Path, *rest: Any, **options: Any) -> None:
+        if path == theirs:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        remove(path, *rest, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", refusing)
+    assert store.sweep() == 1
+    assert (theirs.exists(), ours.exists()) == (True, False)

@@ -1,0 +1,148 @@
+"""Samples of the analytic room: as a source that grows, and as jobs of a store."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from analytic_room import analytic_base, render, sees, trace, visibility
+from numpy.typing import NDArray
+
+from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.modification import Modification, sample_modification
+from photonfarm.shared.pointcloud import rebuild
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import Figures, SceneStore
+from photonfarm.shared.view import View, sample_view
+
+
+@dataclass(frozen=True)
+class AnalyticSample:
+    row: int
+    modification: Modification
+    view: View
+    radiance: F32
+    buffers: ViewBuffers
+    visibility: Visibility
+    pass_: int
+    scale: float = 1.0
+
+
+class AnalyticSource:
+    """Samples of the analytic scene, `views` of each configuration, released `per_look` rows at each refresh."""
+
+    def __init__(self, spec: SceneSpec, samples: int, *, views: int = 1, noise: float = 1.0, per_look: int = 1 << 30):
+        self.spec, self._samples, self._views, self._noise, self._per_look = spec, samples, views, noise, per_look
+        self._base = analytic_base(spec)
+        self._released = 0
+        self.reads: list[int] = []
+
+    def ready(self) -> bool:
+        return True
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        return self._base
+
+    def planned(self) -> int:
+        return self._samples
+
+    def plan_requests(self) -> list[dict[str, Any]]:
+        return [{"samples": self._samples}]
+
+    def refresh(self) -> NDArray[np.int64]:
+        before = self._released
+        self._released = min(self._samples, before + self._per_look)
+        return np.arange(before, self._released)
+
+    def taken_back(self) -> NDArray[np.int64]:
+        return np.zeros(0, np.int64)
+
+    def modification(self, row: int) -> Modification:
+        return sample_modification(self.spec, 0, row // self._views)
+
+    def view(self, row: int) -> View:
+        return sample_view(self.spec, self.modification(row).key(self.spec.scene_id), 0, row)
+
+    def modification_key(self, row: int) -> Key:
+        return self.modification(row).key(self.spec.scene_id)
+
+    def view_key(self, row: int) -> Key:
+        return make_key(self.modification_key(row), self.view(row).vector)
+
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        return [self.modification_key(row) for row in rows]
+
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        return [self.view_key(row) for row in rows]
+
+    def cloud_at(self, row: int) -> tuple[F32, NDArray[np.bool_]]:
+        """The cloud of a row's configuration: positions and visibility flags."""
+        return rebuild(self._base[1], self.modification(row))
+
+    def sees(self, row: int, position: F32) -> NDArray[np.bool_]:
+        """Which points the eye of a row sees, by an exact query: nothing lies between, (P,)."""
+        return sees(self.spec, self.modification(row), self.view(row), position)
+
+    def clean(self, row: int) -> F32:
+        return render(self.spec, self.modification(row), self.view(row))[0]
+
+    def read(self, row: int) -> AnalyticSample:
+        self.reads.append(row)
+        modification, view = self.modification(row), self.view(row)
+        clean, buffers = render(self.spec, modification, view)
+        photons = self.read_photons(row) if self.spec.photons.paths else None
+        seen = visibility(self.spec, self._base[1], modification, view, photons)
+        return AnalyticSample(row, modification, view, noisy(clean, row, self._noise), buffers, seen, 0)
+
+    def read_batch(self, rows: Sequence[int]) -> list[AnalyticSample]:
+        return [self.read(row) for row in rows]
+
+    def read_photons(self, row: int) -> Photons:
+        return trace(self.spec, self.modification(row), row // self._views)
+
+
+class ScarceSource(AnalyticSource):
+    """One that gives `lot` rows more whenever nothing has been drawn for `patience` looks; `count` is for training."""
+
+    def __init__(self, spec: SceneSpec, samples: int, *, lot: int, patience: int, **how: Any):
+        super().__init__(spec, samples, **how)
+        self._lot, self._patience, self._looks, self._draws = lot, patience, 0, 0
+        self.stalls: list[int] = []  # draws by each lot
+
+    def refresh(self) -> NDArray[np.int64]:
+        self._looks += 1
+        self._per_look = self._lot if self._looks >= self._patience else 0
+        if self._per_look:
+            self._looks = 0
+            self.stalls.append(self._draws)
+        return super().refresh()
+
+    def count(self, draws: int, _samples: int) -> None:
+        self._draws, self._looks = draws, 0
+
+
+def commit_job(scene: SceneStore, job: int) -> bool:
+    """Write one job of a store, its images analytic; as a render worker does."""
+    rows, new_views, cloud = scene.job_rows(job), set(scene.job_rows(job).new_views), scene.base()[1]
+    photons = {}
+    if scene.spec.photons.paths:
+        photons = {row: trace(scene.spec, modification, row) for row, modification in rows.modifications.items()}
+    with scene.job_writer(job) as out:
+        for sample in rows.samples:
+            shown = rows.modifications[sample.modification_row], rows.views[sample.view_row]
+            clean, buffers = render(scene.spec, *shown)
+            out.radiance(sample.row, noisy(clean, sample.row, 1.0))
+            if sample.view_row in new_views:
+                seen = visibility(scene.spec, cloud, *shown, photons.get(sample.modification_row))
+                out.view(sample.view_row, buffers, seen)
+                new_views.remove(sample.view_row)
+        for row in rows.new_modifications & photons.keys():
+            out.photons(row, photons[row])
+        return out.commit(Figures(core_s=0.5, wall_s=0.6, redrawn=0, worker="test", versions={"test": "1"}))
+
+
+def noisy(clean: F32, seed: int, noise: float) -> F32:
+    """Half-estimates A and B, (2, H, W, 3): the clean image times gamma noise of mean 1 and deviation `noise`."""
+    factor = np.random.default_rng(seed).gamma(1 / noise**2, noise**2, (2, *clean.shape))
+    return (clean * factor).astype(np.float32)

@@ -1,0 +1,50 @@
+"""Which device a name stands for, and training on CUDA where there is one."""
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.trainer import checkpoint
+from photonfarm.trainer.device import described, usable_device
+from photonfarm.trainer.figures import run_figures
+from photonfarm.trainer.loop import CHECKPOINT, train
+from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+
+HAS_CUDA = torch.cuda.is_available()
+
+
+def test_without_a_name_it_is_cuda_where_there_is_one() -> None:
+    assert TrainSettings().device == "auto"
+    assert usable_device("auto").type == ("cuda" if HAS_CUDA else "cpu")
+    assert described(usable_device("cpu")) == "cpu"
+
+
+def test_a_name_that_is_no_device_of_ours_is_refused_with_those_that_are() -> None:
+    with pytest.raises(SpecError, match="device = 'meta': must be auto, cpu or cuda"):
+        usable_device("meta")
+
+
+@pytest.mark.skipif(HAS_CUDA, reason="there is a CUDA device")
+def test_cuda_that_is_not_there_is_refused() -> None:
+    with pytest.raises(SpecError, match="device = 'cuda': cannot be used here"):
+        usable_device("cuda")
+
+
+@pytest.mark.skipif(not HAS_CUDA, reason="there is no CUDA device")
+@pytest.mark.parametrize("architecture", ["light_transport_photons", "denoise_4"])
+def test_on_cuda_a_run_steps_goes_on_and_is_the_cpus_but_for_rounding(
+    make_source, tiny, run, tmp_path, architecture: str
+) -> None:
+    """float32 means float32: of TF32's 10 bits the weights would be some 1e-3 of their way apart after a few steps."""
+    network = NetworkSettings(width=4, architecture=architecture)
+    for stop in (3, 6):
+        train(make_source(24, photons=16), tiny(network=network, max_steps=stop), run)
+    train(make_source(24, photons=16), tiny(network=network, max_steps=6, device="cpu"), tmp_path / "cpu")
+    ends = [checkpoint.load(folder / CHECKPOINT) for folder in (run, tmp_path / "cpu")]
+    assert ends[0]["step"] == ends[1]["step"] == 6
+    assert ends[0]["last_error"] == pytest.approx(ends[1]["last_error"], rel=1e-3)
+    found = run_figures(make_source(24, photons=16), tiny(network=network), run)
+    assert np.isfinite(found.last.error.mean)
+    assert not torch.backends.cudnn.allow_tf32
+    assert described(usable_device("auto")).startswith("cuda (")

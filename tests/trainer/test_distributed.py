@@ -1,0 +1,237 @@
+"""Two processes on a CPU that share each batch, over gloo, against one that has all of it."""
+
+import json
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.trainer import checkpoint
+from photonfarm.trainer import distributed as processes
+from photonfarm.trainer.distributed import Ranks, leading, ranks
+from photonfarm.trainer.loop import CHECKPOINT, METRICS, assist, train
+from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+
+SIZE = 2
+
+
+def in_both(target: Callable[[Ranks], Any], batch: int = 4) -> list[int | None]:
+    """How both processes end that run `target`: 0, or a number for a reason."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def one(rank: int) -> None:
+        told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": SIZE, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        os.environ.update({name: str(value) for name, value in told.items()})
+        try:
+            with ranks("cpu", batch) as group:
+                assert group is not None
+                target(group)
+        except PhotonfarmError as error:
+            sys.exit(error.exit_code)
+
+    children = [multiprocessing.get_context("fork").Process(target=one, args=(rank,)) for rank in range(SIZE)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join(120)
+    return [child.exitcode for child in children]
+
+
+def together(make: Callable[[], Any], settings: TrainSettings, run: Path, **how: Any) -> list[int | None]:
+    """Train in both; `how` is for rank 0."""
+
+    def target(group: Ranks) -> None:
+        if group.rank:
+            assist(lambda _: make(), settings, run, group)
+            return
+        with leading(group):
+            train(make(), settings, run, group=group, **how)
+
+    return in_both(target, settings.batch)
+
+
+def weights(run: Path) -> torch.Tensor:
+    return torch.cat([w.flatten() for w in checkpoint.load(run / CHECKPOINT)["network"].values()])
+
+
+@pytest.mark.parametrize(("architecture", "batch"), [("light_transport", 4), ("light_transport", 3), ("denoise_4", 5)])
+def test_two_processes_end_in_the_weights_of_one_with_the_joint_batch(
+    make_source, tiny, run, tmp_path, architecture: str, batch: int
+) -> None:
+    """Also where their parts differ in length. The tolerance is 1e-4 of what the weights have moved by."""
+    settings = tiny(batch=batch, network=NetworkSettings(width=4, architecture=architecture))
+    train(make_source(24), settings, run)
+    assert together(lambda: make_source(24), settings, tmp_path / "both") == [0, 0]
+    moved = (weights(run) - torch.cat([w.flatten() for w in initial(run)])).abs()
+    apart = (weights(run) - weights(tmp_path / "both")).abs()
+    assert moved.mean() > 1e-3
+    assert apart.mean() < 1e-4 * moved.mean()
+    states = [checkpoint.load(folder / CHECKPOINT) for folder in (run, tmp_path / "both")]
+    followed = [json.dumps(state["following"], default=torch.Tensor.tolist) for state in states]
+    assert followed[0] == followed[1]
+    errors = [state["last_error"] for state in states]
+    assert errors[0] == pytest.approx(errors[1], rel=1e-3)
+
+
+def initial(run: Path) -> list[torch.Tensor]:
+    return list(checkpoint.load(run / "initial.safetensors")["network"].values())
+
+
+def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_source, tiny, run, tmp_path) -> None:
+    def target(group: Ranks) -> None:
+        source = make_source(24)
+        if group.rank:
+            assist(lambda _: source, tiny(batch=4), run, group)
+        else:
+            with leading(group):
+                train(source, tiny(batch=4), run, group=group)
+        (tmp_path / f"{group.rank}.json").write_text(json.dumps(source.reads))
+
+    assert in_both(target) == [0, 0]
+    reads = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(SIZE)]
+    held_out = set(checkpoint.load(run / CHECKPOINT)["following"]["held_out"].tolist())
+    assert len([row for row in reads[0] if row not in held_out]) >= 12 * 2
+    assert len(reads[1]) == 12 * 2
+    assert not set(reads[1]) & held_out
+
+
+def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source, tiny, run, tmp_path) -> None:
+    settings, killed = tiny(batch=4), tmp_path / "killed"
+    assert together(lambda: make_source(24), settings, run) == [0, 0]
+
+    def die(draws: int, _samples: int) -> None:
+        if draws == 4 * 10:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    ended = together(lambda: make_source(24), settings, killed, count=die)
+    assert ended == [-signal.SIGKILL, IncompleteError.exit_code], "whoever is left ends as well, and says so"
+    assert checkpoint.load(killed / CHECKPOINT)["step"] == 8
+    assert together(lambda: make_source(24), settings, killed) == [0, 0]
+    assert torch.equal(weights(run), weights(killed))
+
+
+@pytest.mark.parametrize(("fault", "ended"), [("store", [4, 0]), ("step", [4, 7]), ("loss", [8, 8])])
+def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
+    make_source, tiny, run, fault: str, ended: list[int]
+) -> None:
+    """Where rank 0 cannot read they are told to end; within a step they see it gone; a loss that is none all have."""
+
+    def fail(*_: Any) -> float:
+        raise StoreError("rank 0 fails with its gradient in hand")
+
+    def make() -> Any:
+        source = make_source(24)
+        if fault == "step" and os.environ["RANK"] == "0":
+            Ranks.average = fail  # in a process of its own
+        honest = source.read_batch
+
+        def read_batch(rows: Any) -> Any:
+            samples = honest(rows)
+            if fault == "store" and os.environ["RANK"] == "0" and len(source.reads) > 20:
+                raise StoreError("the disk is gone")
+            if fault == "loss" and len(source.reads) > 20:
+                samples[0].radiance[:] = np.nan
+            return samples
+
+        source.read_batch = read_batch
+        return source
+
+    began = time.monotonic()
+    assert together(make, tiny(batch=4, max_steps=40, validate_every=100), run) == ended
+    assert time.monotonic() - began < 60
+
+
+def test_a_rank_that_hangs_in_a_step_is_waited_for_by_far_less_than_one_that_has_nothing_to_say(
+    make_source, tiny, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No scene for longer than a step may take, and then a reading of rank 1 that takes longer than that."""
+    patience_s = 2.5
+    monkeypatch.setattr(processes, "STEP_PATIENCE", timedelta(seconds=patience_s))
+
+    def make() -> Any:
+        source, began = make_source(24), time.monotonic()
+        source.ready = lambda: time.monotonic() - began > patience_s + 0.5
+        honest, hangs = source.read_batch, [2 * patience_s]
+
+        def read_batch(rows: Any) -> Any:
+            if os.environ["RANK"] == "1" and len(source.reads) > 6 and hangs:
+                time.sleep(hangs.pop())
+            return honest(rows)
+
+        source.read_batch = read_batch
+        return source
+
+    assert together(make, tiny(batch=4, checkpoint_every=1), run) == [IncompleteError.exit_code] * 2
+    assert 0 < checkpoint.load(run / CHECKPOINT)["step"] < 12
+
+
+@pytest.mark.parametrize("lengths", [(3, 1), (4, 0)])
+def test_the_gradient_is_that_of_the_joint_batch_however_it_is_parted(tmp_path, lengths: tuple[int, int]) -> None:
+    x = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+
+    def gradient(inputs: torch.Tensor) -> tuple[torch.nn.Linear, torch.Tensor]:
+        layer = torch.nn.Linear(3, 2)
+        with torch.no_grad():
+            layer.weight.fill_(0.5)
+            layer.bias.fill_(0.1)
+        loss = (layer(inputs) ** 2).mean() if len(inputs) else torch.zeros(())
+        if len(inputs):
+            torch.autograd.backward(loss)
+        return layer, loss
+
+    def target(group: Ranks) -> None:
+        own = torch.split(x, lengths)[group.rank]
+        layer, loss = gradient(own)
+        value = group.average(list(layer.parameters()), loss, len(own))
+        joint, expected = gradient(x)
+        assert value == pytest.approx(expected.item(), rel=1e-6)
+        torch.testing.assert_close(layer.weight.grad, joint.weight.grad)
+        torch.testing.assert_close(layer.bias.grad, joint.bias.grad)
+
+    assert in_both(target) == [0, 0]
+
+
+def test_a_run_that_ends_before_there_is_a_scene_ends_for_both(make_source, tiny, run) -> None:
+    def make() -> Any:
+        source = make_source(24)
+        source.ready = lambda: False
+        return source
+
+    assert together(make, tiny(batch=4, max_seconds=0.1), run) == [0, 0]
+
+
+def test_a_batch_smaller_than_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    with pytest.raises(SpecError, match="batch = 3: is shared by 4 processes"), ranks("cpu", 3):
+        pass
+
+
+def test_torchrun_trains_a_store_with_two_processes(scene, commit, run) -> None:
+    scene.plan(Request(modifications=12), shard_rows=12)
+    commit(scene, 0)
+    told = ["train", "--store", str(scene.storage.root), "--run", str(run), "--steps", "3", "--redis", ""]
+    launched = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone", "-m"]
+    command = [*launched, "--", "photonfarm.shared.cli", *told]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("ended at step 3: steps") == 1
+    assert checkpoint.load(run / CHECKPOINT)["step"] == 3
+    assert [json.loads(line)["kind"] for line in (run / METRICS).read_text().splitlines()].count("end") == 1

@@ -1,0 +1,269 @@
+"""`photonfarm evaluate` on a store: what is measured, on which samples, against which references."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+from PIL import Image
+
+from photonfarm.shared.cli import umbrella
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.pictures import display
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore
+from photonfarm.shared.store.merge import Merged, merge_view
+from photonfarm.trainer.comparison import COMPARISON, comparison
+from photonfarm.trainer.dataset import kept_count, kept_pixels, rows_held_out
+from photonfarm.trainer.evaluate import EVALUATION, compare
+from photonfarm.trainer.evaluation import TIMED_CALLS, WARM_CALLS, DevicePredictor, batches
+from photonfarm.trainer.evaluation_samples import References
+from photonfarm.trainer.evaluation_table import notes, told
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.loop import train
+from photonfarm.trainer.metrics import find_weights, metric_space, mse
+from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+
+
+@pytest.fixture
+def store(scene: SceneStore, commit) -> Path:
+    """16 configurations of two passes of one view."""
+    scene.plan(Request(modifications=16, views_per_modification=1, passes=2), shard_rows=8)
+    for job in range(scene.jobs()):
+        commit(scene, job)
+    return scene.folder.parent.parent
+
+
+@pytest.fixture
+def trained(scene: SceneStore, store: Path, tiny, tmp_path: Path):
+    """Function (name, changes of the settings) → a run of three steps."""
+
+    def make(name: str, **changes) -> TrainedRun:
+        source = StoreSource(store, scene.scene_id)
+        train(source, tiny(**{"max_steps": 3, "hold_out": 0.4, **changes}), tmp_path / name)
+        return TrainedRun.load(tmp_path / name)
+
+    return make
+
+
+@pytest.fixture
+def references(scene: SceneStore, store: Path, tmp_path: Path) -> Path:
+    """All views merged, as `photonfarm store merge` does; of the analytic noise, and far from converged."""
+    reader, folder = SceneReader(store, scene.scene_id), tmp_path / "references"
+    folder.mkdir()
+    for row in reader.refresh().tolist():
+        merge_view(reader, reader.view_row(row)).write(folder / f"{reader.view_key(row).hex()}.npz")
+    return folder
+
+
+def held_out(store: Path, scene: SceneStore, share: float) -> list[int]:
+    source = StoreSource(store, scene.scene_id)
+    rows = source.refresh().tolist()
+    return [row for row, held in zip(rows, rows_held_out(source, rows, share), strict=True) if held]
+
+
+def test_a_network_is_measured_on_all_samples_that_are_held_out_and_on_each_view_with_a_reference_once(
+    scene: SceneStore, store: Path, trained, references: Path
+) -> None:
+    run, rows = trained("run"), held_out(store, scene, 0.4)
+    found = compare(store, [run], references=references)
+    (row,) = found.rows
+    assert found.samples == len(rows) == len(row.held_out.per_sample) == len(row.held_out.units)
+    assert found.units == row.held_out.error.count == row.metrics.images == len(rows) // 2
+    assert found.references == References(len(rows) // 2, 2 * 2 * scene.spec.transport.half_spp, 1 / 4)
+    assert (row.metrics.fid is None) == (find_weights() is None)
+    assert row.metrics.flip.estimate.mean > 0
+    assert 0 < row.seconds < 10
+
+
+def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(
+    scene: SceneStore, store: Path, trained, references: Path
+) -> None:
+    """What is shown as it is, against references read by hand."""
+    reader = SceneReader(store, scene.scene_id)
+    reader.refresh()
+    found = compare(store, [trained("run")], [("none", 1)], references=references, most=3)
+    rows = [row for row in held_out(store, scene, 0.4)[:3] if row == reader.rows_of_view(reader.view_row(row))[0]]
+    exposure = scene.spec.exposure
+    images = [exposure * reader.read(row).radiance[0] for row in rows]
+    wanted = [exposure * Merged.read(references / f"{reader.view_key(row).hex()}.npz").mean for row in rows]
+    expected = mse(metric_space(np.array(images, np.float32)), metric_space(np.array(wanted, np.float32)))
+    assert found.rows[1].name == "none 1/1"
+    assert found.rows[1].metrics.mse.values == pytest.approx(expected.tolist(), rel=1e-5)
+
+
+def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
+    store: Path, trained, references: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
+    runs = [trained("one", network={"width": 4, "architecture": "denoise_4"}), trained("two", seed=1)]
+    named = ["--store", store, "--references", references, "--run", runs[0].folder, "--run", runs[1].folder]
+    arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 5]
+    result = CliRunner().invoke(umbrella, [str(a) for a in (*arguments, "--inception", tmp_path / "none")])
+    assert isinstance(result.exception, SpecError), "weights that are named must be there"
+    result = CliRunner().invoke(umbrella, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0
+    lines = [line for line in result.stdout.splitlines() if line.startswith("|")]
+    assert [line.split(" | ")[0].removeprefix("| ").split(" ")[0] for line in lines[2:]] == [
+        "denoise_4", "light_transport", "oidn", "fill-in",
+    ]  # fmt: skip
+    assert lines[0].count("|") == lines[-1].count("|")
+    assert [line for line in result.stderr.splitlines() if line.endswith(": 5 samples")][2:] == [
+        "oidn 1/4: 5 samples", "fill-in 1/4: 5 samples",
+    ]  # fmt: skip
+    documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
+    assert documents[0] == documents[1]
+    assert documents[0]["rows"][2]["predictor"] == "oidn 1/4"
+    assert documents[0]["rows"][2]["linear_mse"]["mean"] < documents[0]["rows"][0]["linear_mse"]["mean"]
+    pictures = [np.asarray(Image.open(run.folder / COMPARISON)) for run in runs]
+    assert np.array_equal(*pictures)
+
+
+def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references: Path) -> None:
+    """Of 2 passes of a view one half A is a quarter of its reference."""
+    runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
+    found = compare(store, runs, references=references, most=6)
+    foot = told(found).split("\n\n")[-1]
+    assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
+    assert "not converged, which takes 4096" in foot
+    assert "denoisers: up to 25.0% of a reference is the half A that they were given" in foot
+    assert "nor is rendering the 1/k of the pixels that denoisers are given" in foot
+    if find_weights() is not None:
+        assert f"FID of {found.references.views} images: below 2048" in foot
+        assert "the published ones" in foot
+    bare = replace(found, rows=tuple(replace(row, metrics=replace(row.metrics, inception=None)) for row in found.rows))
+    assert "no weights of the Inception network are installed" in notes(bare)[-1]
+    converged = replace(found, references=replace(found.references, spp=4096))
+    assert notes(converged)[2].endswith("samples per pixel or more; converged")
+    head = told(found).split("\n\n")[0]
+    assert head.startswith(f"analytic: 6 held-out samples of {found.units} configurations; noise of the targe")
+
+
+def test_the_pictures_stand_side_by_side_in_one_exposure(
+    scene: SceneStore, store: Path, trained, references: Path
+) -> None:
+    """Each 256 pixels wide, 8 apart, below a line of text of 18: the target, then what was given as it is."""
+    reader = SceneReader(store, scene.scene_id)
+    reader.refresh()
+    run = trained("run")
+    for folder, first in ((None, "radiance"), (references, "reference")):
+        found = compare(store, [run], [("none", 1)], references=folder, most=8)
+        sheet = comparison(found)
+        assert sheet.shape[1] == 3 * 256 + 2 * 8
+        assert len({reader.modification_key(target.row) for target in found.shown}) == len(found.shown) == 4
+        for place, target in enumerate(reversed(found.shown)):
+            bottom = sheet.shape[0] - place * (256 + 18 + 8)
+            shown = [sheet[bottom - 256 : bottom, x : x + 256][::16, ::16] for x in (0, 2 * 264)]
+            radiance = reader.read(target.row).radiance
+            wanted = radiance.mean(axis=0)
+            if first == "reference":
+                wanted = Merged.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
+            for picture, image in zip(shown, (wanted, radiance[0]), strict=True):
+                assert np.abs(picture.astype(int) - display(image, scene.spec.exposure)).max() <= 1
+
+
+def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
+    """Of 256 pixels one of 256 is one, and one of 257 none."""
+    source = make_source(3)
+    assert kept_pixels(source.read(0), source.spec, 256).sum() == kept_count(source.spec, 256) == 1
+    with pytest.raises(SpecError, match="one of 257 pixels is to be kept, and the film has 256"):
+        kept_pixels(source.read(0), source.spec, 257)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--kept", "4"], "--kept is what untrained denoisers are given"),
+        (["--inception", "file"], "--inception is for the columns that compare with references"),
+        (["room"], "Got unexpected extra argument (room)"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(arguments: list[str], said: str) -> None:
+    result = CliRunner().invoke(umbrella, ["evaluate", *arguments])
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+def test_a_network_is_timed_alone_after_calls_that_do_not_count(make_source, tiny) -> None:
+    """Of 2 slow calls and 9 fast ones the median is that of the fast ones; images of the whole batch are made."""
+    calls = []
+
+    def images(inputs) -> torch.Tensor:
+        calls.append(len(inputs.albedo))
+        time.sleep(0.2 if len(calls) <= WARM_CALLS else 0.01)
+        return inputs.albedo
+
+    with Feed(make_source(3), tiny(), needs=Needs(points=False)) as feed:
+        seconds = DevicePredictor(images, torch.device("cpu")).seconds(next(batches(feed, [0], 1)).inputs)
+    assert calls == [1] * (WARM_CALLS + TIMED_CALLS)
+    assert 0.01 <= seconds < 0.2
+
+
+def test_without_references_only_the_linear_error_is_given(store: Path, trained) -> None:
+    found = compare(store, [trained("run")], most=3)
+    assert found.samples == 3
+    assert found.references is found.rows[0].metrics is None
+    assert "MSSIM" not in told(found)
+    assert "no references: the columns of the paper need them" in notes(found)[-1]
+    assert found.document()["rows"][0]["metric_space"] is None
+
+
+def test_how_far_a_row_is_behind_the_first_is_taken_in_pairs(store: Path, trained) -> None:
+    """Of a run beside itself the difference is nothing at all; in general it is that of the means."""
+    run = trained("run")
+    first, same, other = compare(store, [run, run], [("none", 4)]).rows
+    assert (same.behind(first).mean, same.behind(first).standard_error) == (0, 0)
+    assert other.behind(first).mean == pytest.approx(other.held_out.error.mean - first.held_out.error.mean)
+    assert other.behind(first).count == first.held_out.error.count
+
+
+def test_a_configuration_file_may_name_one_run_or_several(store: Path, trained, tmp_path: Path) -> None:
+    runs = [str(trained(name).folder) for name in ("one", "two")]
+    file = tmp_path / "photonfarm.toml"
+    for value, wanted in ((json.dumps(runs[0]), 1), (json.dumps(runs), 2)):
+        file.write_text(f'run = {value}\n[evaluate]\nkept = 4\ndenoiser = "none"\n')
+        result = CliRunner().invoke(
+            umbrella, ["--config", str(file), "evaluate", "--store", str(store), "--json"], catch_exceptions=False
+        )
+        assert [row["predictor"].split(" (")[0] for row in json.loads(result.stdout)["rows"]] == [
+            *["light_transport"] * wanted, "none 1/4",
+        ]  # fmt: skip
+
+
+def test_runs_with_different_shares_are_measured_on_what_none_has_seen(scene: SceneStore, store: Path, trained) -> None:
+    runs = [trained("more", hold_out=0.6), trained("fewer", hold_out=0.3)]
+    assert compare(store, runs).samples == len(held_out(store, scene, 0.3)) < len(held_out(store, scene, 0.6))
+
+
+def test_what_cannot_be_compared_is_refused(
+    scene: SceneStore, store: Path, trained, references: Path, make_source, tiny, tmp_path: Path
+) -> None:
+    run = trained("run")
+    train(make_source(12, moving=False), tiny(max_steps=1), tmp_path / "static")
+    with pytest.raises(SpecError, match="runs of one scene can be compared"):
+        compare(store, [run, TrainedRun.load(tmp_path / "static")])
+    with pytest.raises(SpecError, match=r"one of 300 pixels is to be kept, and the film has 256 \(16×16\)"):
+        compare(store, [run], [("none", 300)])
+    with pytest.raises(SpecError, match="cannot be used here"):
+        compare(store, [run], device="cuda:99")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SpecError, match="holds no reference of the"):
+        compare(store, [run], references=tmp_path / "empty")
+    for file in references.iterdir():
+        Merged(1, *np.zeros((4, 8, 8, 3))).write(file)
+    with pytest.raises(SpecError, match=r"has the shape \(8, 8, 3\), and the scene's film \(16, 16, 3\)"):
+        compare(store, [run], references=references)
+
+
+def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_source, tiny, tmp_path: Path) -> None:
+    train(make_source(24), tiny(max_steps=1), tmp_path / "run")
+    scene.plan(Request(modifications=1), shard_rows=8)
+    commit(scene, 0)
+    with pytest.raises(IncompleteError, match="none of the 1 complete samples is held out"):
+        compare(scene.folder.parent.parent, [TrainedRun.load(tmp_path / "run")])

@@ -1,0 +1,182 @@
+"""The grid search: cells that differ in nothing else, kept where finished, compared in pairs."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.estimate import Estimate
+from photonfarm.shared.plan import Request
+from photonfarm.trainer import checkpoint, grid, service
+from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.evaluation import HeldOut
+from photonfarm.trainer.grid import Cell, run_grid, table
+from photonfarm.trainer.learner import DivergedError
+from photonfarm.trainer.loop import CHECKPOINT, train
+
+AXES = {"optimiser": ("adam", "rmsprop"), "learning_rate": (1e-4, 2e-3)}
+
+
+def test_every_cell_is_the_run_that_its_settings_make_alone(make_source, tiny, run, tmp_path) -> None:
+    cells = run_grid(lambda: make_source(24), tiny(), run, AXES)
+    assert [cell.changes["optimiser"] for cell in cells] == ["adam", "adam", "rmsprop", "rmsprop"]
+    outcome = train(make_source(24), tiny(optimiser="rmsprop", learning_rate=2e-3), tmp_path / "alone")
+    states = [checkpoint.load(path / CHECKPOINT) for path in (tmp_path / "alone", run / "rmsprop-0.002")]
+    assert all(np.array_equal(states[0]["network"][name], states[1]["network"][name]) for name in states[0]["network"])
+    assert np.mean(cells[-1].picked_by + cells[-1].per_unit) == pytest.approx(outcome.last_error, rel=1e-5)
+    assert len({cell.error.mean for cell in cells}) == 4
+
+
+def test_all_cells_draw_the_same_samples_in_the_same_order(make_source, tiny, run) -> None:
+    run_grid(lambda: make_source(24), tiny(), run, AXES)
+    states = [checkpoint.load(path)["following"] for path in sorted(run.glob(f"*/{CHECKPOINT}"))]
+    followed = [json.dumps(state, default=lambda numbers: numbers.tolist()) for state in states]
+    assert len(followed) == 4
+    assert all(state == followed[0] for state in followed)
+
+
+def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) -> None:
+    opened = []
+
+    def make():
+        opened.append(make_source(24))
+        return opened[-1]
+
+    first = run_grid(make, tiny(), run, {"learning_rate": (1e-4,)})
+    so_far = len(opened)
+    assert run_grid(make, tiny(), run, {"learning_rate": (1e-4,)}) == first
+    assert len(opened) == so_far + 1, "one look at the samples, and no run"
+    told: list[str] = []
+    cells = run_grid(make, tiny(), run, {"learning_rate": (1e-4, 5e-4)}, tell=told.append)
+    assert cells[0] == first[0]
+    assert len(cells) == 2
+    assert len(told) == 1
+    assert told[0].startswith("2: 0.0005: 0.")
+
+
+def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(make_source, tiny, run, tmp_path) -> None:
+    whole = run_grid(lambda: make_source(24), tiny(), run, AXES)
+    stop, broken = threading.Event(), tmp_path / "broken"
+
+    def make():
+        source = make_source(24)
+        honest = source.read
+
+        def read(row: int):
+            if (broken / "rmsprop-0.0001").exists() and len(source.reads) > 15:
+                stop.set()
+            return honest(row)
+
+        source.read = read
+        return source
+
+    begun = run_grid(make, tiny(), broken, AXES, stop=stop)
+    assert len(begun) == 2
+    assert 0 < checkpoint.load(broken / "rmsprop-0.0001" / CHECKPOINT)["step"] < 12
+    assert run_grid(lambda: make_source(24), tiny(), broken, AXES) == whole
+
+
+def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -> None:
+    def diverge(source, settings, folder, **how):
+        if settings.learning_rate == 1e-4:
+            raise DivergedError("the loss is inf")
+        return train(source, settings, folder, **how)
+
+    monkeypatch.setattr(grid, "train", diverge)
+    cells = run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)})
+    assert [cell.error is None for cell in cells] == [True, False]
+    assert table(cells).splitlines()[-1] == "| 0.0001 |  | diverged |  |"
+    assert run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)}) == cells
+
+
+def test_the_files_hold_the_table_and_every_figure(make_source, tiny, run) -> None:
+    cells = run_grid(lambda: make_source(24), tiny(), run, {"decay": (0.9, 1.0)})
+    assert (run / "grid.md").read_text() == table(cells) + "\n"
+    written = json.loads((run / "grid.json").read_text())
+    assert written["samples"] == 24
+    assert written["settings"] == tiny().model_dump(mode="json")
+    assert [cell["mean"] for cell in written["cells"]] == [cell.error.mean for cell in cells]
+    assert [cell["standard_error"] for cell in written["cells"]] == [cell.error.standard_error for cell in cells]
+
+
+def test_the_best_is_picked_by_one_half_and_all_are_told_by_the_other_in_pairs() -> None:
+    """On the second half 1, 2, 3 and 1.1, 2.1, 3.1: by pairs the difference is 0.1 exactly, though the first is lower.
+
+    A cell that is lucky on the half it is picked by is not told by its luck.
+    """
+    cells = [Cell({"decay": 1.0}, (0.9, 0.7), (1.0, 2.0, 3.0)), Cell({"decay": 0.95}, (0.2, 0.2), (1.1, 2.1, 3.1))]
+    lines = table(cells).splitlines()
+    assert lines[0] == "| decay | picked by | held-out error | more than the best |"
+    assert lines[2] == "| 0.95 | 0.20000 | 2.10000 ± 0.57735 |  |"
+    assert lines[3] == "| 1.0 | 0.80000 | 2.00000 ± 0.57735 | -0.10000 ± 0.00000 |"
+
+
+def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, tiny, run) -> None:
+    """Views of one configuration stay together, and the order in which they come does not matter."""
+    source = make_source(48, views=2)
+    source.refresh()
+    rows = [row for row, held in zip(range(48), rows_held_out(source, range(48), 0.5), strict=True) if held]
+    assert len(rows) > 12
+    units = tuple(source.modification_keys(rows))
+
+    def halves(order: list[int]) -> tuple[set[float], set[float]]:
+        errors = np.array([rows[i] // 2 for i in order], float)  # the number of its configuration stands for an error
+        found = HeldOut(Estimate.of(errors), 0.0, errors, tuple(units[i] for i in order))
+        first, second = grid._halves(found)
+        assert len(first) == len(set(units)) // 2
+        assert len(first) + len(second) == len(set(units))
+        return set(first), set(second)
+
+    straight, reversed_ = halves(list(range(len(rows)))), halves(list(reversed(range(len(rows)))))
+    assert straight == reversed_
+    assert not straight[0] & straight[1]
+    assert max(straight[0]) > min(straight[1]), "the halves are not by the order of arrival"
+
+
+def test_a_grid_needs_a_configuration_for_each_half(make_source, tiny, run) -> None:
+    with pytest.raises(IncompleteError, match=r"hold_out = 0\.01: holds out fewer than two configurations"):
+        run_grid(lambda: make_source(24), tiny(hold_out=0.01), run, AXES)
+    assert not run.exists()
+
+
+def test_samples_that_are_missing_are_waited_for_elsewhere(make_source, tiny, run) -> None:
+    with pytest.raises(IncompleteError, match=r"9 of 24 planned samples are complete; .* wait for the workers"):
+        run_grid(lambda: make_source(24, per_look=9), tiny(), run, AXES)
+
+
+@pytest.mark.parametrize(
+    ("change", "samples", "found"),
+    [
+        ({"seed": 3}, 24, "has seed = 0, now 3; use another run folder"),
+        ({"max_steps": 5}, 24, "has max_steps = 12, now 5; use another run folder"),
+        ({}, 27, "has samples = 24, now 27; use another run folder"),
+    ],
+)
+def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, samples, found) -> None:
+    run_grid(lambda: make_source(24), tiny(max_steps=12), run, {"decay": (1.0,)})
+    with pytest.raises(SpecError, match=f"grid.json: {found}"):
+        run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
+
+
+def test_an_axis_that_cannot_be_is_named_before_anything_runs(make_source, tiny, run) -> None:
+    with pytest.raises(SpecError, match=r"the axes of the grid: decay = 1\.5: Input should be less than or equal to 1"):
+        run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0, 1.5)})
+    assert not run.exists()
+
+
+def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit, run, tmp_path, capsys) -> None:
+    scene.plan(Request(modifications=16, views_per_modification=1, passes=1), shard_rows=8)
+    with pytest.raises(IncompleteError, match="0 of 16 planned samples are complete"):
+        service.search(None, tmp_path / "store", run, "small", {})
+    for job in scene.missing_jobs():
+        commit(scene, job)
+    changes = {"optimiser": "rmsprop", "decay": 1.0, "max_steps": 2, "width": 4, "hold_out": 0.4}
+    found = service.search(None, tmp_path / "store", run, "small", changes)
+    assert len(found.splitlines()) == 2 + 4, "a line for each rate"
+    assert "| rmsprop | 0.002 | 1.0 |" in found
+    assert "4: rmsprop-0.002-1.0: " in capsys.readouterr().err
+    assert (run / "grid.md").read_text() == found + "\n"

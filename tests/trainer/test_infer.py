@@ -1,0 +1,253 @@
+"""`photonfarm infer`: samples of a store and camera paths, as pictures; the renderer's part by the analytic scene."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic_room import analytic_base, analytic_spec, render, visibility
+from analytic_room_samples import commit_job
+from click.testing import CliRunner
+from PIL import Image
+
+from photonfarm.shared.camera_path import orbit
+from photonfarm.shared.cli import umbrella
+from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.frames import Frames
+from photonfarm.shared.modification import Modification
+from photonfarm.shared.pictures import display
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.view import View
+from photonfarm.trainer import animation, infer
+from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.loop import train
+from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> SceneStore:
+    """8 configurations of two views, with photons."""
+    scene = Store(tmp_path / "store", create=True).add(analytic_spec(16, 256, photons=32))
+    scene.write_base(*analytic_base(scene.spec))
+    scene.plan(Request(modifications=8, views_per_modification=2), shard_rows=16)
+    commit_job(scene, 0)
+    return scene
+
+
+@pytest.fixture
+def store(scene: SceneStore) -> Path:
+    return scene.folder.parent.parent
+
+
+@pytest.fixture
+def trained(store: Path, scene: SceneStore, tiny, run: Path):
+    """Function (architecture) → a run of two steps."""
+
+    def make(architecture: str = "light_transport") -> TrainedRun:
+        settings = tiny(max_steps=2, hold_out=0.3, network={"width": 4, "architecture": architecture})
+        train(StoreSource(store, scene.scene_id), settings, run)
+        return TrainedRun.load(run)
+
+    return make
+
+
+@pytest.fixture
+def frames(scene: SceneStore):
+    """Function (configuration, views, photons) → what the renderer would write."""
+
+    def make(modification: Modification, views: list[View], photons=None) -> Frames:
+        buffers = [render(scene.spec, modification, view)[1] for view in views]
+        images = (np.stack([getattr(b, name) for b in buffers]) for name in ("depth", "albedo", "normal"))
+        told = scene.base()[1], modification
+        seen = [visibility(scene.spec, *told, view, photons) for view in views]
+        flags = (np.stack([getattr(each, name) for each in seen]) for name in ("points", "photons"))
+        return Frames(scene.scene_id, modification, tuple(views), *images, *flags, photons)
+
+    return make
+
+
+def pixels(file: Path) -> np.ndarray:
+    return np.asarray(Image.open(file))
+
+
+def decoded(file: Path, width: int, height: int) -> np.ndarray:
+    """The frames of a film, (F, H, W, 3)."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    command = [get_ffmpeg_exe(), "-loglevel", "error", "-i", str(file), *["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]]
+    raw = subprocess.run(command, capture_output=True, check=True).stdout
+    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+
+
+@pytest.mark.parametrize("architecture", ["light_transport_photons", "cnn"])
+def test_a_frame_of_a_path_is_the_image_of_the_stored_sample_of_the_same_view(
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path, architecture: str
+) -> None:
+    """The store's buffers are rounded, so that a grey may differ by one step."""
+    reader = SceneReader(store, scene.scene_id)
+    reader.refresh()
+    run, sample = trained(architecture), reader.read(5)
+    infer.show_sample(store, run, 5, tmp_path / "sample")
+    other = orbit(scene.spec, 3)[1]
+    path = frames(sample.modification, [other, sample.view], reader.read_photons(5))
+    infer.show_frames(store, run, path, tmp_path / "path")
+    shown, wanted = (pixels(tmp_path / name) for name in ("path/frame-0001.png", "sample/prediction.png"))
+    assert shown.shape == (256, 256, 3)
+    assert np.abs(shown.astype(int) - wanted).max() <= 1
+    assert np.abs(pixels(tmp_path / "path/frame-0000.png").astype(int) - wanted).max() > 10
+
+
+def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, trained, tmp_path: Path) -> None:
+    """Only of what is held out an error is told: what was trained on may be known with its noise."""
+    run, reader = trained("denoise_4"), SceneReader(store, scene.scene_id)
+    source = StoreSource(store, scene.scene_id)
+    rows = source.refresh().tolist()
+    sides = dict(zip(rows, rows_held_out(source, rows, 0.3), strict=True))
+    assert 0 < sum(sides.values()) < len(rows)
+    for wanted in (True, False):
+        row = next(row for row, held in sides.items() if held is wanted)
+        found = infer.show_sample(store, run, row, tmp_path / "out")
+        reader.refresh()
+        target = display(reader.read(row).radiance.mean(axis=0), scene.spec.exposure)
+        shown = pixels(tmp_path / "out/target.png")[::16, ::16].astype(int)
+        assert np.abs(shown - target).max() <= 1
+        assert [file.name for file in found.files] == ["prediction.png", "target.png"]
+        said = f"row {row}: held out; squared error " if wanted else f"row {row}: was trained on (it is not held out)"
+        assert found.sentence.startswith(said)
+
+
+def test_a_row_that_is_not_there_is_told_from_one_that_is_not_complete(
+    store: Path, scene: SceneStore, trained, tmp_path: Path
+) -> None:
+    run = trained()
+    with pytest.raises(StoreError, match=r"there is no row 99; scene .* has 16 rows, and the first is 0"):
+        infer.show_sample(store, run, 99, tmp_path / "out")
+    scene.plan(Request(modifications=8, views_per_modification=3))
+    with pytest.raises(StoreError, match=r"row 17 of scene .* is not complete; wait for the workers"):
+        infer.show_sample(store, run, 17, tmp_path / "out")
+    with pytest.raises(StoreError, match=r"there is no row 24; scene .* has 24 rows"):
+        infer.show_sample(store, run, 24, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_path_becomes_pictures_an_animation_and_a_film(
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    path = frames(Modification.from_vector(np.tile([0, 0, 0, 1], (2, 1))), orbit(scene.spec, 5))
+    found = infer.show_frames(store, trained(), path, tmp_path / "out", fps=10)
+    assert {file.name for file in found.files} == {f"frame-000{i}.png" for i in range(5)} | {"path.gif", "path.mp4"}
+    with Image.open(tmp_path / "out/path.gif") as gif:
+        assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (5, 100, 0)
+    film = decoded(tmp_path / "out/path.mp4", 256, 256)
+    assert len(film) == 5
+    assert np.abs(film[2].astype(int) - pixels(tmp_path / "out/frame-0002.png")).mean() < 8
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    without = infer.show_frames(store, TrainedRun.load(tmp_path / "run"), path, tmp_path / "other")
+    assert not (tmp_path / "other/path.mp4").exists()
+    assert "no MP4: pip install photonfarm-trainer[video]" in without.sentence
+
+
+def test_odd_sizes_become_even_in_a_film_and_stay_odd_in_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    picture = np.full((33, 47, 3), 200, np.uint8)
+    animation.write_mp4([picture] * 3, tmp_path / "film.mp4", 12)
+    animation.write_png(picture, tmp_path / "picture.png")
+    film = decoded(tmp_path / "film.mp4", 48, 34)
+    assert len(film) == 3
+    assert np.abs(film.astype(int) - 200).max() <= 3
+    with pytest.raises(StoreError, match="ffmpeg cannot write the film: "):
+        animation.write_mp4([picture], tmp_path / "missing/film.mp4", 12)
+    assert pixels(tmp_path / "picture.png").shape == (33, 47, 3)
+
+
+def test_what_cannot_be_shown_is_refused(
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trained("light_transport_photons")
+    path = frames(Modification.from_vector(np.tile([0, 0, 0, 1], (2, 1))), orbit(scene.spec, 2))
+    with pytest.raises(SpecError, match="needs photons, and the buffers have none"):
+        infer.show_frames(store, run, path, tmp_path / "out")
+    with pytest.raises(SpecError, match="the buffers are of scene other"):
+        infer.show_frames(store, run, replace(path, scene_id="other"), tmp_path / "out")
+    denoiser = replace(run, settings=run.settings.model_copy(
+        update={"network": run.settings.network.model_copy(update={"architecture": "denoise_4"})}
+    ))  # fmt: skip
+    with pytest.raises(SpecError, match="denoise_4 needs the noisy image of a view"):
+        infer.show_frames(store, denoiser, path, tmp_path / "out")
+    monkeypatch.setattr(infer, "entry_points", lambda **_: ())
+    with pytest.raises(SpecError, match=r"the renderer, which is not installed here; .*buffers --scene .* --orbit 3`"):
+        infer.rendered_frames(store, run, ["--orbit", "3"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_verb_shows_a_row_a_view_or_a_file_of_buffers(
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path
+) -> None:
+    run = trained()
+    reader = SceneReader(store, scene.scene_id)
+    reader.refresh()
+    view, modification = reader.view_key(7).hex(), reader.modification_key(7).hex()
+
+    def shown(*arguments: str) -> bytes:
+        place = ["infer", "--store", str(store), "--run", str(run.folder), "--out", str(tmp_path / "out")]
+        result = CliRunner().invoke(umbrella, [*place, *arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return Path(result.stdout.splitlines()[0]).read_bytes()
+
+    wanted = shown("--row", "7")
+    assert shown("--view", view) == wanted
+    assert shown("--view", " ".join(map(str, reader.read(7).view.vector)), "--modification", modification) == wanted
+    assert shown("--modification", modification) == shown("--row", "6") != wanted
+    frames(reader.read(7).modification, orbit(scene.spec, 2)).write(tmp_path / "buffers.npz")
+    assert shown("--buffers", str(tmp_path / "buffers.npz"))
+    with pytest.raises(StoreError, match="no complete sample of this configuration and view; the nearest planned one"):
+        infer.find_row(store, run, None, "0 0 0 1 1 1")
+
+
+EXCLUDES = "name what to show by one of --row, --view, --camera-path, --orbit, --buffers, or by --modification"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], f"{EXCLUDES}\n"),
+        (["--row", "1", "--orbit", "3"], f"{EXCLUDES}; --row and --orbit exclude each other\n"),
+        (
+            ["--row", "1", "--modification", "0 0 0 1"],
+            "--row has a configuration; --modification cannot give it another",
+        ),
+        (["--orbit", "0"], "Invalid value for '--orbit'"),
+    ],
+)
+def test_the_verb_refuses_none_or_several_things_to_show(arguments: list[str], said: str) -> None:
+    result = CliRunner().invoke(umbrella, ["infer", *arguments])
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+def test_frames_of_a_film_are_poured_one_by_one_and_an_ffmpeg_that_ends_early_is_heard(tmp_path: Path) -> None:
+    """Frames are made as ffmpeg takes them; where it refuses what it is to write, the making stops."""
+    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
+    made = []
+
+    def frames():
+        for i in range(200):
+            made.append(i)
+            yield np.full((64, 64, 3), i, np.uint8)
+
+    animation.write_mp4(frames(), tmp_path / "film.mp4", 12)
+    assert len(made) == len(decoded(tmp_path / "film.mp4", 64, 64)) == 200
+    made.clear()
+
+    def endless():
+        while True:
+            made.append(0)
+            yield np.zeros((256, 256, 3), np.uint8)
+
+    with pytest.raises(StoreError, match="ffmpeg cannot write the film: "):
+        animation.write_mp4(endless(), tmp_path / "missing/film.mp4", 12)

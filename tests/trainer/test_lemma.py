@@ -1,0 +1,189 @@
+"""Lemma 1 on a rendered scene [supplement 3.2]: noisy targets give, on average, the gradient of the clean image.
+
+The room with objects and lights moved, a view at 32², and a network that has been trained a little, so that no gradient
+is zero. K noisy targets and R converged ones have seeds of their own. For each weight tensor, and for all of them as
+one, the statistic is t = |ḡ − ḡ*| / σ: ḡ is the mean gradient over the K noisy targets, ḡ* that over the R converged
+ones, and σ² = tr Σ/K + tr Σ*/R what |ḡ − ḡ*|² is by noise alone. Without bias t² is a weighted sum of χ² of mean 1, so
+that P(t > 3) ≤ P(χ²₁ > 9) = 0.0027 for each tensor (Székely and Bakirov 2003). Seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from photonfarm.renderer import backend
+from photonfarm.renderer.jobs import visibility_of
+from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.shared.modification import sample_modification
+from photonfarm.shared.pointcloud import rebuild
+from photonfarm.shared.records import F32
+from photonfarm.shared.scene import load_spec
+from photonfarm.shared.view import View, sample_view
+from photonfarm.trainer.dataset import Batch, fill
+from photonfarm.trainer.losses import LOSSES
+from photonfarm.trainer.networks import build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.optimisers import build_optimiser
+from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.store_source import StoredSample
+
+SIZE, POINTS = 32, 1024
+K = 336  # noisy targets, of one sample in each half
+R, CONVERGED = 8, 64  # converged targets, and samples in each half of one
+TRAINED_ON, WARM_UP = 16, 100  # noisy targets of their own for the steps before gradients are taken; how many steps
+AT_ONCE = 64  # renders a call, so that one kernel does for all
+
+Loss = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A batch of one with a network, and targets (n, 1, 2, H, W, 3) for it, linear radiance × exposure."""
+
+    batch: Batch
+    network: Network
+    noisy: Tensor
+    converged: Tensor
+
+
+@pytest.fixture(scope="module")
+def rendered() -> Rendered:
+    torch.set_num_threads(1)
+    backend.load(threads=1)
+    room = load_spec("room")
+    film = room.film.model_copy(update={"width": SIZE, "height": SIZE})
+    transport = room.transport.model_copy(update={"half_spp": 1})
+    spec = room.model_copy(update={"film": film, "transport": transport, "points": POINTS})
+    scene = LoadedScene.load(spec)
+    geometry, cloud = scene.base()
+    modification = sample_modification(spec, 0, 0)
+    view = sample_view(spec, modification.key(spec.scene_id), 0, 0)
+    scene.apply(modification)
+
+    noisy = targets(scene, view, K + TRAINED_ON, samples=1, seed=1_000_000)
+    converged = targets(scene, view, R, samples=CONVERGED, seed=2_000_000)
+    seen = visibility_of(scene, view, rebuild(cloud, modification), None)
+    batch = Batch.empty(1, POINTS, spec)
+    fill(batch, 0, StoredSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), seen, 0), spec, cloud)
+
+    settings = TrainSettings(network=NetworkSettings(width=8), learning_rate=2e-3)
+    network = build(settings.network, SceneFrame.of(spec, geometry, cloud, settings.network), 0)
+    noisy, converged = (torch.from_numpy(x * np.float32(spec.exposure)) for x in (noisy, converged))
+    warm_up(network, settings, batch, noisy[K:])
+    return Rendered(batch, network, noisy[:K], converged)
+
+
+def targets(scene: LoadedScene, view: View, count: int, *, samples: int, seed: int) -> F32:
+    """`count` targets whose halves are the mean of `samples` renders of one sample, (count, 1, 2, H, W, 3).
+
+    Every render has a seed of its own.
+    """
+    seeds = range(seed, seed + 2 * count * samples)
+    images = [scene.render_halves(view, seeds[i : i + AT_ONCE]) for i in range(0, len(seeds), AT_ONCE)]
+    return np.concatenate(images).reshape(count, 1, 2, samples, SIZE, SIZE, 3).mean(axis=3)
+
+
+def warm_up(network: Network, settings: TrainSettings, batch: Batch, noisy: Tensor) -> None:
+    """Some steps of training, so that the layers that start at zero have left it."""
+    optimiser = build_optimiser(network.parameters(), settings)
+    for step in range(WARM_UP):
+        optimiser.zero_grad()
+        LOSSES["linear"](network(batch.inputs), noisy[step % len(noisy)]).backward()
+        optimiser.step()
+
+
+# ----------------------------------------------------------------------------------------------------------- statistics
+
+
+@dataclass
+class Gradients:
+    """Mean gradient of each weight tensor over some targets, and the variance of that mean, summed over the tensor."""
+
+    mean: list[Tensor]
+    variance: Tensor  # (tensors,)
+
+
+def gradients(rendered: Rendered, loss: Loss, targets: Tensor, clip: float | None = None) -> Gradients:
+    """Over `targets`, by the network and the loss as in training; each gradient clipped at the norm `clip`."""
+    weights = list(rendered.network.parameters())
+    image = rendered.network(rendered.batch.inputs)
+    total = [torch.zeros_like(w, dtype=torch.float64) for w in weights]
+    squares = torch.zeros(len(weights), dtype=torch.float64)
+    for target in targets:
+        found = torch.autograd.grad(loss(image, target), weights, retain_graph=True)
+        norm = float(torch.stack([g.norm() for g in found]).norm())
+        scale = 1.0 if clip is None else min(1.0, clip / norm)
+        for place, gradient in enumerate(scale * g.double() for g in found):
+            total[place] += gradient
+            squares[place] += gradient.square().sum()
+    n = len(targets)
+    mean = [t / n for t in total]
+    spread = squares / n - torch.stack([m.square().sum() for m in mean])
+    return Gradients(mean, spread / (n - 1))
+
+
+def deviations(noisy: Gradients, clean: Gradients) -> tuple[list[float], float]:
+    """t of each weight tensor, and t of all of them as one vector."""
+    apart = torch.stack([(a - b).square().sum() for a, b in zip(noisy.mean, clean.mean, strict=True)])
+    variance = noisy.variance + clean.variance
+    assert bool((variance > 0).all()), "every weight tensor has a gradient, and noise in it"
+    return (apart / variance).sqrt().tolist(), float((apart.sum() / variance.sum()).sqrt())
+
+
+# ---------------------------------------------------------------------------------------------------------------- tests
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+def test_noisy_targets_give_the_gradient_of_the_clean_image_for_every_weight_tensor(rendered, name: str) -> None:
+    """t ≤ 3 for each tensor and for all as one; a bias of a quarter of the gradient would show."""
+    noisy = gradients(rendered, LOSSES[name], rendered.noisy)
+    clean = gradients(rendered, LOSSES[name], rendered.converged)
+    each, together = deviations(noisy, clean)
+    assert len(each) == sum(1 for _ in rendered.network.parameters()) > 50
+    assert max(*each, together) <= 3
+    length = math.sqrt(sum(float(g.square().sum()) for g in clean.mean))
+    assert 3 * math.sqrt(float((noisy.variance + clean.variance).sum())) < 0.25 * length
+
+
+def log1p(f: Tensor, t: Tensor) -> Tensor:
+    return (torch.log1p(f.clamp(min=-0.9))[:, None] - torch.log1p(t)).square().mean()
+
+
+def display(image: Tensor) -> Tensor:
+    return image.clamp(1e-3, 1) ** (1 / 2.2)
+
+
+BIASED: dict[str, Loss] = {
+    "log1p": log1p,
+    "clip and gamma": lambda f, t: (display(f)[:, None] - display(t)).square().mean(),
+    "targets clamped": lambda f, t: (f[:, None] - t.clamp(max=1)).square().mean(),
+    "L1": lambda f, t: (f[:, None] - t).abs().mean(),
+    "relative, noisy weight": lambda f, t: ((f[:, None] - t).square() / (t.square() + 0.1)).mean(),
+    "relative, weight not detached": lambda f, t: ((f[:, None] - t).square() / (f[:, None].square() + 0.1)).mean(),
+}
+
+
+@pytest.mark.parametrize("name", sorted(BIASED))
+def test_a_biased_loss_misses_its_own_gradient_at_the_clean_image(rendered, name: str) -> None:
+    noisy = gradients(rendered, BIASED[name], rendered.noisy[: K // 4])
+    each, together = deviations(noisy, gradients(rendered, BIASED[name], rendered.converged))
+    assert together > 10
+    assert min(each) > 3
+
+
+def test_clipped_gradients_miss_the_clean_gradient(rendered) -> None:
+    """Clipped at the clean gradient's own norm, which would never touch it."""
+    clean = gradients(rendered, LOSSES["linear"], rendered.converged)
+    norm = math.sqrt(sum(float(g.square().sum()) for g in clean.mean))
+    noisy = gradients(rendered, LOSSES["linear"], rendered.noisy[: K // 2], clip=norm)
+    each, together = deviations(noisy, clean)
+    assert together > 5
+    assert np.mean(np.array(each) > 3) > 0.8

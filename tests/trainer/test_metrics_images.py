@@ -1,0 +1,182 @@
+"""Metrics of pairs of images: the metric space, MSE, MSSIM, FLIP, intervals."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from flip_evaluator import evaluate
+from numpy.typing import NDArray
+from scipy import stats
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.trainer.metrics import confidence_interval, flip, metric_space, mse, mssim
+from photonfarm.trainer.metrics.intervals import PerImage, t_975
+
+
+def _pictures(count: int, size: tuple[int, int], seed: int) -> NDArray[np.float32]:
+    """Smooth exposed radiance with a few lamps, (count, *size, 3)."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0 : size[0], 0 : size[1]] / 10
+    waves = [np.sin(a * x + b * y + c) for a, b, c in rng.uniform(0, 3, (count * 3, 3))]
+    images = np.exp(np.stack(waves)).reshape(count, 3, *size).transpose(0, 2, 3, 1) / 2
+    images[:, ::7, ::9] *= 20
+    return images.astype(np.float32)
+
+
+def _noisy(images: NDArray[np.float32], strength: float, seed: int) -> NDArray[np.float32]:
+    factor = np.random.default_rng(seed).gamma(1 / strength**2, strength**2, images.shape)
+    return (images * factor).astype(np.float32)
+
+
+# ------------------------------------------------------------------------------------------------------ metric space
+
+
+def test_the_metric_space_is_clipped_exposed_radiance_to_the_power_of_1_over_2_2() -> None:
+    exposed = np.array([-1.0, 0.0, 0.25, 1.0, 7.0, np.inf], np.float32)
+    shown = metric_space(exposed.reshape(1, 1, 2, 3))
+    assert shown.dtype == torch.float32
+    assert torch.allclose(shown.flatten(), torch.tensor([0, 0, 0.25 ** (1 / 2.2), 1, 1, 1]))
+
+
+def test_arrays_that_may_not_be_written_and_tensors_that_are_learned_are_shown_alike() -> None:
+    grey = np.broadcast_to(np.float32(0.5), (2, 4, 5, 3))
+    learned = torch.full((2, 4, 5, 3), 0.5, requires_grad=True)
+    assert torch.equal(metric_space(grey), metric_space(learned))
+    assert not metric_space(learned).requires_grad
+
+
+def test_what_is_not_a_number_has_no_error_and_is_named() -> None:
+    images = np.ones((3, 4, 4, 3), np.float32)
+    images[2, 1, 1, 0] = np.nan
+    with pytest.raises(SpecError, match="image 2 of 3 holds values that are not numbers"):
+        metric_space(images)
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (1, 4, 4, 4), (1, 2, 4, 4, 3)])
+def test_metrics_are_taken_of_batches_of_colour_images(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"metrics are taken of \(N, H, W, 3\)"):
+        metric_space(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("metric", [mse, mssim, flip])
+def test_a_prediction_is_compared_with_one_reference_of_its_size(metric) -> None:
+    with pytest.raises(ValueError, match="each prediction is compared with the reference of its own view"):
+        metric(torch.zeros(2, 16, 16, 3), torch.zeros(1, 16, 16, 3))
+
+
+# --------------------------------------------------------------------------------------------------------------- MSE
+
+
+def test_mse_is_the_mean_squared_difference_of_each_image() -> None:
+    black, greys = torch.zeros(3, 4, 5, 3), torch.tensor([0.0, 0.1, 0.5])
+    assert mse(greys[:, None, None, None].expand(3, 4, 5, 3), black) == pytest.approx([0, 0.01, 0.25])
+
+
+# --------------------------------------------------------------------------------------------------------- intervals
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 7, 10, 30, 100, 10_000])
+def test_the_quantile_of_students_t_is_that_of_scipy_within_two_thousandths(freedom: int) -> None:
+    assert t_975(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=2e-3)
+
+
+def test_an_interval_is_students_and_needs_two_groups() -> None:
+    values = np.array([1.0, 2.0, 4.0, 9.0])
+    found = PerImage.of(values)
+    expected = stats.t.interval(0.95, 3, loc=values.mean(), scale=stats.sem(values))
+    assert found.interval == pytest.approx(expected, abs=2e-3 * (expected[1] - expected[0]))
+    assert PerImage.of(values, ["a"] * 4).interval is None
+    assert confidence_interval(PerImage.of(values[:1]).estimate) is None
+    with pytest.raises(ValueError, match="at least one degree of freedom"):
+        t_975(0)
+
+
+# ------------------------------------------------------------------------------------------------------------- MSSIM
+
+
+def _ssim_by_hand(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Wang et al. 2004, eq. 13, window by window: (H, W) each."""
+    offset = np.arange(11) - 5
+    weight = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
+    weight /= weight.sum()
+    found = []
+    for top, left in itertools.product(range(x.shape[0] - 10), range(x.shape[1] - 10)):
+        a, b = (image[top : top + 11, left : left + 11] for image in (x, y))
+        mean_a, mean_b = (weight * a).sum(), (weight * b).sum()
+        var_a, var_b = (weight * (a - mean_a) ** 2).sum(), (weight * (b - mean_b) ** 2).sum()
+        both = (weight * (a - mean_a) * (b - mean_b)).sum()
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        found.append(luminance * (2 * both + 9e-4) / (var_a + var_b + 9e-4))
+    return float(np.mean(found))
+
+
+def test_mssim_is_the_formula_window_by_window() -> None:
+    clean = metric_space(_pictures(2, (17, 23), 7))
+    other = metric_space(_noisy(_pictures(2, (17, 23), 7), 0.3, 8))
+    x, y = clean.double().numpy(), other.double().numpy()
+    expected = [np.mean([_ssim_by_hand(a[..., c], b[..., c]) for c in range(3)]) for a, b in zip(x, y, strict=True)]
+    assert mssim(clean, other) == pytest.approx(expected, abs=1e-12)
+    assert min(expected) < 0.9
+
+
+def test_mssim_agrees_with_scikit_image_to_five_digits() -> None:
+    metrics = pytest.importorskip("skimage.metrics")
+    clean, other = metric_space(_pictures(2, (40, 31), 9)), metric_space(_noisy(_pictures(2, (40, 31), 9), 0.5, 10))
+    how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    expected = [
+        metrics.structural_similarity(x.astype(np.float64), y.astype(np.float64), channel_axis=-1, **how)
+        for x, y in zip(clean.numpy(), other.numpy(), strict=True)
+    ]
+    assert mssim(clean, other) == pytest.approx(expected, abs=1e-5)
+
+
+def test_mssim_agrees_with_pytorch_msssim_to_five_digits() -> None:
+    package = pytest.importorskip("pytorch_msssim")
+    clean, other = metric_space(_pictures(2, (40, 31), 9)), metric_space(_noisy(_pictures(2, (40, 31), 9), 0.5, 10))
+    expected = package.ssim(clean.movedim(-1, 1), other.movedim(-1, 1), data_range=1, size_average=False)
+    assert mssim(clean, other) == pytest.approx(expected.numpy(), abs=1e-5)
+
+
+def test_mssim_is_1_for_equal_images_and_needs_room_for_a_window() -> None:
+    images = metric_space(_pictures(2, (11, 12), 11))
+    assert mssim(images, images) == pytest.approx([1, 1])
+    with pytest.raises(ValueError, match="images are 10×12 pixels; MSSIM needs at least 11×11"):
+        mssim(images[:, :10], images[:, :10])
+
+
+# -------------------------------------------------------------------------------------------------------------- FLIP
+
+
+def test_flip_is_0_for_equal_images_and_grows_with_the_noise() -> None:
+    clean = _pictures(2, (32, 48), 12)
+    shown = metric_space(clean)
+    found = [flip(metric_space(_noisy(clean, strength, 13)), shown) for strength in (0.05, 0.2, 0.8)]
+    assert flip(shown, shown) == pytest.approx([0, 0])
+    assert np.all(np.diff(np.stack(found), axis=0) > 0)
+    assert found[0].min() > 0.001
+
+
+def test_flip_is_that_of_a_viewer_who_sees_67_pixels_per_degree() -> None:
+    """The authors' viewer: 0.7 m before a screen of 3840 pixels and 0.7 m."""
+    clean = _pictures(1, (32, 48), 12)
+    shown, wanted = metric_space(_noisy(clean, 0.3, 13)), metric_space(clean)
+    viewer = {"vc": [0.7, 3840.0, 0.7]}
+    expected = evaluate(wanted[0].numpy(), shown[0].numpy(), "LDR", applyMagma=False, parameters=viewer)[1]
+    assert flip(shown, wanted) == pytest.approx([expected], rel=1e-6)
+
+
+def test_flip_of_black_against_white_is_nearly_1() -> None:
+    black, white = torch.zeros(1, 16, 16, 3), torch.ones(1, 16, 16, 3)
+    assert flip(black, white)[0] > 0.9
+
+
+@pytest.mark.parametrize("metric", [mse, mssim, flip])
+def test_every_image_has_its_own_value_whatever_else_is_in_the_batch(metric) -> None:
+    clean = _pictures(3, (16, 16), 14)
+    shown, wanted = metric_space(_noisy(clean, 0.3, 15)), metric_space(clean)
+    alone = [float(metric(shown[i : i + 1], wanted[i : i + 1])[0]) for i in range(3)]
+    assert metric(shown, wanted) == pytest.approx(alone, rel=1e-9)
+    assert len({round(value, 9) for value in alone}) == 3
+    assert all(math.isfinite(value) for value in alone)

@@ -1,0 +1,118 @@
+"""What a denoiser sees of a noisy image, what it is trained on, and its error without the noise. Limits are 3 σ."""
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.shared.estimate import Estimate, clean_error, clean_error_having_seen_a
+from photonfarm.trainer.dataset import Batch, kept_pixels, read_into
+from photonfarm.trainer.evaluation import batches, measure
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.settings import NetworkSettings
+
+DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
+
+
+def batch_of(source, rows: tuple[int, ...], architecture: str) -> Batch:
+    needs, (_, cloud) = ARCHITECTURES[architecture].needs, source.base()
+    batch = Batch.empty(len(rows), len(cloud.position), source.spec, needs)
+    return read_into(batch, source, rows, needs, cloud)
+
+
+@pytest.mark.parametrize(("architecture", "of"), DENOISERS.items())
+def test_exactly_so_many_pixels_are_kept_and_the_rest_is_zero(make_source, architecture: str, of: int) -> None:
+    source = make_source(4)
+    batch = batch_of(source, (0, 1, 2, 3), architecture)
+    noisy = batch.inputs.noisy
+    assert noisy.kept.sum(dim=(1, 2)).tolist() == [256 // of] * 4
+    assert torch.equal(noisy.colour, batch.target[:, 0] * noisy.kept[..., None])
+
+
+@pytest.mark.parametrize("architecture", DENOISERS)
+def test_a_denoiser_sees_the_kept_pixels_of_half_a_and_nothing_else_of_the_image(
+    make_source, architecture: str
+) -> None:
+    source = make_source(1)
+    settings = NetworkSettings(width=4, architecture=architecture)
+    network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
+    sample = source.read(0)
+    kept = kept_pixels(sample, source.spec, DENOISERS[architecture])
+
+    def image() -> torch.Tensor:
+        with torch.no_grad():
+            return network(batch_of(source, (0,), architecture).inputs)
+
+    source.read = lambda _: sample
+    before = image()
+    sample.radiance[1] = 1e3
+    sample.radiance[0][~kept] = 1e3
+    assert torch.equal(image(), before)
+    sample.radiance[0][np.argwhere(kept)[0][0], np.argwhere(kept)[0][1]] += 1
+    assert not torch.equal(image(), before)
+
+
+def test_the_pixels_kept_follow_from_what_the_sample_is(make_source) -> None:
+    source, again = make_source(3), make_source(3)
+    kept = [kept_pixels(source.read(row), source.spec, 4) for row in range(3)]
+    assert all(np.array_equal(kept[row], kept_pixels(again.read(row), again.spec, 4)) for row in range(3))
+    assert not np.array_equal(kept[0], kept[1])
+    fewer = kept_pixels(source.read(0), source.spec, 16)
+    assert not (fewer & ~kept[0]).any()
+
+
+def test_pixels_are_kept_uniformly(make_source) -> None:
+    """Binomial over 400 samples, the largest of 256 pixels: |z| < 4.5 has a chance of 0.998."""
+    source = make_source(400)
+    times = sum(kept_pixels(source.read(row), source.spec, 4).astype(int) for row in range(400))
+    assert np.abs(times - 100).max() < 4.5 * np.sqrt(400 * 3 / 16)
+
+
+def test_a_denoiser_is_trained_from_a_to_b_and_from_b_to_a(make_source) -> None:
+    source = make_source(2)
+    plain = batch_of(source, (0, 1), "denoise_4")
+    pairs = plain.for_training()
+    assert pairs.rows == (0, 1, 0, 1)
+    assert pairs.target.shape == (4, 1, 16, 16, 3)
+    kept = plain.inputs.noisy.kept[..., None]
+    for inputs, target, places in ((0, 1, slice(0, 2)), (1, 0, slice(2, 4))):
+        assert torch.equal(pairs.inputs.noisy.colour[places], plain.target[:, inputs] * kept)
+        assert torch.equal(pairs.target[places, 0], plain.target[:, target])
+        assert torch.equal(pairs.inputs.albedo[places], plain.inputs.albedo)
+    assert batch_of(source, (0, 1), "cnn").for_training().target.shape == (2, 2, 16, 16, 3)
+
+
+def test_the_error_of_a_prediction_made_from_a_has_the_noise_removed() -> None:
+    """A blur of A, against the clean image; the error for predictions that saw neither half is far off."""
+    rng = np.random.default_rng(0)
+    clean = rng.random((16, 16, 3), np.float32)
+    found, naive, truth = [], [], []
+    for _ in range(1500):
+        a, b = (clean * rng.gamma(0.5, 2, (2, 16, 16, 3))).astype(np.float32)
+        blurred = 0.5 * a + 0.25 * (np.roll(a, 1, axis=0) + np.roll(a, -1, axis=0))
+        found.append(clean_error_having_seen_a(blurred, a, b) - float(np.mean((blurred - clean) ** 2)))
+        naive.append(clean_error(blurred, a, b) - float(np.mean((blurred - clean) ** 2)))
+        truth.append(float(np.mean((blurred - clean) ** 2)))
+    difference = Estimate.of(np.array(found))
+    assert abs(difference.mean) < 3 * difference.standard_error
+    assert difference.standard_error < 0.02 * np.mean(truth)
+    assert abs(np.mean(naive)) > 0.2 * np.mean(truth)
+
+
+def test_a_predictor_that_is_not_trained_is_fed_what_it_needs_and_measured_like_a_network(make_source, tiny) -> None:
+    """The mean colour of the kept pixels everywhere, though the settings' network needs nothing of an image."""
+
+    def predict(batch: Batch) -> np.ndarray:
+        noisy = batch.inputs.noisy
+        mean = noisy.colour.sum(dim=(1, 2)) / noisy.kept.sum(dim=(1, 2))[:, None]
+        return mean[:, None, None].expand(-1, 16, 16, 3).numpy()
+
+    source = make_source(60)
+    with Feed(source, tiny(), needs=Needs(points=False, kept=4)) as feed:
+        found = measure(predict, batches(feed, range(60), 3))
+    constants = [source.clean(row).mean(axis=(0, 1)) for row in range(60)]
+    least = np.mean([np.mean((source.clean(row) - constants[row]) ** 2) for row in range(60)])
+    assert found.error.standard_error < 0.3 * least
+    assert -3 * found.error.standard_error < found.error.mean - least < 0.2 * least + 3 * found.error.standard_error

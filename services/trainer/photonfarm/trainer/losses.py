@@ -11,8 +11,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-RELATIVE_EPSILON = 1.0
-"""Squared exposed radiance: what is darker than the display's white counts about as in the linear loss."""
+RELATIVE_EPSILON = 0.05
+"""Squared exposed radiance: the display's middle grey, 0.5^2.2 ≈ 0.22. What is darker counts about as in the linear
+loss; with the white's 1 instead, the edges of lamps still outweighed what their light does to a room."""
 
 
 def linear_loss(prediction: Tensor, target: Tensor) -> Tensor:

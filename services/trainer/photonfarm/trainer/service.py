@@ -60,7 +60,7 @@ def run(
             assist(partial(StoreSource, store), settings, folder, ours)
             return
         with leading(group):
-            click.echo(f"training on {described(device)}", err=True)
+            click.echo(f"training on {described(device, settings.network.precision)}", err=True)
             _lead(load_spec(spec).scene_id if spec else None, store, folder, settings, redis_url, stop, group)
 
 

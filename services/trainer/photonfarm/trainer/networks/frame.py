@@ -21,7 +21,8 @@ class SceneFrame:
     """The constants of a scene by which inputs are brought near 1; all ours, as the supplement is silent.
 
     Positions are taken about the centre of the geometry's bounding box and, like depths, divided by half its diagonal.
-    Emission is divided by the largest in the cloud. Normals, rays and albedo are near 1 as they are.
+    Emission is divided by its root mean square over the cloud: lamps, few points among many, stand out so far that
+    maxima over the points tell of where they are before any step. Normals, rays and albedo are near 1 as they are.
     """
 
     optics: Optics
@@ -42,7 +43,7 @@ class SceneFrame:
         """
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)
-        emission = cloud.emission[used] / max(float(cloud.emission.max()), 1e-30)
+        emission = cloud.emission[used] / max(float(np.sqrt(np.mean(cloud.emission[used] ** 2))), 1e-30)
         appearance = np.concatenate([cloud.normal[used], cloud.albedo[used], emission], axis=1)
         scale = max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
         return cls(

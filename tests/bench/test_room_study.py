@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from analytic_scene import small_spec
 from numpy.typing import NDArray
 
 import noise_budget
 from noise_budget import Arm, slices_of
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.store_source import StoreSource
@@ -23,17 +23,6 @@ from store_contents import Pool, commit
 
 SIZE, SLOTS, BUDGET = 8, 8, 16
 Root = tuple[Path, str]
-
-
-def small_spec() -> SceneSpec:
-    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
-    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit}
-    described = {
-        "name": "random", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
-        "view": {"origin": unit, "look_at": unit}, "film": {"width": SIZE, "height": SIZE},
-        "photons": {"paths": 4, "depth": 2}, "transport": {"half_spp": noise_budget.HALF_SPP},
-    }  # fmt: skip
-    return parse_spec(described, where="test")
 
 
 def pool() -> Pool:
@@ -52,7 +41,8 @@ def pool() -> Pool:
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
     """Samples of a budget of 16 spp for two seeds: passes of 2 spp, 8 of the first views, then 2, then 1."""
-    spec, store = small_spec(), Store(tmp_path_factory.mktemp("study") / "store", create=True)
+    store = Store(tmp_path_factory.mktemp("study") / "store", create=True)
+    spec = small_spec(film={"width": SIZE, "height": SIZE}, transport={"half_spp": noise_budget.HALF_SPP})
     scene = store.add(spec)
     for modifications, passes in ((8, 8), (20, 2), (40, 1)):
         scene.plan(Request(modifications=modifications, passes=passes), shard_rows=16)

@@ -7,25 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from analytic_scene import small_spec
 
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from store_contents import EncodedPool, Pool, commit, commit_encoded
 
 SIZE, SLOTS = 8, 8
-
-
-def small_spec() -> SceneSpec:
-    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
-    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit}
-    described = {
-        "name": "random", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
-        "view": {"origin": unit, "look_at": unit}, "film": {"width": SIZE, "height": SIZE},
-        "photons": {"paths": 4, "depth": 2},
-    }  # fmt: skip
-    return parse_spec(described, where="test")
 
 
 def pool(scale: float) -> Pool:
@@ -54,7 +44,7 @@ def files(scene: SceneStore) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("scale", [1.0, 1e6])  # within float16 and beyond
 def test_rows_encoded_before_become_the_same_files(tmp_path: Path, scale: float) -> None:
-    spec = small_spec()
+    spec = small_spec(film={"width": SIZE, "height": SIZE})
     ways = [(commit, pool(scale)), (commit_encoded, EncodedPool(pool(scale), spec))]
     found = []
     for number, (way, contents) in enumerate(ways):

@@ -38,12 +38,19 @@ def test_the_image_synthesis_layer_has_the_published_size() -> None:
 
 
 def test_the_light_transport_layer_is_the_one_of_figure_1() -> None:
-    made = layer()
+    made = layer().double()
     assert parameters(made) == (9 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
-    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    varying, fixed, visible = torch.randn(2, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(2, 50) < 0.7
     found = made(varying, fixed, visible)
     assert found.shape == (2, 50, 64)
     torch.testing.assert_close(found, as_drawn(made, torch.cat([varying, fixed.expand(2, -1, -1)], dim=2), visible))
+
+
+def test_features_of_size_one_stay_so_before_any_step() -> None:
+    """From torch's own start they would shrink with each layer, far below the U-Net's other channels."""
+    torch.manual_seed(0)
+    found = LightTransportLayer(3, 6)(torch.randn(2, 500, 3), torch.randn(500, 6), torch.ones(2, 500, dtype=torch.bool))
+    assert 0.8 < found[..., :32].std() < 2.5
 
 
 def test_a_residual_block_starts_as_its_shortcut() -> None:

@@ -11,6 +11,7 @@ import s3_server
 
 from photonfarm.shared.queue import connect
 from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import Store
 
 
 @pytest.fixture(scope="session")
@@ -39,6 +40,12 @@ def connection(common_redis: EmbeddedRedis) -> Iterator[redis.Redis]:
     with connect(common_redis.url) as connected:
         connected.flushall()
         yield connected
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """An empty one."""
+    return Store(tmp_path / "store", create=True)
 
 
 @pytest.fixture(scope="session")

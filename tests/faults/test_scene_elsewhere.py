@@ -27,11 +27,6 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def elsewhere(analytic: ModuleType, store: Store, file: Path) -> SceneStore:
     """A scene of one job that was planned where its file is; here it is missing."""
     spec = analytic.small_spec(scene={"file": file.name})

@@ -39,11 +39,6 @@ def two_may_be_committed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def add(store: Store, analytic: ModuleType) -> Callable[..., SceneStore]:
     """A scene of four jobs of two samples, of which some are committed."""
 

@@ -20,11 +20,6 @@ from photonfarm.shared.store import SceneStore, Store
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def scene(analytic: ModuleType, store: Store) -> SceneStore:
     """Four jobs of two samples."""
     return store.scene(store.plan(analytic.small_spec(), Request(modifications=8), shard_rows=2).scene_id)

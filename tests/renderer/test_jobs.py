@@ -19,11 +19,6 @@ from photonfarm.shared.store.check import check_store
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def scene(analytic: ModuleType, store: Store) -> SceneStore:
     """Two jobs: 3 modifications × 2 views × 2 passes, 8 samples a job."""
     request = Request(modifications=3, views_per_modification=2, passes=2)

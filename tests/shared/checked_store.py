@@ -13,11 +13,6 @@ from photonfarm.shared.store.check import StoreReport, check_store
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def scene(store: Store) -> SceneStore:
     """Three jobs of 4, 4 and 2 samples, all committed, one of them in radiance_wide; and the base."""
     request = Request(modifications=5, views_per_modification=2)

@@ -1,7 +1,5 @@
 """A small scene to queue, its names, and what the tests of the queue look at in Redis."""
 
-from pathlib import Path
-
 import pytest
 import redis
 import store_samples as samples
@@ -12,11 +10,6 @@ from photonfarm.shared.store import SceneStore, Store
 
 SCENE_ID = "0123456789abcdef" * 2
 NAME = f"{SCENE_ID}-7"
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
 
 
 @pytest.fixture

@@ -4,10 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 
+from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec, parse_spec
-from photonfarm.shared.store import Figures, SceneStore
+from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
 
@@ -32,6 +34,20 @@ def small_spec(**changes: Any) -> SceneSpec:
         "photons": {"paths": 4, "depth": 2},
     }  # fmt: skip
     return parse_spec({**described, **changes}, where="test")
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """Three jobs of 4, 4 and 2 samples: 5 modifications, 2 views each."""
+    request = Request(modifications=5, views_per_modification=2)
+    return store.scene(store.plan(small_spec(), request, shard_rows=4).scene_id)
+
+
+def reader_of(scene: SceneStore) -> SceneReader:
+    """A reader that has looked."""
+    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
+    reader.refresh()
+    return reader
 
 
 def outputs(scene: SceneStore, job: int) -> Outputs:

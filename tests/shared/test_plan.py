@@ -40,11 +40,6 @@ def planned(scene: SceneStore) -> list[Triple]:
     ]
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
 def test_a_request_is_every_combination_of_modification_view_and_pass(store: Store) -> None:
     result = store.plan(samples.small_spec(), Request(modifications=5, views_per_modification=3, passes=2))
     scene = store.scene(result.scene_id)

@@ -32,7 +32,7 @@ from photonfarm.shared.queue import (
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
-store, scene = queue_samples.store, queue_samples.scene
+scene = queue_samples.scene
 queued = queue_samples.queued
 
 

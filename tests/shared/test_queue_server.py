@@ -22,7 +22,7 @@ from photonfarm.shared.queue import connect, open_queue, queue_status, reconcile
 from photonfarm.shared.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.store import SceneStore, Store
 
-store, scene = queue_samples.store, queue_samples.scene
+scene = queue_samples.scene
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 START = Path(__file__).parents[2] / "docker/redis.sh"
 COMPOSE = Path(__file__).parents[2] / "docker-compose.yml"

@@ -8,7 +8,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.queue import FAILED, QUEUE, Failure, job_name, open_queue, queue_status, reconcile
 from photonfarm.shared.store import SceneStore, Store
 
-store, scene = queue_samples.store, queue_samples.scene
+scene = queue_samples.scene
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 pushed, queued = queue_samples.pushed, queue_samples.queued
 WORKERS = f"rq:workers:{QUEUE}"

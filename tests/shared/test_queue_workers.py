@@ -12,7 +12,6 @@ from photonfarm.shared import queue
 from photonfarm.shared.queue import queue_status, reconcile
 from photonfarm.shared.store import Store
 
-store = queue_samples.store
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 
 

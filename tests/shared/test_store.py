@@ -14,23 +14,7 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
-def scene(store: Store) -> SceneStore:
-    """Three jobs of 4, 4 and 2 samples: 5 modifications, 2 views each."""
-    request = Request(modifications=5, views_per_modification=2)
-    return store.scene(store.plan(samples.small_spec(), request, shard_rows=4).scene_id)
-
-
-def reader_of(scene: SceneStore) -> SceneReader:
-    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
-    reader.refresh()
-    return reader
+scene, reader_of = samples.scene, samples.reader_of
 
 
 def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore) -> None:

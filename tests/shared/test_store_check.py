@@ -21,7 +21,7 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store, schema
 from photonfarm.shared.store.job_check import JobCheck
 from photonfarm.shared.store.local import LocalStorage
 
-store, scene = stores.store, stores.scene
+scene = stores.scene
 samples, checked, found, noted = stores.samples, stores.checked, stores.found, stores.noted
 shard, flip, marker, recommitted = stores.shard, stores.flip, stores.marker, stores.recommitted
 

@@ -14,7 +14,7 @@ from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store, r
 from photonfarm.shared.store.check import StoreReport, said
 from photonfarm.shared.view import Camera
 
-store, scene = stores.store, stores.scene
+scene = stores.scene
 samples, outputs, checked, found = stores.samples, stores.outputs, stores.checked, stores.found
 noted, shard, marker, recommitted = stores.noted, stores.shard, stores.marker, stores.recommitted
 

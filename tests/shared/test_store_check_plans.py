@@ -15,7 +15,7 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.top_up import TopUp
 
-store, scene = stores.store, stores.scene
+scene = stores.scene
 samples, commit_all, checked, found = stores.samples, stores.commit_all, stores.checked, stores.found
 noted, data, shard, flip = stores.noted, stores.data, stores.shard, stores.flip
 marker = stores.marker

@@ -18,7 +18,7 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, check
 from photonfarm.shared.store.quarantine import Quarantine
 
-store, scene, outputs = stores.store, stores.scene, stores.outputs
+scene, outputs = stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data
 shard, flip, marker, recommitted = stores.shard, stores.flip, stores.marker, stores.recommitted
 

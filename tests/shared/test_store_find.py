@@ -20,11 +20,6 @@ from photonfarm.shared.store.plans import StoredPlan
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
 def scene(store: Store) -> SceneStore:
     """6 modifications with 2 views of 2 passes each: jobs 0 to 5 of plan 0 are pass 0, those of plan 1 pass 1."""
     views = Request(modifications=6, views_per_modification=2)

@@ -20,11 +20,6 @@ from photonfarm.shared.store.local import LocalStorage
 DOCUMENT = Path(__file__).parents[2] / "docs/store-format.md"
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
     """Two jobs of 4 samples and 1; base and job 0 are there. Not to be changed."""

@@ -34,11 +34,6 @@ def redis_url(redis_server: EmbeddedRedis) -> str:
     return redis_server.url
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
 def planned(store: Store, points: int = 16) -> SceneStore:
     """Two jobs of two samples, the first of them committed."""
     spec = samples.small_spec(points=points)

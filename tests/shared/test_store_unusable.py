@@ -13,25 +13,9 @@ import store_samples as samples
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneStore, Store
 
-
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(tmp_path / "store", create=True)
-
-
-@pytest.fixture
-def scene(store: Store) -> SceneStore:
-    """Three jobs of 4, 4 and 2 samples: 5 modifications, 2 views each."""
-    request = Request(modifications=5, views_per_modification=2)
-    return store.scene(store.plan(samples.small_spec(), request, shard_rows=4).scene_id)
-
-
-def reader_of(scene: SceneStore) -> SceneReader:
-    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
-    reader.refresh()
-    return reader
+scene, reader_of = samples.scene, samples.reader_of
 
 
 def test_a_missing_store_and_a_folder_that_is_none_are_refused(tmp_path: Path) -> None:

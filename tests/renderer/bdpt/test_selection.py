@@ -57,6 +57,15 @@ def test_probabilities_sum_to_one_in_every_cell_and_are_positive_for_what_shines
     assert (probabilities[:, dark] == 0).all()
 
 
+def test_points_that_are_not_finite_are_in_some_cell() -> None:
+    lights = read_lights(two_lights(1.0, 2.0))
+    points = mi.Point3f([np.nan, np.inf, 0.5, -np.inf], [0.5, np.nan, np.nan, np.nan], [np.nan, 0.5, np.inf, np.nan])
+    number, probability = lights.selection.choose(points, dr.opaque(mi.Float, 0.5, 4))
+    assert (np.array(number) < 2).all()
+    assert np.isin(np.array(probability), np.array(lights.selection.pmf)).all()
+    assert (np.array(lights.selection._cell(points)) < CELLS).all()
+
+
 def _is_dark(emitter: Any) -> bool:
     parameters = mi.traverse(emitter)
     keys = [key for key in parameters.keys() if key.endswith(".value")]  # noqa: SIM118 - no mapping

@@ -51,9 +51,13 @@ class Selection:
         return dr.gather(mi.Float, self.pmf, self._cell(p) * self.count + slot, number != 0)
 
     def _cell(self, p: Any) -> Any:
+        """The cell that points lie in or are next to; any one for points that are not finite.
+
+        NaN converts to what the processor likes: with AVX2 to what lies far outside the table.
+        """
         place = dr.clip((p - self.lower) * self.cells_per_length, 0, CELLS - 0.5)
         x, y, z = (mi.UInt32(place[k]) for k in range(3))
-        return (z * CELLS + y) * CELLS + x
+        return dr.minimum((z * CELLS + y) * CELLS + x, CELLS**3 - 1)
 
 
 def read_selection(pointers: Any, ids: list[int], base: Any, box: Any) -> Selection:

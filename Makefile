@@ -19,9 +19,9 @@ demo: $(STAMP)
 	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 3000 --store demo/store --run demo/run --out demo
 
 # Two at a time, as most tests wait or use one core; a file's tests together, as they share servers and scenes; in order,
-# as the longest files come early.
+# as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)

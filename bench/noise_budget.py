@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 
 import results
 import room_study
-from photonfarm.shared.keys import Key
 from photonfarm.shared.plan import Request
-from photonfarm.shared.records import BasePointCloud, Geometry, Photons, ViewBuffers, arrays_of
+from photonfarm.shared.records import ViewBuffers, arrays_of
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store.reader import SceneReader
 from photonfarm.shared.top_up import TopUp
@@ -43,8 +42,8 @@ ARCHITECTURE = "light_transport"
 MOST_SEEDS = SPP[1] - 1  # with so many slices the second arm needs fewer configurations than the first has
 
 
-class Arm:
-    """A `SampleSource` of samples of `spp`, one view each of so many configurations that they make up a budget.
+class Arm(StoreSource):
+    """Samples of `spp`, one view each of so many configurations that they make up a budget.
 
     A sample's halves are means of the halves of its view's first passes. A sample of one spp is a half A, as both of
     its halves, so that the loss sees no other. An arm of a slice holds every `slices`-th configuration, and one of
@@ -53,14 +52,15 @@ class Arm:
 
     def __init__(self, root: Path, scene_id: str, spp: int, budget: int, slice_: tuple[int, int] = (0, 1)) -> None:
         """Of a slice, its number and how many there are; raises ValueError where the store has too few samples."""
-        self._source, reader = StoreSource(root, scene_id), SceneReader(root, scene_id)
+        super().__init__(root, scene_id)
+        reader = SceneReader(root, scene_id)
         self._spp, self._wanted = spp, -(-spp // (2 * HALF_SPP))
-        complete = self._source.refresh().tolist()
+        complete = super().refresh().tolist()
         reader.refresh()
         first = {reader.view_row(row): row for row in reversed(complete)}
         passes = {row: reader.rows_of_view(view).tolist() for view, row in sorted(first.items())}
         self._passes = {row: of[: self._wanted] for row, of in passes.items()}
-        held_out = dict(zip(self._passes, rows_held_out(self._source, list(self._passes), HELD_OUT), strict=True))
+        held_out = dict(zip(self._passes, rows_held_out(self, list(self._passes), HELD_OUT), strict=True))
         number, slices = slice_
         enough = [row for row, held in held_out.items() if not held and len(self._passes[row]) == self._wanted]
         self.rows = enough[number::slices][: budget // spp]
@@ -70,19 +70,6 @@ class Arm:
                 f"slice {number} of {slices}: {len(self.rows)} views have {self._wanted} passes, and {budget // spp} "
                 "are needed"
             )
-
-    def ready(self) -> bool:
-        """It is."""
-        return self._source.ready()
-
-    @property
-    def spec(self) -> SceneSpec:
-        """The scene's spec."""
-        return self._source.spec
-
-    def base(self) -> tuple[Geometry, BasePointCloud]:
-        """The geometry and the base cloud."""
-        return self._source.base()
 
     def refresh(self) -> NDArray[np.int64]:
         """The chosen samples, at the first call."""
@@ -98,31 +85,15 @@ class Arm:
         return [self._mean(row) for row in rows]
 
     def _mean(self, row: int) -> StoredSample:
-        read = self._source.read_batch(self._passes[row])
+        read = super().read_batch(self._passes[row])
         halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
         halves = halves[[0, 0]] if self._spp < 2 * HALF_SPP else halves
         buffers: dict[str, Any] = {name: values.copy() for name, values in arrays_of(read[0].buffers).items()}
         return replace(read[0], radiance=halves, scale=1.0, buffers=ViewBuffers(**buffers))
 
-    def read_photons(self, row: int) -> Photons:
-        """The photons of a row's configuration."""
-        return self._source.read_photons(row)
-
-    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
-        """The content key of each row's configuration."""
-        return self._source.modification_keys(rows)
-
-    def view_keys(self, rows: Sequence[int]) -> list[Key]:
-        """The content key of each row's configuration and view."""
-        return self._source.view_keys(rows)
-
     def planned(self) -> int:
         """As many as were chosen."""
         return len(self.rows) + 1
-
-    def plan_requests(self) -> list[dict[str, Any]]:
-        """What was asked for."""
-        return self._source.plan_requests()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ def test_the_papers_presets_are_what_the_supplement_states() -> None:
         assert (settings.network.width, settings.network.points) == (64, 16384)
         assert (settings.learning_rate, settings.decay, settings.max_steps) == (5e-4, 0.99, 150_000)
         assert (settings.optimiser, settings.loss, settings.network.precision) == ("adam", "linear", "float32")
+        assert settings.network.maxima == "absolute"  # Fig. 1
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -19,6 +19,7 @@ Architecture = Literal[
     "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
+Maxima = Literal["absolute", "relative"]
 Loss = Literal["linear", "relative"]
 Optimiser = Literal["adam", "rmsprop"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
@@ -41,6 +42,9 @@ class NetworkSettings(_Frozen):
     width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
     points: Count | None = None  # first points of the base cloud to use; None: all of them
     descriptor: Annotated[int, Field(ge=0, le=512)] = 32  # learnable numbers per point
+    octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
+    maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration, with
+    # which it takes far fewer steps to learn what lights do (docs/results/order.md)
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
@@ -114,10 +118,11 @@ def paper_dynamic(**changes: object) -> TrainSettings:
 def small(**changes: object) -> TrainSettings:
     """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2.
 
-    An epoch is 256 samples, so that the rate falls within such a run; one configuration of eight is held out.
+    An epoch is 256 samples, so that the rate falls within such a run; one configuration of eight is held out. Maxima
+    over the points are relative, as so short a run learns little of lights from absolute ones.
     """
     described: dict[str, object] = {
-        "network": NetworkSettings(width=16, points=4096),
+        "network": NetworkSettings(width=16, points=4096, maxima="relative"),
         "batch": 2,
         "epoch_samples": 256,
         "hold_out": 1 / 8,

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.store import store_errors
+from photonfarm.shared.store import Store, store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.figures import production, run_figures, summary, validations
 from photonfarm.trainer.loop import CHECKPOINT, read_settings
@@ -21,6 +21,7 @@ def write_report(store: str | Path, run: Path, out: Path) -> dict[str, Any]:
     first 512 if there are more. Raises SpecError if `run` is not a run, StoreError without a readable checkpoint or
     store or if `out` cannot be written, IncompleteError if nothing is held out.
     """
+    Store(store)  # raises StoreError where there is none
     settings = read_settings(run)
     scene_id = checkpoint.load(run / CHECKPOINT)["scene_id"]
     found = run_figures(StoreSource(store, scene_id), settings, run)

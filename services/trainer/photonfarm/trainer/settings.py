@@ -20,7 +20,7 @@ Architecture = Literal[
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
-Loss = Literal["linear", "relative"]
+Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
@@ -64,7 +64,7 @@ class TrainSettings(_Frozen):
     network: NetworkSettings = NetworkSettings()
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
 
-    loss: Loss = "linear"  # [S 3.2]; "relative" is ours, for lamps in view; both are unbiased
+    loss: Loss = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased
     batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
     learning_rate: Positive = 5e-4  # [S 3.1]
     decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]
@@ -96,6 +96,15 @@ class TrainSettings(_Frozen):
     @classmethod
     def _refuse_what_biases(cls, settings: Any) -> Any:
         return biased.refuse(settings)
+
+    @model_validator(mode="after")
+    def _has_the_other_half(self) -> Self:
+        if self.loss == "paired" and self.network.architecture.startswith("denoise"):
+            raise ValueError(
+                f"has loss = 'paired', which weights each half by the other; {self.network.architecture} is given one "
+                "of them, and 'linear' or 'relative' are its losses"
+            )
+        return self
 
 
 KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model_fields) if key != "network")

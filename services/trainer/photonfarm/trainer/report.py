@@ -21,10 +21,9 @@ def write_report(store: str | Path, run: Path, out: Path) -> dict[str, Any]:
     first 512 if there are more. Raises SpecError if `run` is not a run, StoreError without a readable checkpoint or
     store or if `out` cannot be written, IncompleteError if nothing is held out.
     """
-    Store(store)  # raises StoreError where there is none
     settings = read_settings(run)
     scene_id = checkpoint.load(run / CHECKPOINT)["scene_id"]
-    found = run_figures(StoreSource(store, scene_id), settings, run)
+    found = run_figures(StoreSource(Store(store).root, scene_id), settings, run)
     figures = summary(settings, run, found, production(store, scene_id))
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)

@@ -43,13 +43,24 @@ def noisy_targets(count: int, seed: int = 0) -> NDArray[np.float64]:
     return rng.gamma(count, 0.3 / count, TARGETS) + rng.binomial(count, 0.01, TARGETS) * 60 / count
 
 
-def clipped_gradient_rest(targets: NDArray[np.float64], norm: float = 1.0) -> float:
-    """Where the mean of 2(f − t), each clipped at `norm`, is 0; by bisection, as it grows with f."""
+def zero(gradient: Callable[[float], float]) -> float:
+    """Where a function that is negative at 0 and positive at 10 is 0; by bisection."""
     low, high = 0.0, 10.0
     for _ in range(40):
         f = 0.5 * (low + high)
-        low, high = (f, high) if np.clip(2 * (f - targets), -norm, norm).mean() < 0 else (low, f)
+        low, high = (f, high) if gradient(f) < 0 else (low, f)
     return 0.5 * (low + high)
+
+
+def clipped_gradient_rest(targets: NDArray[np.float64], norm: float = 1.0) -> float:
+    """Where the mean of 2(f − t), each clipped at `norm`, is 0."""
+    return zero(lambda f: float(np.clip(2 * (f - targets), -norm, norm).mean()))
+
+
+def paired_rest(targets: NDArray[np.float64]) -> float:
+    """Where the mean of (f − a) / (f² + b² + ε) is 0, over pairs of targets a and b, and b and a."""
+    a, b = targets, np.roll(targets.reshape(-1, 2), 1, axis=1).reshape(-1)
+    return zero(lambda f: float(((f - a) / (f**2 + b**2 + EPSILON)).mean()))
 
 
 def undetached_least(targets: NDArray[np.float64]) -> float:
@@ -72,6 +83,7 @@ LEAST: dict[str, Callable[[NDArray[np.float64]], float]] = {
     "squared error, targets clamped at 1": lambda t: float(np.minimum(t, 1).mean()),
     "relative, weight from the noisy target": weighted_mean,
     "relative, weight from the prediction, not detached": undetached_least,
+    "relative, weight from the prediction and from another noisy target": paired_rest,
     "squared error, gradient of each step clipped at 1 (Huber)": clipped_gradient_rest,
 }
 """Each loss with the value of the pixel at which it is least."""
@@ -176,8 +188,9 @@ which each loss is least, over {TARGETS:,} targets (weights 1 / (x² + ε) with 
 
 {losses_table(losses)}
 
-Only what is linear in the target, but for weights that do not see its noise, ends at the mean: `loss = "linear"` and
-`loss = "relative"`. The others are refused. More samples a target make them less wrong, and never right.
+Only what is linear in the target, but for weights that do not see its noise, ends at the mean: `loss = "linear"`,
+`loss = "relative"`, and `loss = "paired"`, whose weights are from the prediction and the other half. The others are
+refused. More samples a target make them less wrong, and never right.
 
 ## Optimisers, under the squared error
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import CHECKPOINT, train
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.metrics.intervals import t_975
-from photonfarm.trainer.settings import TrainSettings, preset
+from photonfarm.trainer.settings import Loss, TrainSettings, preset
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 
@@ -102,7 +102,7 @@ def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     parser.add_argument("--batch", type=int, default=2, help="samples a step (%(default)s)")
     parser.add_argument("--rate", type=float, default=5e-4, help="learning rate (%(default)s)")
     parser.add_argument("--decay", type=float, default=0.93, help="of the rate, per 256 samples (%(default)s)")
-    parser.add_argument("--loss", choices=("linear", "relative"), default="relative", help="(%(default)s)")
+    parser.add_argument("--loss", choices=get_args(Loss), default="relative", help="(%(default)s)")
     parser.add_argument(
         "--demodulation", type=float, default=0.0, help="ε; outputs × (albedo + ε) are the images; 0: off (%(default)s)"
     )
@@ -142,7 +142,7 @@ def described(settings: TrainSettings) -> str:
     return (
         f"{settings.optimiser}, rate {settings.learning_rate:g}, times {settings.decay:g} every "
         f"{settings.epoch_samples} samples; loss `{settings.loss}`; outputs {demodulated}; U-Net in "
-        f"{network.precision}; occlusion `{network.occlusion}`"
+        f"{network.precision}; maxima `{network.maxima}`; occlusion `{network.occlusion}`"
     )
 
 

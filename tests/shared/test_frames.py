@@ -54,9 +54,11 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", depth=np.zeros(3))
     made(photons=False).write(tmp_path / "cut.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "cut.npz").read_bytes()[:-40])
-    for name in ("text", "other", "cut", "missing"):
-        with pytest.raises(StoreError, match=f"{name}.npz: holds no buffers that `photonfarm buffers` wrote"):
+    for name in ("text", "other", "cut"):
+        with pytest.raises(StoreError, match=f"{name}.npz: holds no buffers that `photonfarm buffers` wrote$"):
             Frames.read(tmp_path / f"{name}.npz")
+    with pytest.raises(StoreError, match=r"missing\.npz: there is no such file$"):
+        Frames.read(tmp_path / "missing.npz")
     with pytest.raises(StoreError, match="cannot write the buffers"):
         made(photons=False).write(tmp_path / "text.npz" / "below.npz")
 

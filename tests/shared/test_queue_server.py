@@ -81,7 +81,7 @@ def test_who_lacks_a_name_or_a_password_is_told_which_and_nobody_to_start_a_serv
     request = {"modifications": 1, "views": 1, "passes": 1, "seed": 0}
     with pytest.raises(QueueError, match=r"submits without Redis$"):
         submission.submit("cornell", store.root, url, **request)
-    with pytest.raises(QueueError, match=r"without Redis, and `redis-server` or .* starts one$"):
+    with pytest.raises(QueueError, match=r"`redis-server` or .* starts one\. The plan is stored.* without Redis$"):
         submission.submit("cornell", store.root, "redis://127.0.0.1:1/0", **request)
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 
 from photonfarm.shared.camera_path import orbit
 from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.frames import Frames
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pictures import display
@@ -182,6 +182,14 @@ def test_what_cannot_be_shown_is_refused(
     monkeypatch.setattr(infer, "entry_points", lambda **_: ())
     with pytest.raises(SpecError, match=r"the renderer, which is not installed here; .*buffers --scene .* --orbit 3`"):
         infer.rendered_frames(store, run, ["--orbit", "3"])
+    monkeypatch.undo()
+    with pytest.raises(PhotonfarmError, match=r"`photonfarm buffers` ended with exit code 2; what it said") as error:
+        infer.rendered_frames(store, run, ["--orbit", "0"])
+    assert error.value.exit_code == 2
+    for show in (lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),
+                 lambda: infer.show_frames(tmp_path, run, path, tmp_path / "out")):  # fmt: skip
+        with pytest.raises(StoreError, match="is not a store"):
+            show()
     assert not (tmp_path / "out").exists()
 
 

@@ -65,11 +65,12 @@ def test_what_biases_under_noisy_targets_is_refused_with_the_reason(changes: dic
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"loss": "squared"}, r"loss = 'squared': Input should be 'linear' or 'relative'$"),
-        ({"loss": 3}, r"loss = 3: Input should be 'linear' or 'relative'$"),
+        ({"loss": "squared"}, r"loss = 'squared': Input should be 'linear', 'relative' or 'paired'$"),
+        ({"loss": 3}, r"loss = 3: Input should be 'linear', 'relative' or 'paired'$"),
         ({"optimiser": "sgd"}, r"optimiser = 'sgd': Input should be 'adam' or 'rmsprop'$"),
         ({"gradient": 1}, r"gradient: unknown key"),
         ({"demodulation": 0.0}, r"demodulation = 0\.0: Input should be greater than 0$"),
+        ({"loss": "paired", "architecture": "denoise_4"}, r"has loss = 'paired', which weights each half by the other"),
     ],
 )
 def test_other_values_get_the_ordinary_message(changes: dict[str, object], found: str) -> None:

@@ -46,6 +46,25 @@ def test_the_light_transport_layer_is_the_one_of_figure_1() -> None:
     torch.testing.assert_close(found, as_drawn(made, torch.cat([varying, fixed.expand(2, -1, -1)], dim=2), visible))
 
 
+def test_relative_maxima_are_less_those_of_the_reference() -> None:
+    made = layer().double()
+    varying, fixed, visible = torch.randn(3, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(3, 50) < 0.7
+    visible[2] = False
+    reference, all_visible = torch.randn(50, 3).double(), torch.ones(1, 50, dtype=torch.bool)
+    both = torch.cat([torch.cat([varying, reference[None]]), fixed.expand(4, -1, -1)], dim=2)
+    x = made.preprocess(both)
+    for block in made.blocks:
+        local = block.shortcut(x) + block.out(functional.relu(block.hidden(functional.relu(x))))
+        maximum = masked_max(local, torch.cat([visible, all_visible]))
+        relative = (maximum - maximum[3]) * torch.tensor([1, 1, 0, 1])[:, None]  # zero where no point is visible
+        x = torch.cat([local, relative[:, None].expand_as(local)], dim=2)
+    found = made(varying, fixed, visible, reference)
+    torch.testing.assert_close(found, x[:3])
+    assert not found[2, :, 32:].any()
+    at_base = made(reference[None], fixed, all_visible, reference)
+    assert not at_base[..., 32:].any()
+
+
 def test_features_of_size_one_stay_so_before_any_step() -> None:
     """From torch's own start they would shrink with each layer, far below the U-Net's other channels."""
     torch.manual_seed(0)

@@ -30,21 +30,22 @@ def test_the_work_of_a_u_net_grows_with_its_pixels_and_with_the_square_of_its_wi
 
 
 def test_the_point_branch_is_the_one_of_figure_1() -> None:
-    """Per point 44 → 64 and two blocks of 64 → 32 twice and 32 → 32; the maximum's half is worked once a cloud.
+    """Per point 56 → 64 and two blocks of 64 → 32 twice and 32 → 32; the maximum's half is worked once a cloud.
 
-    9 fixed numbers, 32 of the descriptor and the first layer's bias are the same in all samples, worked once.
+    Of its 56 numbers the 15 of the position change; 9 others, 32 of the descriptor and the first layer's bias are the
+    same in all samples, worked once.
     """
     found = parts()["point branch"]
-    assert found.parameters == 16384 * 32 + (44 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
+    assert found.parameters == 16384 * 32 + (56 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
     first_block = 64 * 32 + 32 * 32 + 64 * 32
     second_block = 32 * 32 + 32 * 32 + 32 * 32
-    per_point = 44 * 64 + first_block + second_block
+    per_point = 56 * 64 + first_block + second_block
     assert found.gmacs == pytest.approx((16384 * per_point + 2 * 32 * 32) / 1e9, rel=1e-6)
 
 
 def test_photons_have_a_branch_of_their_own() -> None:
     without, found = parts(), parts(architecture="light_transport_photons")
-    assert found["photon branch"].parameters == (13 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
+    assert found["photon branch"].parameters == (25 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
     assert found["point branch"] == without["point branch"]
     assert found["U-Net"].parameters - without["U-Net"].parameters == 64 * 64 * 9  # 64 channels more
 

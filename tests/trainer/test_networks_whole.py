@@ -102,15 +102,38 @@ def test_the_seed_makes_the_weights_and_leaves_torchs_generator_alone(make_sourc
 # --------------------------------------------------------------------------------------------------------------- points
 
 
+def test_positions_come_with_sines_and_cosines_of_each_octave(make_source) -> None:
+    source = make_source(1)
+    made = network(source, octaves=2)
+    x = torch.tensor([[[0.5, -0.25, 1.0]]])
+    wanted = torch.cat([x, *(f(k * torch.pi * x) for k in (0.5, 1.0) for f in (torch.sin, torch.cos))], dim=-1)
+    torch.testing.assert_close(made.coordinates(made.centre + made.scale * x), wanted)
+    torch.testing.assert_close(network(source, octaves=0).coordinates(made.centre + made.scale * x), x)
+
+
+def test_relative_maxima_are_zero_in_the_base_configuration_and_not_elsewhere(make_source) -> None:
+    source = make_source(2)
+    made, points = network(source, maxima="relative"), batch_of(source, (0, 1)).inputs.points
+    with torch.no_grad():
+        moved = made.point_features(points)[..., 32:]
+        points.position.copy_(made.base)
+        points.visible.fill_(True)
+        unmoved = made.point_features(points)[..., 32:]
+    assert moved.abs().amax(dim=(1, 2)).min() > 1e-3
+    assert unmoved.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("maxima", ["absolute", "relative"])
 @pytest.mark.parametrize("architecture", WITH_POINTS)
-def test_the_order_of_points_and_photons_does_not_matter(make_source, architecture: str) -> None:
+def test_the_order_of_points_and_photons_does_not_matter(make_source, architecture: str, maxima: str) -> None:
     source = make_source(3, points=300, photons=64)
-    made, shuffled = network(source, architecture), network(source, architecture)
+    made, shuffled = (network(source, architecture, maxima=maxima) for _ in range(2))
     inputs = batch_of(source, (0, 1, 2), architecture).inputs
     order = torch.randperm(300)
     shuffled.descriptor.data.copy_(made.descriptor.data[order])
     if architecture != "feature_projection":
         shuffled.appearance.copy_(made.appearance[order])
+        shuffled.base.copy_(made.base[order])
     other = replace(inputs, points=map_tensors(lambda x: x[:, order], inputs.points))
     if inputs.photons is not None:
         slots = torch.randperm(128)

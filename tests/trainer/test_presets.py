@@ -4,12 +4,14 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from click.testing import CliRunner
 from pydantic import ValidationError
 
 from photonfarm.shared.cli import umbrella
 from photonfarm.shared.errors import SpecError
 from photonfarm.trainer import service
+from photonfarm.trainer.losses import paired_loss
 from photonfarm.trainer.settings import PRESETS, TrainSettings, preset, small
 
 
@@ -20,6 +22,7 @@ def test_the_papers_presets_are_what_the_supplement_states() -> None:
         assert (settings.network.width, settings.network.points) == (64, 16384)
         assert (settings.learning_rate, settings.decay, settings.max_steps) == (5e-4, 0.99, 150_000)
         assert (settings.optimiser, settings.loss, settings.network.precision) == ("adam", "linear", "float32")
+        assert settings.network.maxima == "absolute"  # Fig. 1
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -35,6 +38,15 @@ def test_values_that_are_not_allowed_are_refused() -> None:
         preset("small", network={"architecture": "transformer"})
     with pytest.raises(ValidationError, match="has descriptor = 0; feature_projection projects descriptors"):
         preset("small", network={"architecture": "feature_projection", "descriptor": 0})
+
+
+def test_the_paired_loss_needs_the_half_that_a_denoiser_is_given() -> None:
+    assert preset("small", loss="paired").loss == "paired"
+    with pytest.raises(ValidationError, match="denoise_16 is given one of them"):
+        preset("small", network={"architecture": "denoise_16"}, loss="paired")
+    image = torch.zeros(1, 2, 2, 3)
+    with pytest.raises(ValueError, match="has 1 half-estimates; each of two is weighted by the other"):
+        paired_loss(image, image[:, None])
 
 
 @pytest.fixture
@@ -70,7 +82,15 @@ def test_the_configuration_file_chooses_them_as_well(chosen: list[TrainSettings]
 def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
     chosen: list[TrainSettings], tmp_path: Path
 ) -> None:
-    pairs = ["width=8", "points=null", "occlusion=window", "beta1=0.8", "epoch_samples=1000", "catch_up=5", "batch=3"]
+    pairs = [
+        "network.width=8",
+        "points=null",
+        "occlusion=window",
+        "beta1=0.8",
+        "epoch_samples=1000",
+        "catch_up=5",
+        "batch=3",
+    ]
     arguments = [word for pair in pairs for word in ("--set", pair)]
     found = CliRunner().invoke(umbrella, ["train", *arguments, "--batch", "7"])
     assert found.exit_code == 0, found.output

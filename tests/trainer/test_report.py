@@ -88,6 +88,12 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_report_of_a_store_that_is_none_is_refused(make_source, tiny, run, tmp_path) -> None:
+    train(make_source(24), tiny(max_steps=1), run)
+    with pytest.raises(StoreError, match="is not a store"):
+        write_report(tmp_path / "store", run, tmp_path / "out")
+
+
 def test_a_report_without_held_out_samples_says_so(scene, commit, make_source, tiny, run, tmp_path) -> None:
     source = make_source(24)
     train(source, tiny(max_steps=1), run)

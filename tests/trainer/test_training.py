@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.scene import load_spec
 from photonfarm.trainer import checkpoint, loop, metrics_log, service
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.device import described, usable_device
@@ -22,6 +23,7 @@ from photonfarm.trainer.learner import DivergedError
 from photonfarm.trainer.loop import CHECKPOINT, METRICS, read_settings, stop_on_signals, train
 from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import NetworkSettings, small
+from photonfarm.trainer.trained import TrainedRun
 
 
 def weights(run) -> dict[str, torch.Tensor]:
@@ -192,6 +194,8 @@ def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:
         whole = rf"checkpoint\.safetensors: was trained with {re.escape(found)}; use another run directory"
         with pytest.raises(SpecError, match=whole):
             train(make_source(24), tiny(**change), run)
+    with pytest.raises(SpecError, match=r"or the same values \(--set width=4 --set seed=0\)$"):
+        train(make_source(24), tiny(network={"width": 5}, seed=2), run)
     assert read_settings(run) == tiny(max_steps=2)
 
 
@@ -217,6 +221,23 @@ def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
     (run / "settings.json").write_text('{"network": {"widht": 8}, "batch": 0}')
     with pytest.raises(SpecError, match=r"network\.widht: unknown key; nearest: width.*; batch = 0: Input should be"):
         read_settings(run)
+
+
+def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, tiny, run) -> None:
+    """Or of a version whose settings lacked some, which would else be those of today."""
+    train(make_source(24), tiny(max_steps=1), run)
+    written = json.loads((run / "settings.json").read_text())
+    older = {**written, "network": {k: v for k, v in written["network"].items() if k not in ("octaves", "maxima")}}
+    (run / "settings.json").write_text(json.dumps(older))
+    with pytest.raises(SpecError, match="lacks octaves, maxima of the network: another version's run"):
+        TrainedRun.load(run)
+    (run / "settings.json").write_text(json.dumps({**written, "network": {**written["network"], "octaves": 1}}))
+    with pytest.raises(SpecError, match=r"was trained with network\.octaves = 2, and 1 is asked for now"):
+        TrainedRun.load(run)
+    (run / "settings.json").write_text(json.dumps(written))
+    (run / CHECKPOINT).unlink()
+    with pytest.raises(StoreError, match="there is no checkpoint yet; train the run first"):
+        TrainedRun.load(run)
 
 
 def test_a_hold_out_that_leaves_nothing_to_validate_on_is_refused(make_source, tiny, run) -> None:
@@ -281,6 +302,14 @@ def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path, caps
     first, *said = capsys.readouterr().err.splitlines()
     assert first == f"training on {described(usable_device('auto'))}"
     assert any("no scene to train on has come" in line for line in said)
+
+
+def test_the_service_says_which_scene_it_waits_for(scene, run, capsys) -> None:
+    store = scene.folder.parent.parent
+    service.run("cornell", store, run, "small", {"max_seconds": 0.3})
+    assert (
+        f"waiting for scene {load_spec('cornell').scene_id}; {store} holds {scene.spec.name}" in capsys.readouterr().err
+    )
 
 
 def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run, monkeypatch) -> None:

@@ -49,7 +49,9 @@ class CameraPath(_Frozen):
             return cls.model_validate(json.loads(file.read_text()))
         except ValidationError as error:
             raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise SpecError(f"{file}: cannot be read: {error.strerror}") from error
+        except ValueError as error:
             raise SpecError(f"{file}: is not a camera path in JSON: {error}") from error
 
     def sampled(self) -> list[View]:

@@ -80,5 +80,7 @@ class Frames:
                 modification = Modification.from_vector(stored["modification"])
                 of_views = {name: stored[name] for name in _OF_VIEWS}
                 return cls(str(stored["scene_id"]), modification, views, photons=photons, **of_views)
+        except FileNotFoundError as error:
+            raise StoreError(f"{file}: there is no such file") from error
         except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
-            raise StoreError(f"{file}: holds no buffers that `photonfarm buffers` wrote: {error}") from error
+            raise StoreError(f"{file}: holds no buffers that `photonfarm buffers` wrote") from error

@@ -145,7 +145,8 @@ def merged(views: Iterable[tuple[str, Merged]], folder: Path, as_json: bool) -> 
         mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
         written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})
         if not as_json:
-            click.echo(f"{file}: {view.passes} passes, mean {mean:.4g}, standard error of a value {error:.2g} (RMS)")
+            passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
+            click.echo(f"{file}: {passes}, mean {mean:.4g}, standard error of a value {error:.2g} (RMS)")
     if as_json:
         click.echo(json.dumps(written, indent=2))
     if not written:

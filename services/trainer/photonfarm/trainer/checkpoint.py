@@ -63,6 +63,8 @@ def load(path: Path) -> dict[str, Any]:
             document = json.loads((file.metadata() or {}).get(METADATA, "{}"))
             found = document.get("format")
             state: dict[str, Any] = _together(document, file.get_tensor) if found == FORMAT else {}
+    except FileNotFoundError as error:
+        raise StoreError(f"{path}: there is no checkpoint yet; train the run first") from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise StoreError(f"{path}: is not a readable checkpoint: {reason}") from error
@@ -112,22 +114,28 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
 
     Returns which other settings are not what they were. Both have `scene_id` and `settings`.
     """
-    changed = _differing({"scene_id": state["scene_id"], **state["settings"]}, {**identity, **identity["settings"]})
+    then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
+    changed = _differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
-        raise SpecError(f"{path}: was trained with {found}; use another run directory, or the same values")
+        options = " ".join(
+            f"--set {key.split('.')[-1]}={then}" for key, (then, _) in lasting.items() if key != "scene_id"
+        )
+        same = f"the same values{f' ({options})' if options else ''}"
+        raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
     return changed
 
 
 def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
     """What is not the same in both, (then, now), by key; a key within another one as OUTER.INNER."""
     found: Changes = {}
-    for key, then in before.items():
-        if isinstance(then, Mapping):
-            found |= _differing(then, now[key], f"{inside}{key}.")
-        elif then != now.get(key):
-            found[f"{inside}{key}"] = (then, now.get(key))
+    for key in {**before, **now}:
+        then, value = before.get(key), now.get(key)
+        if isinstance(then, Mapping) and isinstance(value, Mapping):
+            found |= _differing(then, value, f"{inside}{key}.")
+        elif then != value:
+            found[f"{inside}{key}"] = (then, value)
     return found
 
 

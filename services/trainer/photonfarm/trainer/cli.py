@@ -34,10 +34,11 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
         key, equals, value = pair.partition("=")
         if not equals:
             raise click.BadParameter(f"{pair!r} is not KEY=VALUE", param_hint="--set")
+        name = key.strip().removeprefix("network.")
         try:
-            found[key.strip()] = json.loads(value)
+            found[name] = json.loads(value)
         except ValueError:
-            found[key.strip()] = value.strip()
+            found[name] = value.strip()
     return found
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.frames import Frames
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, ViewBuffers, Visibility, arrays_of
@@ -66,7 +66,7 @@ def find_row(store: str | Path, run: TrainedRun, modification: str | None, view:
 def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> Written:
     """Write prediction.png and target.png, the mean of both noisy halves, of one sample; StoreError without it."""
     torch.set_num_threads(run.settings.threads)
-    source = StoreSource(store, run.scene_id)
+    source = _source(store, run)
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
         feed.ask([row])
         batch = feed.take()
@@ -100,7 +100,7 @@ def _judged(image: F32, batch: Batch) -> str:
 def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
     """What `photonfarm buffers` makes of the arguments, such as --orbit 24, for the scene of the run.
 
-    Raises SpecError where the verb is not installed, IncompleteError where it failed, which it has said why.
+    Raises SpecError where the verb is not installed, PhotonfarmError with its exit code where it failed.
     """
     if not entry_points(group=GROUP, name=VERB):
         raise SpecError(
@@ -113,8 +113,15 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
         verb = [sys.executable, "-m", "photonfarm.shared.cli", VERB, *named, *arguments]
         code = subprocess.run(verb, stdout=subprocess.DEVNULL, check=False).returncode
         if code:
-            raise IncompleteError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
+            raise _ended(code)
         return Frames.read(file)
+
+
+def _ended(code: int) -> PhotonfarmError:
+    """An error with the exit code of the verb, which has said why."""
+    error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
+    error.exit_code = code
+    return error
 
 
 def show_frames(
@@ -125,7 +132,7 @@ def show_frames(
     Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
     """
     torch.set_num_threads(run.settings.threads)
-    source = StoreSource(store, run.scene_id)
+    source = _source(store, run)
     _check(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
     _make(out)
@@ -193,6 +200,11 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
         shown = _Unrendered(frames.modification, view, frames.buffers(i), frames.visibility(i), black)
         fill(memory, 0, shown, spec, cloud)
         yield memory.filled((i,), (b"",))
+
+
+def _source(store: str | Path, run: TrainedRun) -> StoreSource:
+    """The samples of the run's scene; StoreError where there is no store."""
+    return StoreSource(Store(store).root, run.scene_id)
 
 
 def _make(folder: Path) -> None:

@@ -51,8 +51,8 @@ class Learner:
         value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
         if not math.isfinite(value):
             raise DivergedError(
-                f"step {number}: the loss is {value} on rows {list(batch.rows)}; training cannot go on. The run's last "
-                "checkpoint is kept; a smaller learning_rate or a larger batch may help"
+                f"step {number}: the loss is {value} on rows {list(batch.rows)}; training cannot go on. What "
+                "the run has saved is kept; a smaller learning_rate or a larger batch may help"
             )
         self.optimiser.step()
         return value

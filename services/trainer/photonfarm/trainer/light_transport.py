@@ -67,15 +67,25 @@ class LightTransportLayer(nn.Module):
         nn.init.kaiming_uniform_(self.preprocess.weight, nonlinearity="linear")
         self.blocks = nn.ModuleList([ResidualBlock(), ResidualBlock()])
 
-    def forward(self, varying: Tensor, fixed: Tensor, visible: Tensor) -> Tensor:
+    def forward(self, varying: Tensor, fixed: Tensor, visible: Tensor, reference: Tensor | None = None) -> Tensor:
         """p_i and visible (B, P) → f_i (B, P, 64).
 
-        p_i comes in two parts: what differs between samples (B, P, F), and what does not (P, F′).
+        p_i comes in two parts: what differs between samples (B, P, F), and what does not (P, F′). With a reference, a
+        cloud (P, F) of which all points are visible, maxima are taken less its own, which is ours: what a moved lamp
+        does to them is little beside what all configurations have in common, and else lost in what each step of the
+        optimiser does to that.
         """
+        samples = len(varying)
+        if reference is not None:
+            varying = torch.cat([varying, reference[None]])
+            visible = torch.cat([visible, visible.new_ones(1, visible.shape[1])])
         own, common = torch.split(self.preprocess.weight, [varying.shape[-1], fixed.shape[-1]], dim=1)
         local = functional.linear(varying, own) + functional.linear(fixed, common, self.preprocess.bias)
         shared = local.new_zeros(len(local), 0)
         for block in self.blocks:
             local = block(local, shared)
             shared = masked_max(local, visible)
+            if reference is not None:
+                shared = torch.where(visible.any(dim=1, keepdim=True), shared - shared[-1:], 0)
+        local, shared = local[:samples], shared[:samples]
         return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)

@@ -1,7 +1,7 @@
-"""What is minimised. Both losses are unbiased under noisy targets, and every change here must keep them so.
+"""What is minimised. All losses are unbiased under noisy targets, and every change here must keep them so.
 
-Nothing may be clipped, compressed, or weighted by the target: each moves the minimum away from the clean image. Shape
-letters: B batch, H W image.
+Nothing may be clipped, compressed, or weighted by its own noise: each moves the minimum away from the clean image.
+Shape letters: B batch, H W image.
 """
 
 from __future__ import annotations
@@ -37,4 +37,25 @@ def relative_loss(prediction: Tensor, target: Tensor) -> Tensor:
     return torch.mean((prediction[:, None] - target) ** 2 / (brightness**2 + RELATIVE_EPSILON)[:, None])
 
 
-LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"linear": linear_loss, "relative": relative_loss}
+def paired_loss(prediction: Tensor, target: Tensor, told: Tensor | None = None) -> Tensor:
+    """The relative error of each half, whose weight is of the prediction and of the other half: (B, 2, H, W, 3).
+
+    Where the prediction is far too dark, as beside lamps at first, the relative loss's weight is far too large, and a
+    few such pixels are most of the gradient. The other half knows that they are bright. Its noise is independent of
+    this half's: E w(B) (f − A) = E w(B) · (f − I), zero for the clean image. How much a pixel counts depends on the
+    noise, and so of a network that cannot be right everywhere where it is. Ours. `told` are the halves that the weights
+    are made of, if not the target's. Raises ValueError unless there are two.
+    """
+    told = target if told is None else told
+    if told.shape[1] != 2:
+        raise ValueError(f"has {told.shape[1]} half-estimates; each of two is weighted by the other")
+    brightness = torch.cat([prediction[:, None].detach(), told.flip(1)], dim=1).mean(dim=-1, keepdim=True)
+    of_prediction, of_other = brightness[:, :1], brightness[:, 1:]
+    return torch.mean((prediction[:, None] - target) ** 2 / (of_prediction**2 + of_other**2 + RELATIVE_EPSILON))
+
+
+LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "linear": linear_loss,
+    "relative": relative_loss,
+    "paired": paired_loss,
+}

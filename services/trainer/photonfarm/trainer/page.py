@@ -113,7 +113,7 @@ def _details(figures: dict[str, Any]) -> str:
         ("rendering", f"{figures['render_core_seconds']:.1f} core-seconds, {figures['renders_redrawn']} drawn again"),
         ("seeds", ", ".join(f"{k} {v}" for k, v in figures["seeds"].items())),
         ("versions", ", ".join(f"{k} {v}" for k, v in figures["versions"].items())),
-        ("settings", ", ".join(f"{k} = {v}" for k, v in settings.items() if k != "network")),
+        ("settings", ", ".join(f"{k} = {v}" for k, v in {**settings, **settings["network"]}.items() if k != "network")),
     ]
     cells = "".join(f"<tr><th>{name}</th><td><code>{escape(str(value))}</code></td></tr>" for name, value in rows)
     return f"<h2>Details</h2>\n<table>{cells}</table>"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.store import store_errors
+from photonfarm.shared.store import Store, store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.figures import production, run_figures, summary, validations
 from photonfarm.trainer.loop import CHECKPOINT, read_settings
@@ -23,7 +23,7 @@ def write_report(store: str | Path, run: Path, out: Path) -> dict[str, Any]:
     """
     settings = read_settings(run)
     scene_id = checkpoint.load(run / CHECKPOINT)["scene_id"]
-    found = run_figures(StoreSource(store, scene_id), settings, run)
+    found = run_figures(StoreSource(Store(store).root, scene_id), settings, run)
     figures = summary(settings, run, found, production(store, scene_id))
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)

@@ -87,6 +87,9 @@ def _lead(
         if scene_id is None:
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
+        if not is_vacant(store) and scene_id not in Store(store).scene_ids():
+            there = ", ".join(scene.spec.name for scene in Store(store).scenes()) or "no scene"
+            click.echo(f"waiting for scene {scene_id}; {store} holds {there}", err=True)
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         with _consumption_told(redis_url, store, scene_id) as count:
             listen = [_tell, *([board.record] if board else [])]

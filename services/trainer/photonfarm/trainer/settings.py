@@ -19,7 +19,8 @@ Architecture = Literal[
     "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
-Loss = Literal["linear", "relative"]
+Maxima = Literal["absolute", "relative"]
+Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
@@ -41,6 +42,9 @@ class NetworkSettings(_Frozen):
     width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
     points: Count | None = None  # first points of the base cloud to use; None: all of them
     descriptor: Annotated[int, Field(ge=0, le=512)] = 32  # learnable numbers per point
+    octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
+    maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
+    # with which it takes fewer steps to learn what lights do
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
@@ -60,7 +64,7 @@ class TrainSettings(_Frozen):
     network: NetworkSettings = NetworkSettings()
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
 
-    loss: Loss = "linear"  # [S 3.2]; "relative" is ours, for lamps in view; both are unbiased
+    loss: Loss = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased
     batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
     learning_rate: Positive = 5e-4  # [S 3.1]
     decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]
@@ -93,6 +97,15 @@ class TrainSettings(_Frozen):
     def _refuse_what_biases(cls, settings: Any) -> Any:
         return biased.refuse(settings)
 
+    @model_validator(mode="after")
+    def _has_the_other_half(self) -> Self:
+        if self.loss == "paired" and self.network.architecture.startswith("denoise"):
+            raise ValueError(
+                f"has loss = 'paired', which weights each half by the other; {self.network.architecture} is given one "
+                "of them, and 'linear' or 'relative' are its losses"
+            )
+        return self
+
 
 KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model_fields) if key != "network")
 """Every key that can be set, those of the network among them."""
@@ -114,10 +127,11 @@ def paper_dynamic(**changes: object) -> TrainSettings:
 def small(**changes: object) -> TrainSettings:
     """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2.
 
-    An epoch is 256 samples, so that the rate falls within such a run; one configuration of eight is held out.
+    An epoch is 256 samples, so that the rate falls within such a run; one configuration of eight is held out. Maxima
+    over the points are relative, as so short a run learns little of lights from absolute ones.
     """
     described: dict[str, object] = {
-        "network": NetworkSettings(width=16, points=4096),
+        "network": NetworkSettings(width=16, points=4096, maxima="relative"),
         "batch": 2,
         "epoch_samples": 256,
         "hold_out": 1 / 8,

@@ -32,9 +32,12 @@ class TrainedRun:
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
         """The run with the weights of the checkpoint of this name, the last one that was written unless told otherwise.
 
-        Raises SpecError if the folder is not a run, StoreError without a readable checkpoint.
+        Raises SpecError if the folder is not a run, or its settings are not those of the checkpoint; StoreError without
+        a readable checkpoint.
         """
         settings, state = read_settings(folder), checkpoint.load(folder / name)
+        said = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
+        checkpoint.check_continues(folder / name, state, said)
         return cls(folder, settings, str(state["scene_id"]), state["network"])
 
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:

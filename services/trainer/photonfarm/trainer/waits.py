@@ -14,9 +14,6 @@ KINDS: tuple[Kind, ...] = ("start", "train", "validate", "wait_data", "wait_read
 
 Bottleneck = Literal["rendering", "reading", "training"]
 
-NOTICEABLE = 0.05
-"""Share of the time below which waiting does not make a bottleneck of what is waited for."""
-
 NONE: Mapping[str, float] = {}
 
 
@@ -69,10 +66,10 @@ def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> d
 
 
 def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """What to speed up, by `waits`: that which is waited for most, or training where nothing much is waited for."""
-    if max(shares.values()) < NOTICEABLE:
-        return "training"
-    return "rendering" if shares["samples"] >= shares["reading"] else "reading"
+    """What to speed up: that to which most of the time goes, by `waits`, the rest of it being training."""
+    spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
+    spent["training"] = 1 - sum(spent.values())
+    return max(spent, key=lambda name: spent[name])
 
 
 def samples_per_used(samples: int, draws: int) -> float:

@@ -16,7 +16,7 @@ write to it can delay jobs, and can neither run code in a worker nor change what
     rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
-from photonfarm.shared.queue.connection import connect, has_password, is_absent, with_password_of
+from photonfarm.shared.queue.connection import connect, has_password, with_password_of
 from photonfarm.shared.queue.consumption import consumed_samples, tell_consumed
 from photonfarm.shared.queue.failures import (
     FAILED,
@@ -83,7 +83,6 @@ __all__ = [
     "free_job",
     "has_password",
     "hosts",
-    "is_absent",
     "job_name",
     "job_of_worker",
     "open_queue",

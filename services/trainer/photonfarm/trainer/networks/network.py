@@ -5,6 +5,8 @@ Shape letters: B batch, P points, H W image, C channels.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -38,6 +40,8 @@ class Network(nn.Module):
         super().__init__()
         self.optics = frame.optics
         self.scale = frame.scale
+        self.octaves = settings.octaves
+        self.coordinate_count = 3 + 6 * settings.octaves
         self.demodulation = settings.demodulation
         self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
         width = max(settings.width // share, 1)
@@ -66,9 +70,15 @@ class Network(nn.Module):
         """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, which is what convolutions on CPUs like."""
         return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
-    def normalised(self, position: Tensor) -> Tensor:
-        """World positions about the scene's centre, over half its diagonal; (B, P, 3)."""
-        return (position - self.centre) / self.scale
+    def coordinates(self, position: Tensor) -> Tensor:
+        """World positions about the scene's centre, over half its diagonal, and their sines and cosines.
+
+        (…, 3) → (…, 3 + 6 · octaves): sin and cos of π/2 · 2ᵏ times each, k = 0 … octaves − 1, from which functions of
+        the position are learnt in far fewer steps (Tancik et al., Fourier Features, 2020).
+        """
+        x = (position - self.centre) / self.scale
+        angles = [x * (0.5 * math.pi * 2**octave) for octave in range(self.octaves)]
+        return torch.cat([x, *(wave(angle) for angle in angles for wave in (torch.sin, torch.cos))], dim=-1)
 
     def project(self, features: Tensor, position: Tensor, visible: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""

@@ -72,9 +72,11 @@ def _parameters(network: Network) -> dict[str, int]:
 def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
     """A frame with as many points and photons as the scene's; their values do not matter."""
     points = min(settings.points or spec.points, spec.points)
-    appearance = np.zeros((points, 9), np.float32)
+    appearance, base = np.zeros((points, 9), np.float32), np.zeros((points, 3), np.float32)
     optics = Optics.of(spec, settings.occlusion, settings.occlusion_tolerance)
-    return SceneFrame(optics, np.zeros(3, np.float32), 1.0, appearance, spec.photons.paths, spec.photons.depth, 1.0)
+    return SceneFrame(
+        optics, np.zeros(3, np.float32), 1.0, base, appearance, spec.photons.paths, spec.photons.depth, 1.0
+    )
 
 
 def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:

@@ -77,7 +77,7 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @click.option(
     "--loss",
     metavar=f"[{'|'.join(get_args(Loss))}]",
-    help="Squared error; relative: to the prediction's brightness.  [default: linear]",
+    help="Squared error; relative: to the prediction's brightness; paired: and to the other half's.  [default: linear]",
 )
 @click.option("--optimiser", metavar=f"[{'|'.join(get_args(Optimiser))}]", help="[default: adam]")
 @click.option("--learning-rate", type=click.FloatRange(0, min_open=True), help="At the beginning.  [default: 0.0005]")

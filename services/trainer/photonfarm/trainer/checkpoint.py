@@ -120,7 +120,9 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     if lasting:
         found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
         options = " ".join(
-            f"--set {key.split('.')[-1]}={then}" for key, (then, _) in lasting.items() if key != "scene_id"
+            f"--set {key.split('.')[-1]}={'null' if then is None else then}"
+            for key, (then, _) in lasting.items()
+            if key != "scene_id"
         )
         same = f"the same values{f' ({options})' if options else ''}"
         raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")

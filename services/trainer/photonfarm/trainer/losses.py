@@ -49,9 +49,9 @@ def paired_loss(prediction: Tensor, target: Tensor, told: Tensor | None = None) 
     told = target if told is None else told
     if told.shape[1] != 2:
         raise ValueError(f"has {told.shape[1]} half-estimates; each of two is weighted by the other")
-    brightness = torch.cat([prediction[:, None].detach(), told.flip(1)], dim=1).mean(dim=-1, keepdim=True)
-    of_prediction, of_other = brightness[:, :1], brightness[:, 1:]
-    return torch.mean((prediction[:, None] - target) ** 2 / (of_prediction**2 + of_other**2 + RELATIVE_EPSILON))
+    prediction = prediction[:, None]
+    brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), told.flip(1)))
+    return torch.mean((prediction - target) ** 2 / (brightness**2 + of_other**2 + RELATIVE_EPSILON))
 
 
 LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {

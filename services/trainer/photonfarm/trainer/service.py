@@ -88,8 +88,7 @@ def _lead(
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
         if not is_vacant(store) and scene_id not in Store(store).scene_ids():
-            there = ", ".join(scene.spec.name for scene in Store(store).scenes()) or "no scene"
-            click.echo(f"waiting for scene {scene_id}; {store} holds {there}", err=True)
+            click.echo(f"waiting for scene {scene_id}, which {store} does not hold yet", err=True)
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         with _consumption_told(redis_url, store, scene_id) as count:
             listen = [_tell, *([board.record] if board else [])]

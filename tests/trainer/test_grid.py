@@ -115,6 +115,11 @@ def test_the_best_is_picked_by_one_half_and_all_are_told_by_the_other_in_pairs()
     assert lines[3] == "| 1.0 | 0.80000 | 2.00000 ± 0.57735 | -0.10000 ± 0.00000 |"
 
 
+def test_an_error_that_is_all_but_infinite_is_told_in_few_digits() -> None:
+    cells = [Cell({"decay": 1.0}, (0.5, 0.5), (1.0, 1.0)), Cell({"decay": 0.95}, (3.2e30, 3.2e30), (1e12, 3e12))]
+    assert table(cells).splitlines()[3] == "| 0.95 | 3.2e+30 | 2e+12 ± 1e+12 | 2e+12 ± 1e+12 |"
+
+
 def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, tiny, run) -> None:
     """Views of one configuration stay together, and the order in which they come does not matter."""
     source = make_source(48, views=2)

@@ -35,8 +35,9 @@ class Estimate:
 
 
 def stated(mean: float, standard_error: float | None) -> str:
-    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown."""
-    return f"{mean:.5f}" if standard_error is None else f"{mean:.5f} ± {standard_error:.5f}"
+    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown; "1.23e+12" where it is vast."""
+    values = [mean] if standard_error is None else [mean, standard_error]
+    return " ± ".join(f"{value:.5f}" if abs(value) < 1e5 else f"{value:.3g}" for value in values)
 
 
 def group_means(values: NDArray[np.float64], groups: Sequence[Hashable]) -> NDArray[np.float64]:

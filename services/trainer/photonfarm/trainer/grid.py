@@ -116,7 +116,7 @@ def table(cells: Sequence[Cell]) -> str:
     rows = []
     for cell in ranked:
         behind = _stated(cell.behind(ranked[0])) if cell.per_unit and cell is not ranked[0] else ""
-        picked = f"{cell.rank:.5f}" if cell.picked_by else ""
+        picked = stated(cell.rank, None) if cell.picked_by else ""
         rows.append([*(str(cell.changes.get(key, "")) for key in keys), picked, _stated(cell.error), behind])
     return markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
 

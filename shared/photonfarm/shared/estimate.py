@@ -35,7 +35,7 @@ class Estimate:
 
 
 def stated(mean: float, standard_error: float | None) -> str:
-    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown; "1.23e+12" where it is vast."""
+    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown; a vast one in few digits."""
     values = [mean] if standard_error is None else [mean, standard_error]
     return " ± ".join(f"{value:.5f}" if abs(value) < 1e5 else f"{value:.3g}" for value in values)
 

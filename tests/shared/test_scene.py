@@ -142,7 +142,7 @@ def test_a_file_that_is_no_json_is_told_in_a_short_line_and_so_is_a_long_value()
     with pytest.raises(ValidationError) as caught:
         SceneSpec.model_validate_json(b"garbage\n" * 1000)
     (said,) = sentences(caught.value)
-    assert said.startswith("the spec: Invalid JSON")
+    assert said.startswith("Invalid JSON")
     with pytest.raises(SpecError) as refused:
         parse_spec(changed(points="many" * 1000), where="spec")
     for line in (said, str(refused.value)):

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.estimate import Estimate
 from photonfarm.shared.plan import Request
 from photonfarm.trainer import checkpoint, grid, service
@@ -55,7 +55,7 @@ def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) 
     assert cells[0] == first[0]
     assert len(cells) == 2
     assert len(told) == 1
-    assert told[0].startswith("2: 0.0005: 0.")
+    assert told[0].startswith("2 of 2: 0.0005: 0.")
 
 
 def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(make_source, tiny, run, tmp_path) -> None:
@@ -167,6 +167,14 @@ def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, 
         run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
 
 
+@pytest.mark.parametrize("text", ["xx", "{}", "[]"])
+def test_a_file_that_no_grid_left_is_named(make_source, tiny, run, text: str) -> None:
+    run.mkdir()
+    (run / "grid.json").write_text(text)
+    with pytest.raises(StoreError, match=r"grid\.json: is not what a grid left there"):
+        run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0,)})
+
+
 def test_an_axis_that_cannot_be_is_named_before_anything_runs(make_source, tiny, run) -> None:
     with pytest.raises(SpecError, match=r"the axes of the grid: decay = 1\.5: Input should be less than or equal to 1"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0, 1.5)})
@@ -183,5 +191,5 @@ def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit
     found = service.search(None, tmp_path / "store", run, "small", changes)
     assert len(found.splitlines()) == 2 + 4, "a line for each rate"
     assert "| rmsprop | 0.002 | 1.0 |" in found
-    assert "4: rmsprop-0.002-1.0: " in capsys.readouterr().err
+    assert "4 of 4: rmsprop-0.002-1.0: " in capsys.readouterr().err
     assert (run / "grid.md").read_text() == found + "\n"

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import threading
 import time
@@ -12,15 +13,15 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import SpecError, StoreError
+from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.scene import load_spec
-from photonfarm.trainer import checkpoint, loop, metrics_log, service
+from photonfarm.trainer import checkpoint, cli, loop, metrics_log, service
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.device import described, usable_device
 from photonfarm.trainer.figures import run_figures
 from photonfarm.trainer.following import Growth
 from photonfarm.trainer.learner import DivergedError
-from photonfarm.trainer.loop import CHECKPOINT, METRICS, read_settings, stop_on_signals, train
+from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, read_settings, stop_on_signals, train
 from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import NetworkSettings, small
 from photonfarm.trainer.trained import TrainedRun
@@ -194,9 +195,61 @@ def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:
         whole = rf"checkpoint\.safetensors: was trained with {re.escape(found)}; use another run directory"
         with pytest.raises(SpecError, match=whole):
             train(make_source(24), tiny(**change), run)
-    with pytest.raises(SpecError, match=r"or the same values \(--set width=4 --set seed=0\)$"):
+    with pytest.raises(SpecError, match=r"or the same values \(--set width=4 --seed 0\)$"):
         train(make_source(24), tiny(network={"width": 5}, seed=2), run)
+    with pytest.raises(SpecError, match=r"or the same values \(no --demodulation\)$"):
+        train(make_source(24), tiny(network={"width": 4, "demodulation": 0.2}), run)
     assert read_settings(run) == tiny(max_steps=2)
+
+
+def test_what_a_refusal_names_as_options_are_all_that_the_command_line_has() -> None:
+    options = {parameter.name for parameter in cli.train.params if parameter.name}
+    lasting = {*checkpoint.LASTING, *NetworkSettings.model_fields}
+    assert set(checkpoint.OPTIONS) == options & lasting
+
+
+def test_what_a_run_logged_up_to_its_end_stays_where_it_goes_on(make_source, tiny, run) -> None:
+    """Also a last validation that is due at no other step, and where there is nothing left to do."""
+    train(make_source(24), tiny(), run)
+    ended = metrics_log.read(run / METRICS)
+    assert [(r["kind"], r["step"]) for r in ended[-2:]] == [("validation", 12), ("end", 12)]
+    train(make_source(24), tiny(max_steps=15), run)
+    longer = metrics_log.read(run / METRICS)
+    assert longer[: len(ended)] == ended
+    told = [(r["kind"], r["step"]) for r in longer[len(ended) :]]
+    assert told == [("changes", 12), ("validation", 15), ("end", 15)]
+    train(make_source(24), tiny(max_steps=15), run)
+    assert [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)[len(longer) :]] == [("end", 15)]
+
+
+@pytest.mark.parametrize("line", ["garbage", "[1]", '{"kind": "train"}'])
+def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: str) -> None:
+    train(make_source(24), tiny(max_steps=2), run)
+    with (run / METRICS).open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(StoreError, match=r"metrics\.jsonl: holds .*, which is no record of a training run"):
+        metrics_log.read(run / METRICS)
+    with pytest.raises(StoreError, match="which is no record of a training run; take it out"):
+        train(make_source(24), tiny(max_steps=3), run)
+    assert checkpoint.load(run / CHECKPOINT)["step"] == 2
+
+
+def test_weights_alone_are_no_checkpoint_to_go_on_from(make_source, tiny, run) -> None:
+    train(make_source(24), tiny(max_steps=2), run)
+    shutil.copy(run / INITIAL, run / CHECKPOINT)
+    with pytest.raises(StoreError, match="holds weights alone, and not where a run stood"):
+        train(make_source(24), tiny(max_steps=3), run)
+
+
+def test_a_trainer_that_is_refused_leaves_the_sign_of_life_of_the_one_at_work(run) -> None:
+    with service._sign_of_life(run), held(run):
+        with service._sign_of_life(run):
+            pass
+        service.check(run)
+    with service._sign_of_life(run):
+        pass
+    with pytest.raises(IncompleteError, match="no trainer is at work here"):
+        service.check(run)
 
 
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
@@ -213,7 +266,10 @@ def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tin
 
 def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
     run.mkdir()
-    with pytest.raises(SpecError, match=rf"{run}: is not a training run: it holds no settings\.json$"):
+    with pytest.raises(
+        SpecError,
+        match=rf"{run}: is not a training run, or one that still waits for samples: it holds no settings\.json$",
+    ):
         read_settings(run)
     (run / "settings.json").write_text("{")
     with pytest.raises(SpecError, match=r"settings\.json: is not the JSON that a training run leaves there"):
@@ -236,7 +292,7 @@ def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, ti
         TrainedRun.load(run)
     (run / "settings.json").write_text(json.dumps(written))
     (run / CHECKPOINT).unlink()
-    with pytest.raises(StoreError, match="there is no checkpoint yet; train the run first"):
+    with pytest.raises(StoreError, match="there is no checkpoint yet; a run leaves one every 500 steps"):
         TrainedRun.load(run)
 
 

@@ -265,9 +265,11 @@ def _validate(described: dict[str, Any], where: str) -> SceneSpec:
 def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str]:
     """One sentence for each fault that a model found: its key, the value and the rule; `known` are keys it may have."""
     for fault in error.errors():
-        key = ".".join(map(str, fault["loc"])) or "the spec"
+        key = ".".join(map(str, fault["loc"]))
         rule = fault["msg"].removeprefix("Value error, ")
-        if fault["type"] in ("value_error", "missing", "json_invalid"):
+        if not key:  # of the whole
+            yield rule
+        elif fault["type"] in ("value_error", "missing"):
             yield f"{key}: {rule}"
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {scene_files.nearest(str(fault['loc'][-1]), known)}"

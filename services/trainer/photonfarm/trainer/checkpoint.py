@@ -34,6 +34,9 @@ Changes = dict[str, tuple[Any, Any]]
 LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
 """What a run keeps for as long as it lasts. The rest may be changed where it goes on."""
 
+OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed")
+"""Those with an option of their own on the command line; the others are told by --set."""
+
 UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)
 """What is raised on bytes that were not written here."""
 
@@ -64,10 +67,15 @@ def load(path: Path) -> dict[str, Any]:
             found = document.get("format")
             state: dict[str, Any] = _together(document, file.get_tensor) if found == FORMAT else {}
     except FileNotFoundError as error:
-        raise StoreError(f"{path}: there is no checkpoint yet; train the run first") from error
+        raise StoreError(
+            f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
+            "its end"
+        ) from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise StoreError(f"{path}: is not a readable checkpoint: {reason}") from error
+        raise StoreError(
+            f"{path}: is not a readable checkpoint: {reason}; without this file the run begins anew"
+        ) from error
     if found != FORMAT:
         raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
     return state
@@ -119,14 +127,18 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
-        options = " ".join(
-            f"--set {key.split('.')[-1]}={'null' if then is None else then}"
-            for key, (then, _) in lasting.items()
-            if key != "scene_id"
-        )
+        options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key != "scene_id")
         same = f"the same values{f' ({options})' if options else ''}"
         raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
     return changed
+
+
+def _option(key: str, value: Any) -> str:
+    """What sets a key to a value on the command line."""
+    name = key.split(".")[-1]
+    if name in OPTIONS:
+        return f"no --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
+    return f"--set {name}={'null' if value is None else value}"
 
 
 def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
@@ -142,7 +154,12 @@ def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = 
 
 
 def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:
-    """Raise SpecError unless the store's plans begin with those that the checkpoint saw: rows are numbered by them."""
+    """Raise SpecError unless the store's plans begin with those that the checkpoint saw: rows are numbered by them.
+
+    StoreError if it holds weights alone, as of a run that has not begun.
+    """
+    if "store" not in state:
+        raise StoreError(f"{path}: holds weights alone, and not where a run stood; without this file it begins anew")
     before = state["store"]["plans"]
     if list(plans[: len(before)]) != before:
         raise SpecError(

@@ -63,7 +63,8 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     "--precision", type=click.Choice(get_args(Precision)), help="Of the U-Net's computations.  [default: float32]"
 )
 @click.option("--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
-@click.option("--seconds", "max_seconds", type=click.FloatRange(0, min_open=True), help="Stop after so much time.")
+@click.option("--seconds", "max_seconds", type=click.FloatRange(0, min_open=True),
+              help="Stop after so much time in all, with waiting and what the run has had before.")  # fmt: skip
 @click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
 @click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
 @click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.estimate import Estimate, group_means, stated
 from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.scene import sentences
@@ -105,7 +105,7 @@ def run_grid(
                 finished.append(cell)
                 _write(folder, about, finished)
                 if tell:
-                    tell(f"{len(finished)}: {_name(changes)}: {_stated(cell.error)}")
+                    tell(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
     return finished
 
 
@@ -205,16 +205,21 @@ def _place(unit: Key) -> Key:
 
 
 def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
-    """The finished cells of a grid; SpecError unless it was about the same."""
+    """The finished cells of a grid; SpecError unless it was about the same, StoreError where it cannot be read."""
     if not path.exists():
         return []
     with store_errors("read the grid", path):
-        written = json.loads(path.read_text())
-    before, now = ({**document, **document["settings"]} for document in (written, about))
+        text = path.read_text()
+    try:
+        written = json.loads(text)
+        cells = [Cell(cell["changes"], tuple(cell["picked_by"]), tuple(cell["per_unit"])) for cell in written["cells"]]
+        before, now = ({**document, **document["settings"]} for document in (written, about))
+    except (ValueError, LookupError, TypeError) as error:
+        raise StoreError(f"{path}: is not what a grid left there; without this file it begins anew") from error
     for key in now:
         if key != "settings" and before.get(key) != now[key]:
             raise SpecError(f"{path}: has {key} = {before.get(key)!r}, now {now[key]!r}; use another run folder")
-    return [Cell(cell["changes"], tuple(cell["picked_by"]), tuple(cell["per_unit"])) for cell in written["cells"]]
+    return cells
 
 
 def _write(folder: Path, about: Mapping[str, Any], cells: Sequence[Cell]) -> None:

@@ -154,6 +154,7 @@ class Session:
         self._following = Following(feed, settings, around.script, around.group)
         self._step = 0
         self._last_error: float | None = None
+        self._validated: int | None = None  # the step of the log's last validation
         self._seconds_told: dict[str, float] = {}  # by the last validation
 
     def run(self) -> Outcome:
@@ -161,13 +162,14 @@ class Session:
         self._begin()
         self._watch.turn("other")
         while (reason := self._ended()) is None:
-            if self._step % self._settings.validate_every == 0 and self._wait(self._can_validate):
+            due = self._step % self._settings.validate_every == 0 and self._step != self._validated
+            if due and self._wait(self._can_validate):
                 self._validate()
             if (batch := self._wait(self._next_batch)) is not None:
                 self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
-        if reason != "stopped" and self._following.held_out:
+        if reason != "stopped" and self._following.held_out and self._step != self._validated:
             self._validate()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
@@ -178,7 +180,8 @@ class Session:
         changed = self._continue(path) if path.exists() else self._start()
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
-        self._log.cut(self._step)
+        kept = self._log.cut(self._step)
+        self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)
         self._tell_count()
@@ -276,7 +279,7 @@ class Session:
                 return
             finally:
                 self._following.ask_again()
-        self._last_error = held_out.error.mean
+        self._last_error, self._validated = held_out.error.mean, self._step
         self._log.write(
             "validation",
             step=self._step,
@@ -333,7 +336,9 @@ def read_settings(run: Path) -> TrainSettings:
         document = json.loads(path.read_text())
         settings = TrainSettings.model_validate(document)
     except FileNotFoundError as error:
-        raise SpecError(f"{run}: is not a training run: it holds no {SETTINGS}") from error
+        raise SpecError(
+            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
+        ) from error
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:

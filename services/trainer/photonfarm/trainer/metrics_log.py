@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store import store_errors
 
 
@@ -17,19 +17,25 @@ class MetricsLog:
     def __init__(self, path: Path, listen: Callable[[dict[str, Any]], object] | None = None) -> None:
         self._path, self._listen = path, listen
 
-    def cut(self, step: int) -> None:
-        """Drop what was logged after the checkpoint of `step`; the run that continues from there writes it again.
+    def cut(self, step: int) -> list[dict[str, Any]]:
+        """Drop what was logged after the checkpoint of `step`, which who continues from there writes again.
 
-        What stays is renamed into place, so that whoever reads along finds a whole file under this name. A training
-        record of `step` itself was written before the checkpoint and stays, a validation after it.
+        Returns the records that stay. They are renamed into place, so that whoever reads along finds a whole file under
+        this name. A training record of `step` itself was written before the checkpoint, and so was all up to an end
+        there; a validation or a change of settings that no end follows was written after it.
         """
         with store_errors("cut the log", self._path):
-            lines = self._path.read_bytes().splitlines(keepends=True) if self._path.exists() else []
-            kept = list(takewhile(lambda line: line.endswith(b"\n") and not _is_after(json.loads(line), step), lines))
-            if len(kept) < len(lines):
+            lines = _lines(self._path)
+            records = [_record(line, self._path) for line in lines if line.endswith(b"\n")]
+            ends = [i + 1 for i, record in enumerate(records) if (record["step"], record["kind"]) == (step, "end")]
+            kept = max(ends, default=0)
+            while kept < len(records) and not _is_after(records[kept], step):
+                kept += 1
+            if kept < len(lines):
                 partial = self._path.with_suffix(".partial")
-                partial.write_bytes(b"".join(kept))
+                partial.write_bytes(b"".join(lines[:kept]))
                 partial.replace(self._path)
+            return records[:kept]
 
     def write(self, kind: str, **values: Any) -> None:
         """Append a record."""
@@ -44,8 +50,20 @@ def _is_after(record: dict[str, Any], step: int) -> bool:
     return record["step"] > step or (record["step"] == step and record["kind"] != "train")
 
 
+def _lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True) if path.exists() else []
+
+
+def _record(line: bytes, path: Path) -> dict[str, Any]:
+    try:
+        record: dict[str, Any] = json.loads(line)
+        _ = record["step"], record["kind"]
+        return record
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path}: holds {line[:40]!r}, which is no record of a training run; take it out") from error
+
+
 def read(path: Path) -> list[dict[str, Any]]:
-    """The whole records of a log, in order; a last line cut short by a crash is left out."""
-    if not path.exists():
-        return []
-    return [json.loads(line) for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")]
+    """The whole records of a log, in order; a last line cut short by a crash is left out. Raises StoreError."""
+    with store_errors("read the log", path):
+        return [_record(line, path) for line in _lines(path) if line.endswith(b"\n")]

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -21,6 +21,7 @@ from photonfarm.shared.scene import load_spec, sentences
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.storage import is_vacant
 from photonfarm.trainer import waits
+from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import KEYS, NetworkSettings, TrainSettings, preset
 
 if TYPE_CHECKING:
@@ -87,9 +88,11 @@ def _lead(
         if scene_id is None:
             click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
             return
-        if not is_vacant(store) and scene_id not in Store(store).scene_ids():
-            click.echo(f"waiting for scene {scene_id}, which {store} does not hold yet", err=True)
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
+        if not is_vacant(store) and not source.ready():
+            there = scene_id in Store(store).scene_ids()
+            lacks = "of which no sample is complete" if there else f"which {store} does not hold yet"
+            click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
         with _consumption_told(redis_url, store, scene_id) as count:
             listen = [_tell, *([board.record] if board else [])]
             outcome = train(
@@ -227,7 +230,9 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-        (folder / ALIVE_FILE).unlink(missing_ok=True)
+        if folder.is_dir():
+            with suppress(StoreError), held(folder):  # whoever is at work there keeps it
+                (folder / ALIVE_FILE).unlink(missing_ok=True)
 
 
 @contextmanager

@@ -45,6 +45,8 @@ class NetworkSettings(_Frozen):
     octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
     maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
     # with which it takes fewer steps to learn what lights do
+    photon_transport: bool = False  # a second Light Transport Layer, over the photons (ours), beside what is gathered
+    # from them
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]

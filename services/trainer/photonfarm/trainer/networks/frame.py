@@ -32,6 +32,7 @@ class SceneFrame:
     appearance: F32  # (P, 9) what never changes of each point: normal, albedo, emission
     photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
     photon_depth: int  # hits stored of each at most
+    exposure: float  # the spec's factor on radiance
     photon_scale: float  # what makes of a photon's power over the number emitted a feature near 1
 
     @classmethod
@@ -55,5 +56,6 @@ class SceneFrame:
             appearance=appearance.astype(np.float32),
             photon_paths=spec.photons.paths,
             photon_depth=spec.photons.depth,
+            exposure=spec.exposure,
             photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
         )

@@ -13,6 +13,8 @@ from photonfarm.trainer.light_transport import WIDTH, LightTransportLayer
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
+from photonfarm.trainer.photon_map import WINDOWS, gathered, seen_area
+from photonfarm.trainer.projection import footprint
 from photonfarm.trainer.settings import NetworkSettings
 
 PHOTON_NUMBERS = 10
@@ -47,10 +49,12 @@ class LightTransport(Network):
 
 
 class LightTransportPhotons(LightTransport):
-    """The same, with photons of the current configuration: "Ours (w/ photons)", whose design is ours [method 2].
+    """The same, with photons of the current configuration: "Ours (w/ photons)", whose design is ours.
 
-    A second PointNet of the same kind over the photons, projected and averaged like the points. Nothing that it sees
-    depends on how many photons there are: not their power, which is normalised, nor a maximum or mean over them.
+    It sees what is gathered from the photons in windows of the image; and what the widest window gathers, times albedo,
+    is the image that its output is added to. With `photon_transport`, a second PointNet of the same kind over the
+    photons is projected and averaged like the points [method 2]. Nothing that it sees depends on how many photons there
+    are, but for its noise: not their power, which is normalised, nor a maximum or mean over them.
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
@@ -59,18 +63,34 @@ class LightTransportPhotons(LightTransport):
                 "network.architecture = 'light_transport_photons': the scene has photons.paths = 0, and none are "
                 "stored; set photons.paths in its spec and render it anew, or train 'light_transport'"
             )
-        super().__init__(settings, frame, further=2 * WIDTH)
-        self.photon_depth, self.photon_scale = frame.photon_depth, frame.photon_scale
-        self.photon_transport = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0)
+        transported = WIDTH if settings.photon_transport else 0
+        super().__init__(settings, frame, further=WIDTH + transported + 3 * len(WINDOWS))
+        self.photon_depth, self.photon_scale, self.exposure = frame.photon_depth, frame.photon_scale, frame.exposure
+        layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if settings.photon_transport else None
+        self.photon_transport = layer
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """Those of the points, then those of the photons, (B, H, W, 64) each."""
-        photons = given(inputs.photons)
-        features, where = self.photon_features(photons), (photons.position, photons.present, photons.seen)
-        return [*super().further(inputs), self.project(features, *where, inputs)]
+        """Those of the points, and of the photons, (B, H, W, 64) each; log(1 + what is gathered), (B, H, W, 3) each."""
+        found, photons = super().further(inputs), given(inputs.photons)
+        if self.photon_transport is not None:
+            where = photons.position, photons.present, photons.seen
+            found.append(self.project(self.photon_features(photons), *where, inputs))
+        return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+
+    def gathered(self, inputs: Inputs) -> list[Tensor]:
+        """The exposed radiance of white diffuse surfaces by the photons in windows, (B, H, W, 3) each."""
+        photons, view = given(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
+        kept = footprint(photons.position, photons.present, photons.seen, *view, self.optics)
+        return gathered(photons.power * self.exposure, kept, seen_area(self.optics, *view))
+
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
+        """Albedo times what the widest window has gathered: the photon map's image of diffuse surfaces."""
+        return inputs.albedo * torch.expm1(further[-1])
 
     def photon_features(self, photons: PhotonInputs) -> Tensor:
-        """Features of the photons, (B, K, 64); those of empty slots are never projected."""
+        """Features of photons by their own layer, (B, K, 64), of empty slots too; ValueError without that layer."""
+        if self.photon_transport is None:
+            raise ValueError("photon_transport = False: there is no layer for photons")
         position, power = self.coordinates(photons.position), photons.power * self.photon_scale
         bounce = photons.bounce[..., None] / self.photon_depth
         numbers = torch.cat([position, photons.direction, photons.normal, power, bounce], dim=-1)

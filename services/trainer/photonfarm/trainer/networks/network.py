@@ -54,12 +54,18 @@ class Network(nn.Module):
         lets lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets stay as they are:
         dividing them by albedo would weight their noise by a factor per pixel.
         """
-        output = self.synthesise(torch.cat([*self.further(inputs), self.image_space(inputs)], dim=-1))
-        return output if self.demodulation is None else output * (inputs.albedo + self.demodulation)
+        further = self.further(inputs)
+        output = self.synthesise(torch.cat([*further, self.image_space(inputs)], dim=-1))
+        made = output if self.demodulation is None else output * (inputs.albedo + self.demodulation)
+        return made + self.known(inputs, further)
 
     def further(self, inputs: Inputs) -> list[Tensor]:  # noqa: ARG002 - what the kinds see
         """What this kind of network puts before the image-space channels, each (B, H, W, C)."""
         return []
+
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:  # noqa: ARG002 - what the kinds see
+        """What the image is without anything learned, (B, H, W, 3), to which the output is added."""
+        return 0.0
 
     def image_space(self, inputs: Inputs) -> Tensor:
         """View ray, depth, albedo and normal as one tensor, (B, H, W, 10)."""

@@ -74,9 +74,8 @@ def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
     points = min(settings.points or spec.points, spec.points)
     appearance, base = np.zeros((points, 9), np.float32), np.zeros((points, 3), np.float32)
     optics = Optics.of(spec, settings.occlusion, settings.occlusion_tolerance)
-    return SceneFrame(
-        optics, np.zeros(3, np.float32), 1.0, base, appearance, spec.photons.paths, spec.photons.depth, 1.0
-    )
+    photons = spec.photons.paths, spec.photons.depth
+    return SceneFrame(optics, np.zeros(3, np.float32), 1.0, base, appearance, *photons, exposure=1.0, photon_scale=1.0)
 
 
 def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:

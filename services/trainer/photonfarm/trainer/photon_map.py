@@ -1,0 +1,53 @@
+"""The photon map, gathered in the image: what falls on the surfaces that each pixel sees, estimated from the photons.
+
+The irradiance of a surface is the flux of the photons that land near over the area on which they do [Jensen, Global
+Illumination using Photon Maps, 1996]; near are here those that land in a window of pixels. Its noise falls with the
+number of photons and of pixels in the window, and what differs within a window is blurred.
+
+Shape letters: B batch, K photon slots, H W image, L photons that land in an image.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from photonfarm.trainer.projection import Footprint, Optics
+
+WINDOWS = (0.08, 0.24)
+"""Sides of the windows, of the image's width: the wider has less noise, the narrower more detail."""
+
+GRAZING = 0.1
+"""Least cosine between ray and normal: the area in a pixel whose surface is seen edge-on has no bound."""
+
+
+def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
+    """Area of the surface that each pixel sees, (B, H, W) in scene units², 0 where nothing is seen.
+
+    z² / (f² |n · d|) for depth z, focal length f in pixels, unit normal n, and d the ray that crosses depth 1.
+    """
+    rays, forward = optics.rays(world_to_camera), world_to_camera[:, None, None, 2, :3]
+    along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs().clamp(min=GRAZING)
+    return (depth / optics.focal_px) ** 2 * along / facing
+
+
+def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
+    """Irradiance / π in each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
+
+    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W). Zero where a window sees no surface.
+    """
+    B, H, W = area.shape
+    landed = power.flatten(0, 1).index_select(0, kept.point)
+    flux = power.new_zeros(B * H * W, 3).index_add(0, kept.pixel, landed).view(B, H, W, 3)
+    both = torch.cat([flux, area[..., None]], dim=-1).permute(0, 3, 1, 2)
+    found = []
+    for share in WINDOWS:
+        beside = round(0.5 * (share * W - 1))  # pixels on each side
+        row = functional.avg_pool2d(both, (1, 2 * beside + 1), 1, (0, beside))
+        around = functional.avg_pool2d(row, (2 * beside + 1, 1), 1, (beside, 0)).permute(0, 2, 3, 1)
+        seen = around[..., 3:]
+        found.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
+    return found

@@ -1,0 +1,98 @@
+"""What is gathered from photons in the image, against areas and radiance in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.shared.view import Camera
+from photonfarm.trainer.dataset import Batch, read_into
+from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.photon_map import WINDOWS, gathered, seen_area
+from photonfarm.trainer.projection import Footprint, Optics
+from photonfarm.trainer.settings import NetworkSettings
+
+ARCHITECTURE = "light_transport_photons"
+B, H, W, K = 2, 24, 32, 40
+
+
+def batch_of(source, rows: tuple[int, ...]) -> Batch:
+    needs, (_, cloud) = ARCHITECTURES[ARCHITECTURE].needs, source.base()
+    return read_into(Batch.empty(len(rows), len(cloud.position), source.spec, needs), source, rows, needs, cloud)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
+def test_the_area_that_a_pixel_sees_of_a_plane_is_that_between_its_corners(tilt: float) -> None:
+    """Of a plane through (0, 0, 3), turned about x; corners where the rays through those of the pixel meet it."""
+    optics = Optics(focal_px=60.0, width=16, height=16, near=0.1, far=20.0)
+    normal = np.array([0.0, math.sin(tilt), -math.cos(tilt)])
+
+    def hits(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        rays = np.stack(np.broadcast_arrays((u - 8) / 60, (v[:, None] - 8) / 60, 1.0), axis=-1)
+        return rays * (3 * normal[2] / (rays @ normal))[..., None]
+
+    corners, centres = hits(np.arange(17.0), np.arange(17.0)), hits(np.arange(16) + 0.5, np.arange(16) + 0.5)
+    diagonals = corners[1:, 1:] - corners[:-1, :-1], corners[1:, :-1] - corners[:-1, 1:]
+    wanted = 0.5 * np.linalg.norm(np.cross(*diagonals), axis=-1)
+    camera = torch.eye(3, 4, dtype=torch.float64)[None]
+    depth = torch.from_numpy(centres[None, ..., 2])
+    found = seen_area(optics, camera, depth, torch.from_numpy(normal).expand(1, 16, 16, 3))
+    np.testing.assert_allclose(found[0], wanted, rtol=2e-3)
+    assert torch.all(seen_area(optics, camera, torch.zeros_like(depth), torch.zeros(1, 16, 16, 3)) == 0)
+
+
+def test_a_window_has_the_flux_that_lands_in_it_over_the_area_that_it_sees() -> None:
+    """Pixel by pixel: of each window, that lies in the image in part, sums of both."""
+    torch.manual_seed(0)
+    power, area = torch.rand(B, K, 3, dtype=torch.float64), torch.rand(B, H, W, dtype=torch.float64)
+    area[:, :12, :12] = 0
+    lands = torch.randperm(B * K)[:50]
+    kept = Footprint(point=lands, pixel=lands // K * (H * W) + torch.randint(H * W, (50,)))
+    flux = np.zeros((B * H * W, 3))
+    for point, pixel in zip(kept.point.tolist(), kept.pixel.tolist(), strict=True):
+        flux[pixel] += power.view(-1, 3)[point].numpy()
+    flux = flux.reshape(B, H, W, 3)
+    sides = {share: round(0.5 * (share * W - 1)) for share in WINDOWS}
+    assert list(sides.values()) == [1, 3]
+    for found, side in zip(gathered(power, kept, area), sides.values(), strict=True):
+        for b, v, u in ((0, 12, 12), (1, 0, 31), (0, 23, 5), (1, 14, 20), (0, 2, 2)):
+            window = b, slice(max(v - side, 0), v + side + 1), slice(max(u - side, 0), u + side + 1)
+            seen = area[window].sum().item()
+            wanted = flux[window].sum(axis=(0, 1)) / seen / math.pi if seen else np.zeros(3)
+            np.testing.assert_allclose(found[b, v, u], wanted, rtol=1e-9)
+
+
+def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_anything_is_learned(
+    make_source,
+) -> None:
+    """Against clean images in closed form, of direct light: sums over the image agree, and the wider window is near.
+
+    Photons are noisy, and the light quad, whose albedo is 0, is in none of it.
+    """
+    source = make_source(12, size=32, photons=4096)
+    settings = NetworkSettings(width=4, architecture=ARCHITECTURE)
+    network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
+    ratios, errors, levels = [], [], []
+    for row in range(12):
+        inputs = batch_of(source, (row,)).inputs
+        with torch.no_grad():
+            further = network.further(inputs)
+            output = network.synthesise(torch.cat([*further, network.image_space(inputs)], dim=-1))
+            known = network.known(inputs, further)
+            torch.testing.assert_close(network(inputs), output + known)
+        diffuse = inputs.albedo[0].sum(dim=-1).numpy() > 0
+        clean = source.clean(row)[diffuse]
+        ratios.append(known[0].numpy()[diffuse].sum() / clean.sum())
+        errors.append(np.mean((known[0].numpy()[diffuse] - clean) ** 2))
+        levels.append(np.mean(clean**2))
+    assert np.mean(ratios) == pytest.approx(1, abs=0.05)
+    assert np.mean(errors) < 0.1 * np.mean(levels)
+
+
+def test_the_camera_of_the_areas_is_that_of_the_rays(make_source) -> None:
+    """The third row of a transform is the forward axis."""
+    source = make_source(1)
+    camera = Camera.of(source.view(0), source.spec)
+    np.testing.assert_allclose(camera.world_to_camera[2, :3], camera.forward, rtol=1e-6)

@@ -61,7 +61,8 @@ def rendered() -> Rendered:
     room = load_spec("room")
     film = room.film.model_copy(update={"width": SIZE, "height": SIZE})
     transport = room.transport.model_copy(update={"half_spp": 1})
-    spec = room.model_copy(update={"film": film, "transport": transport, "points": POINTS})
+    photons = room.photons.model_copy(update={"paths": 512})  # of no use here; the scene, and so its cloud, is fixed
+    spec = room.model_copy(update={"film": film, "transport": transport, "photons": photons, "points": POINTS})
     scene = LoadedScene.load(spec)
     geometry, cloud = scene.base()
     modification = sample_modification(spec, 0, 0)

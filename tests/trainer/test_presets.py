@@ -166,7 +166,6 @@ def test_the_summary_is_printed_and_nothing_else_is_done(tmp_path: Path) -> None
     assert [line.split()[0] for line in table] == [
         "part",
         "point",
-        "photon",
         "projection",
         "U-Net",
         "total",

@@ -39,7 +39,8 @@ ARCHITECTURES = ("cnn", "feature_projection", "light_transport", "light_transpor
 PUBLISHED = (0.0100, 0.0098, 0.0029, 0.0014)
 """Their MSE with movable lights [supplement Table 2], in another scene, of wider networks trained for longer."""
 
-METRICS = {"MSE": "shown", "1 − MSSIM": "dissimilarity", "FLIP": "flip"}
+BLOCK = 8  # px
+METRICS = {"MSE": "shown", f"MSE of {BLOCK} × {BLOCK} means": "coarse", "1 − MSSIM": "dissimilarity", "FLIP": "flip"}
 CLOSE = 0.1  # ≈: a gap of less than this share of the first's error
 SHOWN = (0.3, 0.6, 0.8, 0.95)  # quantiles of the first architecture's error: these views are shown
 PICTURE = "order.png"
@@ -53,6 +54,7 @@ class Measured:
     parameters: int
     train_s: float  # of one run's steps, wall time
     shown: Errors  # squared, in the metric space
+    coarse: Errors  # the same of means of blocks of pixels
     linear: Errors  # squared, in exposed linear radiance
     dissimilarity: Errors  # 1 − MSSIM
     flip: Errors
@@ -84,6 +86,7 @@ def measure(architecture: str, where: tuple[Path, SceneSpec], references: Refere
         parameters=sum(weight.numel() for weight in runs[0][0].weights.values()),
         train_s=sum(seconds for _, seconds in runs) / len(runs),
         shown=shown,
+        coarse=each(partial(references.shown_errors, block=BLOCK)),
         linear=each(references.linear_errors),
         dissimilarity=each(lambda images: 1 - mssim(metric_space(images), wanted)),
         flip=each(lambda images: flip(metric_space(images), wanted)),
@@ -91,19 +94,29 @@ def measure(architecture: str, where: tuple[Path, SceneSpec], references: Refere
     )
 
 
+def photon_map(where: tuple[Path, SceneSpec], references: References, told: Any) -> tuple[Errors, Errors]:
+    """Squared errors in the metric space, and of means of blocks, of what the last architecture adds its output to."""
+    folder, spec = where
+    source = partial(StoreSource, folder / "store", spec.scene_id)
+    run, _ = room_study.trained(source, settings_of(ARCHITECTURES[-1], told.seeds[0], told), folder)
+    unlearned = room_study.photon_maps(run, source(), references.rows)
+    errors = references.shown_errors(unlearned), references.shown_errors(unlearned, BLOCK)
+    return Errors(errors[0][None], references.units), Errors(errors[1][None], references.units)
+
+
 # --------------------------------------------------------------------------------------------------------------- page
 
 
 def errors_table(measured: list[Measured]) -> str:
     header = (
-        "architecture", "parameters", "MSE (95 %)", "of each seed", "linear MSE (95 %)", "MSSIM", "FLIP",
-        "training, minutes", "published MSE",
+        "architecture", "parameters", "MSE (95 %)", "of each seed", f"of {BLOCK} × {BLOCK} means", "linear MSE (95 %)",
+        "MSSIM", "FLIP", "training, minutes", "published MSE",
     )  # fmt: skip
     lines = [
         [
-            f"`{m.architecture}`", f"{m.parameters:,}", stated(m.shown), each_seed(m.shown), stated(m.linear, 3),
-            f"{1 - m.dissimilarity.estimate().mean:.3f}", f"{m.flip.estimate().mean:.3f}", f"{m.train_s / 60:.1f}",
-            f"{published:.4f}",
+            f"`{m.architecture}`", f"{m.parameters:,}", stated(m.shown), each_seed(m.shown), stated(m.coarse),
+            stated(m.linear, 3), f"{1 - m.dissimilarity.estimate().mean:.3f}", f"{m.flip.estimate().mean:.3f}",
+            f"{m.train_s / 60:.1f}", f"{published:.4f}",
         ]
         for m, published in zip(measured, PUBLISHED, strict=True)
     ]  # fmt: skip
@@ -185,8 +198,14 @@ def verdict(measured: list[Measured]) -> str:
     return f"{of_whom}{'; '.join(sentences)}. {disagreement}"
 
 
-def page(told: argparse.Namespace, spec: SceneSpec, references: References, measured: list[Measured]) -> str:
-    """The tables as Markdown."""
+def page(
+    told: argparse.Namespace,
+    spec: SceneSpec,
+    references: References,
+    measured: list[Measured],
+    unlearned: tuple[Errors, Errors],
+) -> str:
+    """The tables as Markdown; `unlearned` are errors of the photon map."""
     settings, paper = settings_of(ARCHITECTURES[0], told.seeds[0], told), preset("paper-dynamic")
     units = len(set(references.units))
     trained_on, drawn = told.configurations - units, told.steps * settings.batch
@@ -206,12 +225,16 @@ width {settings.network.width}, {settings.network.points} points; for each archi
 {room_study.described(settings)}. {room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples.
 
 **MSE** is in the metric space, clip(I, 0, 1)^(1/2.2), against references of {references.spp} spp whose noise is taken
-out by their halves. **Linear MSE** is in exposed radiance, noise taken out in the same way. **MSSIM** and **FLIP** are
+out by their halves; **of {BLOCK} × {BLOCK} means**, the same of blocks of pixels, which tells of light rather than of
+texture and edges. **Linear MSE** is in exposed radiance, noise taken out in the same way. **MSSIM** and **FLIP** are
 in the metric space against the mean of both halves, with its noise: a standard deviation of
 {references.noise(references.spp):.3f} in exposed radiance, root mean square over pixels.
 {room_study.of_intervals(len(told.seeds))}
 
 {errors_table(measured)}
+
+What `{ARCHITECTURES[-1]}` adds its output to, the photon map of {spec.photons.paths} light paths, has an MSE of
+{stated(unlearned[0])}, {stated(unlearned[1])} of {BLOCK} × {BLOCK} means: nothing in it is learned.
 
 The published figures are of another scene, at 256², with {paper.network.width / settings.network.width:g} times the
 width, and {paper.max_steps * paper.batch / drawn:.0f} times as many samples were drawn for them.
@@ -244,14 +267,18 @@ def picture(references: References, measured: list[Measured]) -> Any:
     return room_study.mosaic([("reference", references.mean[views], None), *columns])
 
 
-def document(told: argparse.Namespace, references: References, measured: list[Measured]) -> dict[str, Any]:
+def document(
+    told: argparse.Namespace, references: References, measured: list[Measured], unlearned: tuple[Errors, Errors]
+) -> dict[str, Any]:
     """The figures of order.json; of each view, its errors from each seed."""
     rows = [
         {"architecture": m.architecture, "parameters": m.parameters, "train_s": m.train_s}
         | {name: np.round(getattr(m, name).values, 6).tolist() for name in ("linear", *METRICS.values())}
         for m in measured
     ]
-    return room_study.document(settings_of(ARCHITECTURES[0], told.seeds[0], told), told, references) | {"rows": rows}
+    of_map = dict(zip(("shown", "coarse"), (np.round(errors.values, 6).tolist() for errors in unlearned), strict=True))
+    study = room_study.document(settings_of(ARCHITECTURES[0], told.seeds[0], told), told, references)
+    return study | {"rows": rows, "photon_map": of_map}
 
 
 def main() -> int:
@@ -267,9 +294,11 @@ def main() -> int:
     render(spec := room_study.room(), store, told)
     references = References.of(store, spec, told.reference_spp)
     measured = [measure(name, (folder, spec), references, told) for name in ARCHITECTURES]
+    unlearned = photon_map((folder, spec), references, told)
     told.out.mkdir(parents=True, exist_ok=True)
     picture(references, measured).save(told.out / PICTURE)
-    results.write("order", page(told, spec, references, measured), document(told, references, measured), told.out)
+    values = document(told, references, measured, unlearned)
+    results.write("order", page(told, spec, references, measured, unlearned), values, told.out)
     return 0
 
 

@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn.functional import avg_pool2d
 
 from photonfarm.shared.estimate import Estimate, clean_error, group_means
 from photonfarm.shared.keys import Key
@@ -216,14 +218,17 @@ class References:
         """Squared errors in exposed linear radiance of images (N, H, W, 3), of each view (N,), noise taken out."""
         return np.array([clean_error(image, a, b) for image, (a, b) in zip(made, self.halves, strict=True)])
 
-    def shown_errors(self, made: F32) -> NDArray[np.float64]:
+    def shown_errors(self, made: F32, block: int = 1) -> NDArray[np.float64]:
         """Squared errors in the metric space, likewise: mean (f − A)(f − B) of what a display shows of all three.
+
+        With `block`, of the means of so many by so many pixels, in which fine texture and edges play no part.
 
         The noise of A and that of B multiply to nothing. What stays is the shift δ that the display's curve makes of
         their noise on average, E A = E B = I + δ, of second order in the noise: the expectation is mean (f − I)²
         − 2 δ (f − I) + δ². Its cross term is of f, and so differs between networks.
         """
-        shown, a, b = (metric_space(image).double() for image in (made, self.halves[:, 0], self.halves[:, 1]))
+        images = (metric_space(image).double() for image in (made, self.halves[:, 0], self.halves[:, 1]))
+        shown, a, b = (avg_pool2d(image.movedim(-1, 1), block) for image in images)
         errors: NDArray[np.float64] = ((shown - a) * (shown - b)).mean(dim=(1, 2, 3)).numpy()
         return errors
 
@@ -238,6 +243,16 @@ def images(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F32:
     with Feed(source, run.settings, needs=run.needs) as feed:
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), "cpu")
         return np.concatenate([predict(batch).copy() for batch in batches(feed, rows, run.settings.batch)])
+
+
+def photon_maps(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F32:
+    """What a run's network adds its output to, of complete rows, likewise: nothing in it is learned."""
+    with Feed(source, run.settings, needs=run.needs) as feed, torch.no_grad():
+        network, made = run.network(feed.spec, (feed.geometry, feed.cloud)), []
+        for batch in batches(feed, rows, run.settings.batch):
+            known = torch.as_tensor(network.known(batch.inputs, network.further(batch.inputs)))
+            made.append(known.expand_as(batch.inputs.albedo).numpy())
+        return np.concatenate(made)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

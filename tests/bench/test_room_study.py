@@ -126,6 +126,17 @@ def test_noise_is_taken_out_of_shown_errors() -> None:
     assert against_mean > 1.1 * true
 
 
+def test_errors_of_blocks_are_those_of_their_means() -> None:
+    """A checkerboard is an error of each pixel and of no block; an offset is one of both."""
+    references, clean = noisy_references(0.001)
+    signs = np.indices(clean.shape[1:3]).sum(axis=0) % 2 * 2 - 1
+    checkered = shown(clean) + 0.05 * signs[..., None]
+    made, brighter = (values.astype(np.float32) ** np.float32(2.2) for values in (checkered, shown(clean) + 0.05))
+    assert references.shown_errors(made).mean() == pytest.approx(0.05**2, rel=0.05)
+    assert references.shown_errors(made, block=4).mean() == pytest.approx(0, abs=2e-5)
+    assert references.shown_errors(brighter, block=4).mean() == pytest.approx(0.05**2, rel=0.05)
+
+
 def test_what_the_displays_curve_makes_of_noise_stays() -> None:
     references, clean = noisy_references(0.03)
     made, power = clean + np.float32(0.02), 1 / 2.2

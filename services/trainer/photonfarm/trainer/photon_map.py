@@ -1,10 +1,10 @@
 """The photon map, gathered in the image: what falls on the surfaces that each pixel sees, estimated from the photons.
 
 The irradiance of a surface is the flux of the photons that land near over the area on which they do [Jensen, Global
-Illumination using Photon Maps, 1996]; near are here those that land in a window of pixels. Its noise falls with the
-number of photons and of pixels in the window, and what differs within a window is blurred.
+Illumination using Photon Maps, 1996]; near are here those that land near in the image. Noise falls with the number of
+photons and of pixels, and what differs between these is blurred.
 
-Shape letters: B batch, K photon slots, H W image, L photons that land in an image.
+Shape letters: B batch, K photon slots, H W image.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from torch.nn import functional
 
 from photonfarm.trainer.projection import Footprint, Optics
 
-WINDOWS = (0.08, 0.24)
-"""Sides of the windows, of the image's width: the wider has less noise, the narrower more detail."""
+WINDOWS = (0.07, 0.17)
+"""Sides of the squares over which photons and area are summed, of the image's width, three times in a row, as a sum
+over one square has an edge. The wider has less noise, the narrower more detail."""
 
 GRAZING = 0.1
 """Least cosine between ray and normal: the area in a pixel whose surface is seen edge-on has no bound."""
@@ -35,9 +36,9 @@ def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Te
 
 
 def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
-    """Irradiance / π in each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
+    """Irradiance / π by each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
 
-    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W). Zero where a window sees no surface.
+    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W). Zero where no surface is seen near.
     """
     B, H, W = area.shape
     landed = power.flatten(0, 1).index_select(0, kept.point)
@@ -45,9 +46,16 @@ def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     both = torch.cat([flux, area[..., None]], dim=-1).permute(0, 3, 1, 2)
     found = []
     for share in WINDOWS:
-        beside = round(0.5 * (share * W - 1))  # pixels on each side
-        row = functional.avg_pool2d(both, (1, 2 * beside + 1), 1, (0, beside))
-        around = functional.avg_pool2d(row, (2 * beside + 1, 1), 1, (beside, 0)).permute(0, 2, 3, 1)
+        around = _blurred(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
         seen = around[..., 3:]
         found.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
     return found
+
+
+def _blurred(x: Tensor, beside: int) -> Tensor:
+    """Means over squares with so many pixels on each side of a pixel, three times, (B, C, H, W); zero outside."""
+    side = 2 * beside + 1
+    for _ in range(3):
+        x = functional.avg_pool2d(x, (1, side), 1, (0, beside))
+        x = functional.avg_pool2d(x, (side, 1), 1, (beside, 0))
+    return x

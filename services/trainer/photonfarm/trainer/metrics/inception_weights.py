@@ -112,7 +112,8 @@ def _stored(path: Path) -> dict[str, Tensor]:
             warnings.simplefilter("ignore", DeprecationWarning)  # the archive is of 2022, and has no other reader
             return torch.jit.load(path, map_location="cpu").state_dict()  # type: ignore[no-untyped-call]
     except Exception as error:  # torch raises half a dozen kinds for what holds no tensors
-        raise SpecError(f"Inception weights: {path} cannot be read as saved tensors: {error}") from error
+        reason = (str(error) or type(error).__name__).splitlines()[0].split(". ")[0]  # the rest advises programmers
+        raise SpecError(f"Inception weights: {path} cannot be read as saved tensors: {reason}") from error
 
 
 def _is_torchscript(path: Path) -> bool:

@@ -98,7 +98,8 @@ def test_the_files_hold_the_table_and_every_figure(make_source, tiny, run) -> No
     assert (run / "grid.md").read_text() == table(cells) + "\n"
     written = json.loads((run / "grid.json").read_text())
     assert written["samples"] == 24
-    assert written["settings"] == tiny().model_dump(mode="json")
+    assert written["settings"] | {"decay": 1.0} == tiny(decay=1.0).model_dump(mode="json")
+    assert "decay" not in written["settings"]
     assert [cell["mean"] for cell in written["cells"]] == [cell.error.mean for cell in cells]
     assert [cell["standard_error"] for cell in written["cells"]] == [cell.error.standard_error for cell in cells]
 
@@ -165,6 +166,13 @@ def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, 
     run_grid(lambda: make_source(24), tiny(max_steps=12), run, {"decay": (1.0,)})
     with pytest.raises(SpecError, match=f"grid.json: {found}"):
         run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
+
+
+def test_a_grid_goes_on_where_another_value_of_an_axis_is_asked_for(make_source, tiny, run) -> None:
+    first = run_grid(lambda: make_source(24), tiny(decay=0.9), run, {"decay": (0.9,)})
+    cells = run_grid(lambda: make_source(24), tiny(decay=1.0), run, {"decay": (1.0,)})
+    assert [cell.changes for cell in cells] == [{"decay": 0.9}, {"decay": 1.0}]
+    assert cells[0] == first[0]
 
 
 @pytest.mark.parametrize("text", ["xx", "{}", "[]"])

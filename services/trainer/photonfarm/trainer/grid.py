@@ -94,7 +94,8 @@ def run_grid(
     """
     stop = stop or threading.Event()
     wanted = _cells(settings, axes)
-    about = {**_about(make_source(), settings), "settings": settings.model_dump(mode="json")}
+    equal = {key: value for key, value in settings.model_dump(mode="json").items() if key not in axes}
+    about = {**_about(make_source(), settings), "settings": equal}
     with held(folder):
         finished = _read(folder / JSON, about)
         for changes, changed in wanted:

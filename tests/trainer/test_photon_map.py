@@ -1,6 +1,7 @@
 """What is gathered from photons in the image, against areas and radiance in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from photonfarm.shared.view import Camera
 from photonfarm.trainer.dataset import Batch, read_into
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.photon_map import WINDOWS, gathered, seen_area
+from photonfarm.trainer.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
 from photonfarm.trainer.projection import Footprint, Optics
 from photonfarm.trainer.settings import NetworkSettings
 
@@ -43,6 +44,40 @@ def test_the_area_that_a_pixel_sees_of_a_plane_is_that_between_its_corners(tilt:
     assert torch.all(seen_area(optics, camera, torch.zeros_like(depth), torch.zeros(1, 16, 16, 3)) == 0)
 
 
+def test_a_surface_seen_edge_on_is_left_out_with_what_lands_on_it() -> None:
+    optics = Optics(focal_px=60.0, width=8, height=8, near=0.1, far=20.0)
+    edge_on = torch.tensor([0.0, 1.0, -0.04]) / math.hypot(1, 0.04)
+    camera, depth = torch.eye(3, 4)[None], torch.ones(1, 8, 8)
+    area = seen_area(optics, camera, depth, edge_on.expand(1, 8, 8, 3))
+    assert torch.all(area[0, 3:5, 3:5] == 0)
+    kept = Footprint(point=torch.tensor([0]), pixel=torch.tensor([3 * 8 + 3]))
+    assert all(torch.count_nonzero(found) == 0 for found in gathered(torch.ones(1, 1, 3), kept, area))
+
+
+def test_light_on_the_far_side_of_a_sheet_is_not_what_the_eye_sees() -> None:
+    """An eye at (1, 2, 3), whatever way it looks; sheets before it, lit from its side and from behind."""
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0))).Q
+    eye = torch.tensor([1.0, 2.0, 3.0])
+    camera = torch.cat([rotation, -(rotation @ eye)[:, None]], dim=1)[None]
+    away = torch.tensor([0.0, 0.0, 1.0])
+    position = (eye + away).expand(1, 4, 3)
+    direction, normal = torch.stack([away, -away, away, -away]), torch.stack([away, away, -away, -away])
+    found = arrives_on_seen_side(position, direction[None], normal[None], camera)
+    assert found.tolist() == [[True, False, True, False]]
+
+
+@pytest.mark.parametrize(("max_depth", "counts"), [(-1, True), (4, True), (3, False)])
+def test_photons_of_longer_paths_than_the_images_have_are_left_out(make_source, max_depth: int, counts: bool) -> None:
+    """A photon that met two surfaces before its own has come over three edges, and the eye's is the fourth."""
+    source = make_source(1, photons=256)
+    settings = NetworkSettings(width=4, architecture=ARCHITECTURE)
+    frame = replace(SceneFrame.of(source.spec, *source.base(), settings), max_depth=max_depth)
+    network, inputs = build(settings, frame, 0), batch_of(source, (0,)).inputs
+    inputs.photons.bounce.masked_fill_(inputs.photons.present, 2)
+    with torch.no_grad():
+        assert any(found.any() for found in network.gathered(inputs)) == counts
+
+
 def box(pixels: int, beside: int) -> np.ndarray:
     """Which pixels of a row are within so many of each."""
     return (np.abs(np.subtract.outer(np.arange(pixels), np.arange(pixels))) <= beside).astype(float)
@@ -58,7 +93,7 @@ def test_flux_and_area_are_summed_over_the_same_pixels() -> None:
     flux = np.zeros((B * H * W, 3))
     for point, pixel in zip(kept.point.tolist(), kept.pixel.tolist(), strict=True):
         flux[pixel] += power.view(-1, 3)[point].numpy()
-    flux = flux.reshape(B, H, W, 3)
+    flux = flux.reshape(B, H, W, 3) * (area.numpy() > 0)[..., None]
     besides = [max(round(0.5 * (share * W - 1)), 1) for share in WINDOWS]
     assert besides == [1, 2]
     for found, beside in zip(gathered(power, kept, area), besides, strict=True):

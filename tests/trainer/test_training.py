@@ -234,6 +234,17 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
     assert checkpoint.load(run / CHECKPOINT)["step"] == 2
 
 
+def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny, run) -> None:
+    stop = threading.Event()
+    stop.set()
+    train(make_source(24), tiny(), run, stop=stop)
+    train(make_source(24), tiny(max_steps=1), run)
+    (run / CHECKPOINT).unlink()
+    train(make_source(24), tiny(max_steps=1, seed=1), run)
+    told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
+    assert told == [("validation", 0), ("validation", 1), ("end", 1)]
+
+
 def test_weights_alone_are_no_checkpoint_to_go_on_from(make_source, tiny, run) -> None:
     train(make_source(24), tiny(max_steps=2), run)
     shutil.copy(run / INITIAL, run / CHECKPOINT)
@@ -294,6 +305,15 @@ def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, ti
     (run / CHECKPOINT).unlink()
     with pytest.raises(StoreError, match="there is no checkpoint yet; a run leaves one every 500 steps"):
         TrainedRun.load(run)
+
+
+def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source, tiny, run) -> None:
+    train(make_source(24), tiny(max_steps=1), run)
+    state = checkpoint.load(run / CHECKPOINT)
+    del state["settings"]["network"]["octaves"]
+    checkpoint.save(run / CHECKPOINT, state)
+    with pytest.raises(SpecError, match="lacks octaves of the network: another version's; use another run directory"):
+        train(make_source(24), tiny(max_steps=2), run)
 
 
 def test_a_hold_out_that_leaves_nothing_to_validate_on_is_refused(make_source, tiny, run) -> None:

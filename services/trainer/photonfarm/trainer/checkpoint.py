@@ -73,9 +73,7 @@ def load(path: Path) -> dict[str, Any]:
         ) from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise StoreError(
-            f"{path}: is not a readable checkpoint: {reason}; without this file the run begins anew"
-        ) from error
+        raise StoreError(f"{path}: is not a readable checkpoint: {reason}") from error
     if found != FORMAT:
         raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
     return state
@@ -123,6 +121,10 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     Returns which other settings are not what they were. Both have `scene_id` and `settings`.
     """
     then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
+    if absent := [key for key in now["network"] if key not in then["network"]]:
+        raise SpecError(
+            f"{path}: lacks {', '.join(absent)} of the network: another version's; use another run directory"
+        )
     changed = _differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:

@@ -106,7 +106,8 @@ def run_grid(
                 finished.append(cell)
                 _write(folder, about, finished)
                 if tell:
-                    tell(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+                    done = sum(any(cell.changes == of for cell in finished) for of, _ in wanted)
+                    tell(f"{done} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
     return finished
 
 

@@ -162,8 +162,8 @@ class Session:
         self._begin()
         self._watch.turn("other")
         while (reason := self._ended()) is None:
-            due = self._step % self._settings.validate_every == 0 and self._step != self._validated
-            if due and self._wait(self._can_validate):
+            due = self._step % self._settings.validate_every == 0
+            if due and self._wait(self._can_validate) and self._step != self._validated:
                 self._validate()
             if (batch := self._wait(self._next_batch)) is not None:
                 self._train_step(batch)
@@ -177,10 +177,10 @@ class Session:
 
     def _begin(self) -> None:
         path = self._run / CHECKPOINT
-        changed = self._continue(path) if path.exists() else self._start()
+        changed = self._continue(path) if (continues := path.exists()) else self._start()
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
-        kept = self._log.cut(self._step)
+        kept = self._log.cut(self._step if continues else -1)
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)

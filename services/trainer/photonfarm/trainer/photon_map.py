@@ -21,29 +21,37 @@ WINDOWS = (0.07, 0.17)
 """Sides of the squares over which photons and area are summed, of the image's width, three times in a row, as a sum
 over one square has an edge. The wider has less noise, the narrower more detail."""
 
-GRAZING = 0.1
-"""Least cosine between ray and normal: the area in a pixel whose surface is seen edge-on has no bound."""
+GRAZING = 0.05
+"""Cosine between ray and normal below which a pixel is left out: the area of a surface seen edge-on has no bound."""
 
 
 def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
-    """Area of the surface that each pixel sees, (B, H, W) in scene units², 0 where nothing is seen.
+    """Area of the surface that each pixel sees, (B, H, W) in scene units², 0 where nothing is seen, or all but edge-on.
 
-    z² / (f² |n · d|) for depth z, focal length f in pixels, unit normal n, and d the ray that crosses depth 1.
+    z² / (f² |n · d|) for depth z, focal length f in pixels, unit shading normal n, and d the ray that crosses depth 1.
     """
     rays, forward = optics.rays(world_to_camera), world_to_camera[:, None, None, 2, :3]
-    along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs().clamp(min=GRAZING)
-    return (depth / optics.focal_px) ** 2 * along / facing
+    along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs()
+    area = (depth / optics.focal_px) ** 2 * along / facing.clamp(min=GRAZING)
+    return torch.where(facing < GRAZING, 0, area)
+
+
+def arrives_on_seen_side(position: Tensor, direction: Tensor, normal: Tensor, world_to_camera: Tensor) -> Tensor:
+    """Whether photons (B, K, 3) come from the side of their surface that the eye is on, (B, K)."""
+    eye = -(world_to_camera[:, :, :3].mT @ world_to_camera[:, :, 3:]).mT
+    return (direction * normal).sum(dim=-1) * ((position - eye) * normal).sum(dim=-1) > 0
 
 
 def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     """Irradiance / π by each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
 
-    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W). Zero where no surface is seen near.
+    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W), and pixels where that is 0 are left out.
+    Zero where no surface is seen near.
     """
     B, H, W = area.shape
     landed = power.flatten(0, 1).index_select(0, kept.point)
     flux = power.new_zeros(B * H * W, 3).index_add(0, kept.pixel, landed).view(B, H, W, 3)
-    both = torch.cat([flux, area[..., None]], dim=-1).permute(0, 3, 1, 2)
+    both = torch.cat([flux * (area > 0)[..., None], area[..., None]], dim=-1).permute(0, 3, 1, 2)
     found = []
     for share in WINDOWS:
         around = _blurred(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)

@@ -91,7 +91,7 @@ def _lead(
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             there = scene_id in Store(store).scene_ids()
-            lacks = "of which no sample is complete" if there else f"which {store} does not hold yet"
+            lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
         with _consumption_told(redis_url, store, scene_id) as count:
             listen = [_tell, *([board.record] if board else [])]
@@ -231,7 +231,7 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
         ended.set()
         thread.join()
         if folder.is_dir():
-            with suppress(StoreError), held(folder):  # whoever is at work there keeps it
+            with suppress(StoreError), held(folder):  # whoever trains there keeps it
                 (folder / ALIVE_FILE).unlink(missing_ok=True)
 
 

@@ -33,6 +33,7 @@ class SceneFrame:
     photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
     photon_depth: int  # hits stored of each at most
     exposure: float  # the spec's factor on radiance
+    max_depth: int  # edges of a path of the images; −1: no limit
     photon_scale: float  # what makes of a photon's power over the number emitted a feature near 1
 
     @classmethod
@@ -57,5 +58,6 @@ class SceneFrame:
             photon_paths=spec.photons.paths,
             photon_depth=spec.photons.depth,
             exposure=spec.exposure,
+            max_depth=spec.transport.max_depth,
             photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
         )

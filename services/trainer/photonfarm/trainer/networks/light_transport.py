@@ -5,6 +5,8 @@ Shape letters: B batch, P points, K photon slots, H W image.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from photonfarm.trainer.light_transport import WIDTH, LightTransportLayer
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
-from photonfarm.trainer.photon_map import WINDOWS, gathered, seen_area
+from photonfarm.trainer.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
 from photonfarm.trainer.projection import footprint
 from photonfarm.trainer.settings import NetworkSettings
 
@@ -66,6 +68,7 @@ class LightTransportPhotons(LightTransport):
         transported = WIDTH if settings.photon_transport else 0
         super().__init__(settings, frame, further=WIDTH + transported + 3 * len(WINDOWS))
         self.photon_depth, self.photon_scale, self.exposure = frame.photon_depth, frame.photon_scale, frame.exposure
+        self.last_bounce = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # after it the eye, an edge more
         layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if settings.photon_transport else None
         self.photon_transport = layer
 
@@ -78,9 +81,14 @@ class LightTransportPhotons(LightTransport):
         return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
 
     def gathered(self, inputs: Inputs) -> list[Tensor]:
-        """The exposed radiance of white diffuse surfaces by the photons in windows, (B, H, W, 3) each."""
+        """The exposed radiance of white diffuse surfaces by the photons in windows, (B, H, W, 3) each.
+
+        Of photons whose path to the eye is no longer than the paths of the images.
+        """
         photons, view = given(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
-        kept = footprint(photons.position, photons.present, photons.seen, *view, self.optics)
+        on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
+        wanted = photons.present & on_side & (photons.bounce <= self.last_bounce)
+        kept = footprint(photons.position, wanted, photons.seen, *view, self.optics)
         return gathered(photons.power * self.exposure, kept, seen_area(self.optics, *view))
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:

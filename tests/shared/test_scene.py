@@ -118,6 +118,15 @@ def test_the_scene_id_follows_every_setting_but_the_name(scenes: Path) -> None:
     assert parse_spec(changed(name="other"), where="spec").scene_id == ids[0]
 
 
+def test_a_changed_copy_has_an_id_of_its_own(scenes: Path) -> None:
+    spec = parse_spec(changed(), where="spec")
+    before = spec.scene_id
+    copied = spec.model_copy(update={"points": spec.points + 1})
+    assert copied.scene_id != before
+    assert copied.scene_id == SceneSpec.model_validate(copied.model_dump()).scene_id
+    assert copied.model_copy(update={"points": spec.points}).scene_id == spec.scene_id == before
+
+
 def test_a_light_is_shapes_or_a_rectangle_and_not_both(scenes: Path) -> None:
     light = {"name": "lamp", "at": [0, 2, 0], "box": {"min": [0, 2, 0], "max": [1, 2, 1]}}
     with pytest.raises(SpecError, match="needs either shapes"):

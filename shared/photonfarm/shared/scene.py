@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -203,6 +203,12 @@ class SceneSpec(Frozen):
         """32 hexadecimal digits: the digest of all that a sample depends on."""
         described = self.model_dump(mode="json", exclude={"scene": {"file"}, "name": True})
         return make_key("scene", _canonical(described)).hex()
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A changed copy; pydantic would keep the id of the one that was copied."""
+        copied = super().model_copy(update=update, deep=deep)
+        copied.__dict__.pop("scene_id", None)
+        return copied
 
     @property
     def radiance_exponent(self) -> int:

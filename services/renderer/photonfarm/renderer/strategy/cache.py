@@ -25,7 +25,6 @@ def digest(spec: SceneSpec) -> str:
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
     scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
-    scene = SceneSpec.model_validate(scene.model_dump())  # without the id that the copy has kept
     return make_key("scene plan", scene.scene_id, repr(GRID), repr(_machine()), _revision()).hex()
 
 

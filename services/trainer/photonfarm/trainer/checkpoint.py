@@ -23,6 +23,7 @@ from torch import Tensor
 from photonfarm.shared.errors import SpecError, StoreError
 from photonfarm.shared.store import store_errors
 from photonfarm.shared.store.local import sync
+from photonfarm.trainer.settings import NetworkSettings
 
 FORMAT = 2
 METADATA = "photonfarm"
@@ -121,10 +122,7 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     Returns which other settings are not what they were. Both have `scene_id` and `settings`.
     """
     then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
-    if absent := [key for key in now["network"] if key not in then["network"]]:
-        raise SpecError(
-            f"{path}: lacks {', '.join(absent)} of the network: another version's; use another run directory"
-        )
+    check_of_this_version(path, then["network"])
     changed = _differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
@@ -133,6 +131,15 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
         same = f"the same values{f' ({options})' if options else ''}"
         raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
     return changed
+
+
+def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
+    """Raise SpecError unless what a run wrote of its network says all that makes one today.
+
+    What it left out would be today's default, and another network.
+    """
+    if unsaid := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+        raise SpecError(f"{path}: lacks {unsaid} of the network: another version's run; train anew, in another folder")
 
 
 def _option(key: str, value: Any) -> str:

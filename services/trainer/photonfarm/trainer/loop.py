@@ -31,7 +31,7 @@ from photonfarm.trainer.learner import Learner
 from photonfarm.trainer.metrics_log import MetricsLog
 from photonfarm.trainer.optimisers import rate_at
 from photonfarm.trainer.run_folder import held
-from photonfarm.trainer.settings import KEYS, NetworkSettings, TrainSettings
+from photonfarm.trainer.settings import KEYS, TrainSettings
 from photonfarm.trainer.waits import Stopwatch, samples_per_used, waits
 
 Show = Callable[[int, F32, F32], None]
@@ -345,6 +345,5 @@ def read_settings(run: Path) -> TrainSettings:
         raise SpecError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
     except ValueError as error:
         raise SpecError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
-    if unsaid := ", ".join(key for key in NetworkSettings.model_fields if key not in document.get("network", {})):
-        raise SpecError(f"{path}: lacks {unsaid} of the network: another version's run; train it anew with this one")
+    checkpoint.check_of_this_version(path, document.get("network", {}))
     return settings

@@ -194,7 +194,7 @@ def verdict(measured: list[Measured]) -> str:
         sentences.append(said["MSE"])
         others += [f"by {m} {said[m]}" for m, found in by_metric.items() if not found[place][2].agrees(by_mse)]
     of_whom = "Of these networks, one of each kind, by MSE: " if len(measured[0].shown.values) == 1 else "By MSE: "
-    disagreement = f"Other metrics disagree: {'; '.join(others)}." if others else "MSSIM and FLIP say the same."
+    disagreement = f"Other metrics disagree: {'; '.join(others)}." if others else "All other metrics say the same."
     return f"{of_whom}{'; '.join(sentences)}. {disagreement}"
 
 
@@ -225,8 +225,9 @@ width {settings.network.width}, {settings.network.points} points; for each archi
 {room_study.described(settings)}. {room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples.
 
 **MSE** is in the metric space, clip(I, 0, 1)^(1/2.2), against references of {references.spp} spp whose noise is taken
-out by their halves; **of {BLOCK} × {BLOCK} means**, the same of blocks of pixels, which tells of light rather than of
-texture and edges. **Linear MSE** is in exposed radiance, noise taken out in the same way. **MSSIM** and **FLIP** are
+out by their halves, but for what that curve makes of it; **of {BLOCK} × {BLOCK} means**, the same of blocks of pixels,
+which tells of light rather than of texture and edges.
+**Linear MSE** is in exposed radiance, noise taken out in the same way. **MSSIM** and **FLIP** are
 in the metric space against the mean of both halves, with its noise: a standard deviation of
 {references.noise(references.spp):.3f} in exposed radiance, root mean square over pixels.
 {room_study.of_intervals(len(told.seeds))}
@@ -281,14 +282,19 @@ def document(
     return study | {"rows": rows, "photon_map": of_map}
 
 
-def main() -> int:
-    """Run the benchmark; returns the exit code."""
+def options() -> argparse.ArgumentParser:
+    """What can be told."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--configurations", type=int, default=2048, help="rendered, held-out ones included (2048)")
     room_study.add_options(parser, "order")
     parser.set_defaults(steps=7000, decay=0.96, loss="paired", demodulation=0.2)
     results.add_options(parser)
-    told = parser.parse_args()
+    return parser
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    told = options().parse_args()
     torch.set_num_threads(1)
     folder, store = room_study.opened(told, str(told.configurations))
     render(spec := room_study.room(), store, told)

@@ -37,6 +37,7 @@ from photonfarm.trainer.learner import Learner
 from photonfarm.trainer.loop import METRICS, train
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.networks.light_transport import LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.settings import TrainSettings, preset
 from photonfarm.trainer.store_source import StoreSource
@@ -44,7 +45,7 @@ from photonfarm.trainer.store_source import StoreSource
 RENDERED = 8  # configurations, of two views each
 SAMPLES = 256
 WHOLE = "whole"
-PARTS = ("copy", "point branch", "projection", "U-Net", "optimiser")
+PARTS = ("copy", "point branch", "projection", "photon map", "U-Net", "optimiser")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +63,8 @@ class Row:
 
 
 def points_share(parts: dict[str, float]) -> float:
-    """Light transport and projection, of points and photons, over the U-Net."""
-    return (parts["point branch"] + parts["projection"]) / parts["U-Net"]
+    """Light transport, projection and photon map over the U-Net."""
+    return (parts["point branch"] + parts["projection"] + parts["photon map"]) / parts["U-Net"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,11 +164,13 @@ def timed(learner: Learner, batch: Batch, device: torch.device, clock: Clock, *,
             "copy": lambda: batch.to(device).for_training() if gradients else batch.to(device),
             "point branch": with_gradients(lambda: network.further(inputs)),
             "projection": with_gradients(lambda: [network.project(*told) for told in leaves]),
+            "photon map": lambda: network.gathered(inputs) if isinstance(network, LightTransportPhotons) else [],
             "U-Net": with_gradients(lambda: [network.synthesise(channels)]),
             **({"optimiser": learner.optimiser.step} if gradients else {}),
         }
     )
-    return {**found, "point branch": max(found["point branch"] - found["projection"], 0.0)}
+    others = found["projection"] + found["photon map"]
+    return {**found, "point branch": max(found["point branch"] - others, 0.0)}
 
 
 def projections(network: Network, inputs: Inputs) -> list[tuple[Any, ...]]:
@@ -275,13 +278,13 @@ def page(told: argparse.Namespace, presets: list[Preset]) -> str:
     fed = [[f"{r.size}²", f"{r.stored_ms:.2f}", *(f"{r.fed_ms[name]:.2f}" for name in shown())] for r in read]
     return f"""# A training step
 
-Waiting for data takes at most {waiting:.1%} of a step with `small`; 5 % are allowed. Light transport and projection
-take at most {most:.1%} of the U-Net's time at the supplement's sizes; 15 % are allowed.
+Waiting for data takes at most {waiting:.1%} of a step with `small`; 5 % are allowed. Light transport, projection and
+photon map take at most {most:.1%} of the U-Net's time at the supplement's sizes; 15 % are allowed.
 
 `room` on the device `{told.device}`, one thread. Parts are measured by themselves, so that their shares need not sum to
-100 %; the rest is the loss, rays, and what joins the parts. **Point branch** and **projection** are those of points and
-photons, **points over U-Net** is both over the U-Net's time. Medians of turns. Reading is a thread's, which works ahead
-on the same processor cores; waiting is what is left of it in a run, as a share of the steps' time.
+100 %; the rest is the loss, rays, and what joins the parts. **Points over U-Net** is point branch, projection and
+photon map over the U-Net's time. Medians of turns. Reading is a thread's, which works ahead on the same processor
+cores; waiting is what is left of it in a run, as a share of the steps' time.
 
 {chr(10).join(preset_section(of) for of in presets)}
 ## Reading

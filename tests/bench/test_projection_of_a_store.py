@@ -25,7 +25,7 @@ from projection_oracle import in_camera, sees, triangles
 
 SIZE, POINTS = 32, 1024
 ROWS = (0, 3, 4)
-SETTINGS = NetworkSettings(width=4, architecture="light_transport_photons", photon_transport=True)
+SETTINGS = NetworkSettings(width=4, architecture="light_transport_photons", photons="transport")
 Mask = NDArray[np.bool_]
 
 

@@ -178,7 +178,7 @@ def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothi
 ) -> None:
     scene, repair = repaired
     source = StoreSource(scene.storage.root, scene.scene_id)
-    settings = tiny(max_steps=60, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
+    settings = tiny(max_steps=60, hold_out=0.5, replay_ratio=1000.0, checkpoint_every=10)
     read = [0]
     plain = source.read_batch
 

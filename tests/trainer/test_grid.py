@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 
 import numpy as np
@@ -168,11 +169,19 @@ def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, 
         run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
 
 
-def test_a_grid_goes_on_where_another_value_of_an_axis_is_asked_for(make_source, tiny, run) -> None:
-    first = run_grid(lambda: make_source(24), tiny(decay=0.9), run, {"decay": (0.9,)})
-    cells = run_grid(lambda: make_source(24), tiny(decay=1.0), run, {"decay": (1.0,)})
-    assert [cell.changes for cell in cells] == [{"decay": 0.9}, {"decay": 1.0}]
-    assert cells[0] == first[0]
+def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(make_source, tiny, run) -> None:
+    """Another value of an axis, then both: neither is trained again."""
+    (first,) = run_grid(lambda: make_source(24), tiny(decay=0.9), run, {"decay": (0.9,)})
+    (second,) = run_grid(lambda: make_source(24), tiny(decay=1.0), run, {"decay": (1.0,)})
+    assert [first.changes, second.changes] == [{"decay": 0.9}, {"decay": 1.0}]
+    assert [cell["changes"] for cell in json.loads((run / "grid.json").read_text())["cells"]] == [
+        {"decay": 0.9},
+        {"decay": 1.0},
+    ]
+    assert (run / "grid.md").read_text() == table([second]) + "\n"
+    shutil.rmtree(run / "0.9")
+    assert run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0, 0.9)}) == [first, second]
+    assert (run / "grid.md").read_text() == table([first, second]) + "\n"
 
 
 @pytest.mark.parametrize("text", ["xx", "{}", "[]"])

@@ -47,10 +47,10 @@ def test_photons_may_have_a_branch_of_their_own() -> None:
     without, gathered = parts(), parts(architecture="light_transport_photons")
     assert gathered.keys() == without.keys()
     assert gathered["U-Net"].parameters - without["U-Net"].parameters == 6 * 64 * 9
-    found = parts(architecture="light_transport_photons", photon_transport=True)
+    found = parts(architecture="light_transport_photons", photons="transport")
     assert found["photon branch"].parameters == (25 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
     assert found["point branch"] == without["point branch"]
-    assert found["U-Net"].parameters - without["U-Net"].parameters == (64 + 6) * 64 * 9  # channels more
+    assert found["U-Net"].parameters - without["U-Net"].parameters == 64 * 64 * 9  # channels more
 
 
 def test_the_denoiser_is_light() -> None:

@@ -58,6 +58,14 @@ def test_what_was_shown_after_the_checkpoint_is_taken_back_when_the_run_goes_on(
     assert [e.step for e in accumulated(run).Scalars("error/held out")] == [0, 5, 10, 12]
 
 
+def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tiny, run) -> None:
+    for steps in (12, 12, 15):
+        trained(make_source(24), tiny(max_steps=steps), run)
+    events = accumulated(run)
+    assert [e.step for e in events.Scalars("error/held out")] == [0, 5, 10, 12, 15]
+    assert [e.step for e in events.Images("held out/target above prediction")] == [0, 5, 10, 12, 15]
+
+
 def test_without_tensorboard_nothing_is_written(run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(boards, "find_spec", lambda _: None)
     with boards.event_files(run) as board:

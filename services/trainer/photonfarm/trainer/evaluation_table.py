@@ -25,11 +25,12 @@ def notes(evaluation: Evaluation) -> list[str]:
     denoisers = any(row.kept is not None for row in evaluation.rows)
     threads = f", {_counted(evaluation.threads, 'thread')}" if evaluation.device == "cpu" else ""
     rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
+    making = "reading, or rendering buffers and photons, is not in it"
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over the "
         f"{_counted(evaluation.units, evaluation.unit)}",
-        f"network: one image, the median of {TIMED_CALLS} warm calls on {evaluation.device}{threads}; reading is not "
-        f"in it{rendering if denoisers else ''}",
+        f"network: one image, the median of {TIMED_CALLS} warm calls on {evaluation.device}{threads}; {making}"
+        f"{rendering if denoisers else ''}",
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:

@@ -84,42 +84,46 @@ def run_grid(
     stop: threading.Event | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> list[Cell]:
-    """Train and measure every cell; returns those that are finished, all of them unless `stop` was set.
+    """Train and measure every cell; returns those that are finished, all that the axes make unless `stop` was set.
 
     Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Cells
-    that are finished there are kept, and one that is not goes on from its last checkpoint. `make_source` opens the same
-    complete samples each time; `tell` gets a line for every cell. Raises IncompleteError while samples are missing and
-    where fewer than two configurations are held out; SpecError for an axis that the settings do not have, and for a
-    folder that holds a grid over other samples or settings; what a run raises, besides DivergedError.
+    that are finished there are not trained again, and one that is not goes on from its last checkpoint; grid.json keeps
+    those of other values of the axes too. `make_source` opens the same complete samples each time; `tell` gets a line
+    for every cell. Raises IncompleteError while samples are missing and where fewer than two configurations are held
+    out; SpecError for an axis that the settings do not have, and for a folder that holds a grid over other samples or
+    settings; what a run raises, besides DivergedError.
     """
     stop = stop or threading.Event()
     wanted = _cells(settings, axes)
     equal = {key: value for key, value in settings.model_dump(mode="json").items() if key not in axes}
     about = {**_about(make_source(), settings), "settings": equal}
     with held(folder):
-        finished = _read(folder / JSON, about)
+        known = _read(folder / JSON, about)
+        finished = [cell for cell in known if any(cell.changes == changes for changes, _ in wanted)]
         for changes, changed in wanted:
-            if not any(cell.changes == changes for cell in finished):
-                cell = _run_cell(make_source, changed, changes, folder / _name(changes), stop)
-                if cell is None:
-                    break
-                finished.append(cell)
-                _write(folder, about, finished)
-                if tell:
-                    done = sum(any(cell.changes == of for cell in finished) for of, _ in wanted)
-                    tell(f"{done} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+            if any(cell.changes == changes for cell in finished):
+                continue
+            cell = _run_cell(make_source, changed, changes, folder / _name(changes), stop)
+            if cell is None:
+                break
+            known.append(cell)
+            finished.append(cell)
+            _write(folder, about, known, finished)
+            if tell:
+                tell(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+        _write(folder, about, known, finished)
     return finished
 
 
 def table(cells: Sequence[Cell]) -> str:
     """The cells as a Markdown table, the best first; differences from it are of pairs of configurations."""
     ranked = sorted(cells, key=lambda cell: cell.rank)
-    keys = list(dict.fromkeys(key for cell in cells for key in cell.changes))
+    keys = list(cells[0].changes) if cells else []
     rows = []
     for cell in ranked:
         behind = _stated(cell.behind(ranked[0])) if cell.per_unit and cell is not ranked[0] else ""
         picked = stated(cell.rank, None) if cell.picked_by else ""
-        rows.append([*(str(cell.changes.get(key, "")) for key in keys), picked, _stated(cell.error), behind])
+        rows.append([*map(str, cell.changes.values()), picked, _stated(cell.error), behind])
     return markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
 
 
@@ -224,12 +228,12 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
     return cells
 
 
-def _write(folder: Path, about: Mapping[str, Any], cells: Sequence[Cell]) -> None:
-    """Write grid.json and grid.md, each whole or not at all."""
-    described = [{**asdict(cell), **(asdict(cell.error) if cell.error else {})} for cell in cells]
+def _write(folder: Path, about: Mapping[str, Any], known: Sequence[Cell], wanted: Sequence[Cell]) -> None:
+    """Write grid.json, of all cells that are known, and grid.md, of those wanted, each whole or not at all."""
+    described = [{**asdict(cell), **(asdict(cell.error) if cell.error else {})} for cell in known]
     document = json.dumps({**about, "cells": described}, indent=2)
     with store_errors("write the grid", folder):
-        for name, text in ((JSON, document), (MARKDOWN, table(cells))):
+        for name, text in ((JSON, document), (MARKDOWN, table(wanted))):
             partial = folder / f"{name}.partial"
             partial.write_text(text + "\n")
             partial.replace(folder / name)

@@ -20,6 +20,7 @@ Architecture = Literal[
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
+PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
@@ -45,8 +46,8 @@ class NetworkSettings(_Frozen):
     octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
     maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
     # with which it takes fewer steps to learn what lights do
-    photon_transport: bool = False  # a second Light Transport Layer, over the photons (ours), beside what is gathered
-    # from them
+    photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
+    # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]

@@ -30,7 +30,10 @@ NAMES = {
 
 
 class EventFiles:
-    """Event files of one session of a run; what an earlier one wrote for later steps is taken out of the curves."""
+    """Event files of one session of a run.
+
+    What an earlier session wrote after the checkpoint that this one goes on from is taken out of the curves.
+    """
 
     def __init__(self, folder: Path, *, writer: Any) -> None:
         self._folder, self._make = folder, writer
@@ -38,7 +41,8 @@ class EventFiles:
 
     def record(self, record: dict[str, Any]) -> None:
         """Draw the figures of a record of metrics.jsonl."""
-        writer, step = self._at(record["step"]), record["step"]
+        step = record["step"]
+        writer = self._from(step + (record["kind"] in ("changes", "end")))  # what is of that step itself still holds
         figures = {tag: record[name] for name, tag in NAMES.items() if record.get(name) is not None}
         figures |= {f"waits/{name}": share for name, share in record.get("waits", {}).items()}
         for tag, value in figures.items():
@@ -48,14 +52,15 @@ class EventFiles:
     def pictures(self, step: int, target: F32, prediction: F32) -> None:
         """Show targets (the means of A and B) above predictions, at most `SHOWN`, as clip(I, 0, 1)^(1/2.2)."""
         rows = [np.concatenate([display(image, 1.0) for image in images[:SHOWN]], 1) for images in (target, prediction)]
-        self._at(step).add_image("held out/target above prediction", np.concatenate(rows), step, dataformats="HWC")
+        self._from(step).add_image("held out/target above prediction", np.concatenate(rows), step, dataformats="HWC")
 
     def close(self) -> None:
         """Leave the files complete."""
         if self._writer is not None:
             self._writer.close()
 
-    def _at(self, step: int) -> Any:
+    def _from(self, step: int) -> Any:
+        """The writer; curves that exist end before the first step that is asked for."""
         if self._writer is None:
             self._writer = self._make(str(self._folder), purge_step=step)
         return self._writer

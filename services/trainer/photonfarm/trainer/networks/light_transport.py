@@ -53,9 +53,9 @@ class LightTransport(Network):
 class LightTransportPhotons(LightTransport):
     """The same, with photons of the current configuration: "Ours (w/ photons)", whose design is ours.
 
-    It sees what is gathered from the photons in windows of the image; and what the widest window gathers, times albedo,
-    is the image that its output is added to. With `photon_transport`, a second PointNet of the same kind over the
-    photons is projected and averaged like the points [method 2]. Nothing that it sees depends on how many photons there
+    With `photons = gathered` it sees what is gathered from them in windows of the image; and what the widest window
+    gathers, times albedo, is the image that its output is added to. With `transport` a second PointNet of the same kind
+    over the photons is projected and averaged like the points. Nothing that it sees depends on how many photons there
     are, but for its noise: not their power, which is normalised, nor a maximum or mean over them.
     """
 
@@ -65,20 +65,20 @@ class LightTransportPhotons(LightTransport):
                 "network.architecture = 'light_transport_photons': the scene has photons.paths = 0, and none are "
                 "stored; set photons.paths in its spec and render it anew, or train 'light_transport'"
             )
-        transported = WIDTH if settings.photon_transport else 0
-        super().__init__(settings, frame, further=WIDTH + transported + 3 * len(WINDOWS))
+        transported = settings.photons == "transport"
+        super().__init__(settings, frame, further=WIDTH + (WIDTH if transported else 3 * len(WINDOWS)))
         self.photon_depth, self.photon_scale, self.exposure = frame.photon_depth, frame.photon_scale, frame.exposure
         self.last_bounce = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # after it the eye, an edge more
-        layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if settings.photon_transport else None
+        layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if transported else None
         self.photon_transport = layer
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """Those of the points, and of the photons, (B, H, W, 64) each; log(1 + what is gathered), (B, H, W, 3) each."""
+        """Those of the points, and log(1 + what is gathered), (B, H, W, 3) each, or those of the photons, 64 wide."""
         found, photons = super().further(inputs), given(inputs.photons)
-        if self.photon_transport is not None:
-            where = photons.position, photons.present, photons.seen
-            found.append(self.project(self.photon_features(photons), *where, inputs))
-        return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+        if self.photon_transport is None:
+            return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+        where = photons.position, photons.present, photons.seen
+        return [*found, self.project(self.photon_features(photons), *where, inputs)]
 
     def gathered(self, inputs: Inputs) -> list[Tensor]:
         """The exposed radiance of white diffuse surfaces by the photons in windows, (B, H, W, 3) each.
@@ -91,14 +91,14 @@ class LightTransportPhotons(LightTransport):
         kept = footprint(photons.position, wanted, photons.seen, *view, self.optics)
         return gathered(photons.power * self.exposure, kept, seen_area(self.optics, *view))
 
-    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:
         """Albedo times what the widest window has gathered: the photon map's image of diffuse surfaces."""
-        return inputs.albedo * torch.expm1(further[-1])
+        return inputs.albedo * torch.expm1(further[-1]) if self.photon_transport is None else 0.0
 
     def photon_features(self, photons: PhotonInputs) -> Tensor:
         """Features of photons by their own layer, (B, K, 64), of empty slots too; ValueError without that layer."""
         if self.photon_transport is None:
-            raise ValueError("photon_transport = False: there is no layer for photons")
+            raise ValueError("photons = 'gathered': there is no layer for photons")
         position, power = self.coordinates(photons.position), photons.power * self.photon_scale
         bounce = photons.bounce[..., None] / self.photon_depth
         numbers = torch.cat([position, photons.direction, photons.normal, power, bounce], dim=-1)

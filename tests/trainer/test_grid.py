@@ -204,9 +204,11 @@ def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit
         service.search(None, tmp_path / "store", run, "small", {})
     for job in scene.missing_jobs():
         commit(scene, job)
-    changes = {"optimiser": "rmsprop", "decay": 1.0, "max_steps": 2, "width": 4, "hold_out": 0.4}
+    changes = {"optimiser": "rmsprop", "max_steps": 2, "width": 4, "hold_out": 0.4}
     found = service.search(None, tmp_path / "store", run, "small", changes)
     assert len(found.splitlines()) == 2 + 4, "a line for each rate"
-    assert "| rmsprop | 0.002 | 1.0 |" in found
-    assert "4 of 4: rmsprop-0.002-1.0: " in capsys.readouterr().err
+    assert "| rmsprop | 0.002 | 0.99 |" in found
+    said = capsys.readouterr().err
+    assert "decay is not searched: it begins after 256 samples, and 4 are drawn" in said
+    assert "4 of 4: rmsprop-0.002-0.99: " in said
     assert (run / "grid.md").read_text() == found + "\n"

@@ -38,6 +38,8 @@ def test_values_that_are_not_allowed_are_refused() -> None:
         preset("small", network={"architecture": "transformer"})
     with pytest.raises(ValidationError, match="has descriptor = 0; feature_projection projects descriptors"):
         preset("small", network={"architecture": "feature_projection", "descriptor": 0})
+    with pytest.raises(ValidationError, match="has photons = 'transport', which is for light_transport_photons alone"):
+        preset("small", network={"photons": "transport"})
 
 
 def test_the_paired_loss_needs_the_half_that_a_denoiser_is_given() -> None:

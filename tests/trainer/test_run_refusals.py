@@ -163,6 +163,29 @@ def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(make_source, tiny, ru
     assert (run / CHECKPOINT).read_bytes() == damaged
 
 
+def test_a_checkpoint_whose_numbers_are_not_those_written_is_refused(make_source, tiny, run) -> None:
+    train(make_source(24), tiny(max_steps=2), run)
+    whole = bytearray((run / CHECKPOINT).read_bytes())
+    whole[-400] ^= 1
+    (run / CHECKPOINT).write_bytes(whole)
+    for use in (lambda: train(make_source(24), tiny(), run), lambda: TrainedRun.load(run)):
+        with pytest.raises(StoreError, match=r"is damaged: .*; without this file the run begins anew"):
+            use()
+
+
+def test_another_scene_than_that_of_the_run_is_refused_before_it_is_waited_for(
+    make_source, tiny, run, tmp_path
+) -> None:
+    train(make_source(24), tiny(max_steps=1), run)
+    with pytest.raises(SpecError, match=f"was trained on scene {make_source(1).spec.scene_id}, and"):
+        service.run("cornell", tmp_path / "store", run, "small", {})
+
+
+def test_a_batch_that_no_memory_holds_is_refused(make_source, tiny, run) -> None:
+    with pytest.raises(SpecError, match="batch = 1000000000000: no memory for so many samples"):
+        train(make_source(24), tiny(batch=10**12), run)
+
+
 @pytest.mark.parametrize(
     "content", [b"", b"garbage", b"\x80\x02}q\x00.", bytes(range(256)) * 9, b"PK\x03\x04" + bytes(99)]
 )

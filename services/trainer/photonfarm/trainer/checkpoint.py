@@ -1,15 +1,17 @@
 """Checkpoints: safetensors with what is no tensor as JSON inside; written whole or not at all, enough to go on exactly.
 
 A file's tensors are named by where they stand in the state, `network.image_synthesis.out.weight`. The rest of the state
-is the JSON under `photonfarm` in the file's metadata, where {"tensor": NAME} stands for each of them.
+is the JSON under `photonfarm` in the file's metadata, where {"tensor": NAME} stands for each of them; it has a digest
+of their bytes.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,8 @@ from photonfarm.shared.store import store_errors
 from photonfarm.shared.store.local import sync
 from photonfarm.trainer.settings import NetworkSettings
 
-FORMAT = 2
+FORMAT = 3
+ANEW = "without this file the run begins anew"
 METADATA = "photonfarm"
 TENSOR = "tensor"
 
@@ -48,7 +51,8 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
     A state is made of dictionaries by string, lists, tensors, and what JSON has beside them.
     """
     tensors: dict[str, Tensor] = {}
-    document = json.dumps({"format": FORMAT, **_apart(state, "", tensors)})
+    described = _apart(state, "", tensors)
+    document = json.dumps({"format": FORMAT, "sha256": _digest(tensors), **described})
     content = to_bytes(tensors, {METADATA: document})  # safetensors writing to the file itself would not sync it
     partial = path.with_suffix(".partial")
     with store_errors("write the checkpoint", path):
@@ -66,7 +70,9 @@ def load(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="pt") as file:
             document = json.loads((file.metadata() or {}).get(METADATA, "{}"))
             found = document.get("format")
-            state: dict[str, Any] = _together(document, file.get_tensor) if found == FORMAT else {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()} if found == FORMAT else {}  # noqa: SIM118
+            damaged = found == FORMAT and _digest(tensors) != document["sha256"]
+            state: dict[str, Any] = _together(document, tensors)
     except FileNotFoundError as error:
         raise StoreError(
             f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
@@ -74,10 +80,21 @@ def load(path: Path) -> dict[str, Any]:
         ) from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise StoreError(f"{path}: is not a readable checkpoint: {reason}") from error
+        raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {ANEW}") from error
     if found != FORMAT:
         raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
+    if damaged:
+        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {ANEW}")
     return state
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """Of names and bytes."""
+    found = hashlib.sha256()
+    for name in sorted(tensors):
+        found.update(name.encode())
+        found.update(tensors[name].numpy().tobytes())
+    return found.hexdigest()
 
 
 def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
@@ -92,13 +109,13 @@ def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
-def _together(value: Any, tensor: Callable[[str], Tensor]) -> Any:
+def _together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     """The value with a tensor for each reference."""
     if isinstance(value, dict):
         if value.keys() == {TENSOR}:
-            return tensor(value[TENSOR])
-        return {key: _together(member, tensor) for key, member in value.items()}
-    return [_together(member, tensor) for member in value] if isinstance(value, list) else value
+            return tensors[value[TENSOR]]
+        return {key: _together(member, tensors) for key, member in value.items()}
+    return [_together(member, tensors) for member in value] if isinstance(value, list) else value
 
 
 def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:

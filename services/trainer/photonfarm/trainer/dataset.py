@@ -135,7 +135,10 @@ class Batch:
         """Memory for what is needed of `size` samples, to be filled again and again."""
 
         def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.empty(size, *shape, dtype=dtype, pin_memory=pinned)
+            try:
+                return torch.empty(size, *shape, dtype=dtype, pin_memory=pinned)
+            except RuntimeError as error:  # torch's way to say that there is no memory
+                raise SpecError(f"batch = {size}: no memory for so many samples") from error
 
         target = memory(2, spec.film.height, spec.film.width, 3)
         return cls((), (), Inputs.empty(memory, points, spec, needs), target)

@@ -79,7 +79,12 @@ def _lead(
     from photonfarm.trainer.store_source import StoreSource
     from photonfarm.trainer.tensorboard import event_files
 
-    scene_id = scene_id or _begun_on(folder)
+    begun_on = _begun_on(folder)
+    if scene_id and begun_on and scene_id != begun_on:
+        raise SpecError(
+            f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
+        )
+    scene_id = scene_id or begun_on
     with _sign_of_life(folder), event_files(folder) as board:
         began = time.monotonic()
         if is_vacant(store):
@@ -157,8 +162,11 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
         wanted = f" {spec}" if spec else ""
         raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):
-        axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
         tell = partial(click.echo, err=True)
+        axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
+        if (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
+            axes["decay"] = (settings.decay,)
+            tell(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
         cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
         if stop.is_set():
             tell(f"stopped after {len(cells)} cells; the same command goes on")

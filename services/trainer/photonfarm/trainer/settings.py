@@ -55,9 +55,11 @@ class NetworkSettings(_Frozen):
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
 
     @model_validator(mode="after")
-    def _has_what_is_projected(self) -> Self:
+    def _fits_its_architecture(self) -> Self:
         if self.architecture == "feature_projection" and not self.descriptor:
             raise ValueError("has descriptor = 0; feature_projection projects descriptors, and at least 1 is needed")
+        if self.photons != "gathered" and self.architecture != "light_transport_photons":
+            raise ValueError(f"has photons = {self.photons!r}, which is for light_transport_photons alone")
         return self
 
 

@@ -27,9 +27,17 @@ def make_source() -> Callable[..., AnalyticSource]:
     """A source of so many analytic samples; how: views=, noise=, per_look=."""
 
     def make(
-        samples: int, *, size: int = 16, points: int = 256, moving: bool = True, photons: int = 0, **how: Any
+        samples: int,
+        *,
+        size: int = 16,
+        points: int = 256,
+        moving: bool = True,
+        photons: int = 0,
+        exposure: float = 1.0,
+        **how: Any,
     ) -> AnalyticSource:
-        return AnalyticSource(analytic_spec(size, points, moving=moving, photons=photons), samples, **how)
+        spec = analytic_spec(size, points, moving=moving, photons=photons, exposure=exposure)
+        return AnalyticSource(spec, samples, **how)
 
     return make
 
@@ -57,9 +65,10 @@ def tiny() -> Callable[..., TrainSettings]:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> SceneStore:
-    """A store's scene with its base written and nothing else."""
-    scene = Store(tmp_path / "store", create=True).add(analytic_spec(16, 256))
+def scene(tmp_path: Path, request: pytest.FixtureRequest) -> SceneStore:
+    """A store's scene with its base written and nothing else; of the exposure that a test asks for, or 1."""
+    spec = analytic_spec(16, 256, exposure=getattr(request, "param", 1.0))
+    scene = Store(tmp_path / "store", create=True).add(spec)
     scene.write_base(*analytic_base(scene.spec))
     return scene
 

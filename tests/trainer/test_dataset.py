@@ -42,8 +42,9 @@ def test_a_static_scene_is_split_by_views(make_source) -> None:
     assert abs(held - 50) <= 3 * np.sqrt(200 * 3 / 16), "binomial, 3 σ"
 
 
-def test_a_batch_holds_the_samples_exactly(make_source, tiny) -> None:
-    source = make_source(6)
+@pytest.mark.parametrize("exposure", [1.0, 3.0])
+def test_a_batch_holds_the_samples_exactly(make_source, tiny, exposure: float) -> None:
+    source = make_source(6, exposure=exposure)
     with Feed(source, tiny()) as feed:
         feed.ask([4, 1])
         batch = feed.take()
@@ -65,6 +66,7 @@ def test_a_batch_holds_the_samples_exactly(make_source, tiny) -> None:
                 np.testing.assert_array_equal(found[place].numpy(), wanted)
 
 
+@pytest.mark.parametrize("scene", [1.0, 3.0, 0.25], indirect=True, ids="exposure {}".format)
 @pytest.mark.parametrize("brightest", [60.0, 1e6])
 def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scene, tiny, brightest: float) -> None:
     scene.plan(Request(modifications=2), shard_rows=2)
@@ -178,7 +180,7 @@ def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothi
 ) -> None:
     scene, repair = repaired
     source = StoreSource(scene.storage.root, scene.scene_id)
-    settings = tiny(max_steps=60, hold_out=0.5, replay_ratio=1000.0, checkpoint_every=10)
+    settings = tiny(max_steps=60, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
     read = [0]
     plain = source.read_batch
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic_room import EXPOSURE
 
 from photonfarm.shared.view import Camera
 from photonfarm.trainer.dataset import Batch, read_into
@@ -115,7 +114,7 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
 
     Photons are noisy, and the light quad, whose albedo is 0, is in none of it.
     """
-    source = make_source(12, size=32, photons=4096)
+    source = make_source(12, size=32, photons=32768, exposure=3.0)
     settings = NetworkSettings(width=4, architecture=ARCHITECTURE)
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
     found, wanted = [], []
@@ -126,7 +125,7 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
             torch.testing.assert_close(known, inputs.albedo * network.gathered(inputs)[1])
         diffuse = inputs.albedo[0].sum(dim=-1).numpy() > 0
         found.append(known[0].numpy()[diffuse])
-        wanted.append(EXPOSURE * source.clean(row)[diffuse])
+        wanted.append(source.spec.exposure * source.clean(row)[diffuse])
     image, clean = np.concatenate(found), np.concatenate(wanted)
     assert image.mean() == pytest.approx(clean.mean(), rel=0.05)
     assert np.mean((image - clean) ** 2) < 0.1 * np.mean(clean**2)

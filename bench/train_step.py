@@ -164,7 +164,7 @@ def timed(learner: Learner, batch: Batch, device: torch.device, clock: Clock, *,
             "copy": lambda: batch.to(device).for_training() if gradients else batch.to(device),
             "point branch": with_gradients(lambda: network.further(inputs)),
             "projection": with_gradients(lambda: [network.project(*told) for told in leaves]),
-            "photon map": lambda: network.gathered(inputs) if isinstance(network, LightTransportPhotons) else [],
+            "photon map": lambda: network.gathered(inputs) if isinstance(network, LightTransportPhotons) else None,
             "U-Net": with_gradients(lambda: [network.synthesise(channels)]),
             **({"optimiser": learner.optimiser.step} if gradients else {}),
         }

@@ -173,6 +173,14 @@ def test_a_checkpoint_whose_numbers_are_not_those_written_is_refused(make_source
             use()
 
 
+def test_a_checkpoint_of_an_older_format_is_named_as_that(make_source, tiny, run, monkeypatch) -> None:
+    with monkeypatch.context() as older:
+        older.setattr(checkpoint, "FORMAT", 2)
+        train(make_source(24), tiny(max_steps=2), run)
+    with pytest.raises(StoreError, match=r"has format 2; this version reads 3$"):
+        checkpoint.load(run / CHECKPOINT)
+
+
 def test_another_scene_than_that_of_the_run_is_refused_before_it_is_waited_for(
     make_source, tiny, run, tmp_path
 ) -> None:

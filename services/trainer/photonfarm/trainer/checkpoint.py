@@ -66,13 +66,21 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
 
 def load(path: Path) -> dict[str, Any]:
     """A checkpoint's content, on the CPU. Raises StoreError if it cannot be read; nothing in it is executed."""
+    document, tensors = _read(path)
+    if (found := document.get("format")) != FORMAT:
+        raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
+    if document.get("sha256") != _digest(tensors):
+        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {ANEW}")
+    state: dict[str, Any] = _together(document, tensors)
+    return state
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What is no tensor, and the tensors by their names."""
     try:
         with safe_open(path, framework="pt") as file:
-            document = json.loads((file.metadata() or {}).get(METADATA, "{}"))
-            found = document.get("format")
-            tensors = {name: file.get_tensor(name) for name in file.keys()} if found == FORMAT else {}  # noqa: SIM118
-            damaged = found == FORMAT and _digest(tensors) != document["sha256"]
-            state: dict[str, Any] = _together(document, tensors)
+            document = dict(json.loads((file.metadata() or {}).get(METADATA, "{}")))
+            return document, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise StoreError(
             f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
@@ -81,11 +89,6 @@ def load(path: Path) -> dict[str, Any]:
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {ANEW}") from error
-    if found != FORMAT:
-        raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
-    if damaged:
-        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {ANEW}")
-    return state
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

@@ -73,6 +73,25 @@ def test_a_texture_is_looked_up_where_the_ray_hits() -> None:
     assert set(np.unique(albedo[6:10, 10:14])) == {0, 1}
 
 
+def test_albedo_is_the_mean_over_the_pixel_and_depth_that_of_its_centre() -> None:
+    """The rectangle ends 12 / tan 30° / 3.1 = 6.705 pixels from the middle: 3 of 4 rays along an axis meet it there."""
+    buffers = of(DIFFUSE, View(np.array([0, 0, 3.1], np.float32), np.array([0, 0, 0], np.float32)))
+    for column in (5, 18):
+        np.testing.assert_allclose(buffers.albedo[8, column], 0.75 * np.array(COLOUR), atol=1e-6)
+        assert buffers.depth[8, column] == pytest.approx(3.1, abs=1e-5)
+    np.testing.assert_allclose(buffers.albedo[1, 5], 0.75**2 * np.array(COLOUR), atol=1e-6)
+    assert not buffers.albedo[8, 4].any()
+
+
+def test_albedo_of_a_large_image_is_that_of_a_small_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its rays are traced in several goes."""
+    checks = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
+    at_once = of(checks).albedo
+    monkeypatch.setattr("photonfarm.renderer.gbuffer.RAYS", 5 * 24 * 16)
+    np.testing.assert_allclose(of(checks).albedo, at_once, atol=1e-6)
+    assert len(np.unique(at_once)) > 2
+
+
 def test_a_two_sided_surface_shows_its_back_and_the_normal_as_modelled() -> None:
     bsdf = {"type": "twosided", "front": DIFFUSE, "back": RED}
     front, back = of(bsdf), of(bsdf, BEHIND)

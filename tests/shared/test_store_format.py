@@ -161,22 +161,23 @@ def test_inputs_read_as_unused_where_nothing_is_written(scene: SceneStore) -> No
     [
         ({"format": "photonfarm store", "version": 1}, "older photonfarm made it: read it with the one that its mark"),
         ({"format": "photonfarm store", "version": 2}, "older photonfarm made it: read it with the one that its mark"),
-        ({"format": "photonfarm store", "version": 4}, "newer photonfarm made it: install that one"),
+        ({"format": "photonfarm store", "version": 3}, "older photonfarm made it: read it with the one that its mark"),
+        ({"format": "photonfarm store", "version": 5}, "newer photonfarm made it: install that one"),
         ({"format": "photonfarm store", "version": 10**30}, "newer photonfarm made it"),
         ({"format": "photonfarm store", "version": 0}, r"versions count from 1\. Restore photonfarm\.json"),
-        ({"format": "photonfarm store", "version": "3"}, "versions count from 1"),
-        ({"format": "photonfarm store", "version": 3.0}, "versions count from 1"),
+        ({"format": "photonfarm store", "version": "4"}, "versions count from 1"),
+        ({"format": "photonfarm store", "version": 4.0}, "versions count from 1"),
         ({"format": "photonfarm store", "version": True}, "versions count from 1"),
         ({"format": "photonfarm store", "version": None}, "versions count from 1"),
-        ({"format": "someone's store", "version": 3}, "Give the folder of a photonfarm store"),
-        ({"format": None, "version": 3}, "Give the folder of a photonfarm store"),
+        ({"format": "someone's store", "version": 4}, "Give the folder of a photonfarm store"),
+        ({"format": None, "version": 4}, "Give the folder of a photonfarm store"),
     ],
 )
 def test_another_version_is_refused_by_all_who_open_a_store(store: Store, stated: dict[str, Any], advice: str) -> None:
     scene = store.add(samples.small_spec())
     Path(store.root, "photonfarm.json").write_text(json.dumps(stated))
     before = {path: path.read_bytes() for path in Path(store.root).rglob("*") if path.is_file()}
-    sentence = f"(?s)has format .* version .*; this program reads and writes 'photonfarm store' version 3\\. .*{advice}"
+    sentence = f"(?s)has format .* version .*; this program reads and writes 'photonfarm store' version 4\\. .*{advice}"
     with pytest.raises(StoreError, match=sentence):
         Store(store.root)
     with pytest.raises(StoreError, match=sentence):

@@ -246,6 +246,6 @@ def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_a
 @pytest.mark.parametrize("content", ["", "{}", "[]"])
 def test_a_format_file_that_is_empty_says_what_it_should_hold(store: Store, content: str) -> None:
     (store.root / "photonfarm.json").write_text(content)
-    said = re.escape('{"format": "photonfarm store", "version": 3')
+    said = re.escape('{"format": "photonfarm store", "version": 4')
     with pytest.raises(CorruptError, match=f"is not the document of a store: .* {said}"):
         Store(store.root)

@@ -28,7 +28,7 @@ def test_a_missing_store_and_a_folder_that_is_none_are_refused(tmp_path: Path) -
 
 def test_a_store_of_another_version_is_refused_and_says_which(store: Store) -> None:
     (store.root / "photonfarm.json").write_text('{"format": "photonfarm store", "version": 99}')
-    with pytest.raises(StoreError, match=r"version 99; this program reads and writes .* version 3"):
+    with pytest.raises(StoreError, match=r"version 99; this program reads and writes .* version 4"):
         Store(store.root, create=True)
 
 

@@ -47,10 +47,13 @@ class BasePointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewBuffers:
-    """What one ray through each pixel centre meets; free of noise. Zero everywhere where it meets nothing."""
+    """What rays through each pixel meet first: one through its centre, and for albedo a grid of them; free of noise.
+
+    Zero where they meet nothing.
+    """
 
     depth: F32  # (H, W) along the camera's forward axis; hit point = origin + ray · depth / (ray · forward)
-    albedo: F32  # (H, W, 3) diffuse reflectance
+    albedo: F32  # (H, W, 3) diffuse reflectance, the mean over the pixel's area
     normal: F32  # (H, W, 3) unit, shading normal in world coordinates, as modelled (not turned to the camera)
 
 

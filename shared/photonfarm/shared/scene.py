@@ -6,6 +6,7 @@ of, is the scene id: equal content gives equal ids on every machine, wherever th
 
 from __future__ import annotations
 
+import json
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -168,10 +169,20 @@ class PhotonSpec(Frozen):
         return self.paths * self.depth
 
 
+class Credits(Frozen):
+    """Whom the scene is owed to, and under which terms: it goes with the data, into reports."""
+
+    title: Annotated[str, Field(min_length=1, max_length=200)]
+    author: Annotated[str, Field(min_length=1, max_length=200)]
+    licence: Annotated[str, Field(min_length=1, max_length=200)]  # such as CC0-1.0 or CC-BY-3.0
+    source: Annotated[str, Field(max_length=500)] = ""  # where it was published
+
+
 class SceneSpec(Frozen):
     """A scene and everything that shapes its samples. No movable group: a static scene."""
 
     name: Name
+    credits: Credits | None = None  # None: not said
     scene: Source
     objects: tuple[Movable, ...] = ()
     lights: tuple[Light, ...] = ()
@@ -201,7 +212,7 @@ class SceneSpec(Frozen):
     @cached_property
     def scene_id(self) -> str:
         """32 hexadecimal digits: the digest of all that a sample depends on."""
-        described = self.model_dump(mode="json", exclude={"scene": {"file"}, "name": True})
+        described = self.model_dump(mode="json", exclude={"scene": {"file"}, "name": True, "credits": True})
         return make_key("scene", _canonical(described)).hex()
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
@@ -233,17 +244,18 @@ def _canonical(value: Any) -> str:
 
 
 def load_spec(path: str | Path) -> SceneSpec:
-    """The checked spec in a file; a bare name such as `room` is looked up among the built-in and ready specs.
+    """The checked spec in a file, TOML or, as stores have it, JSON; a bare name such as `room` is looked up among the built-in and ready specs.
 
     Raises SpecError with one sentence that names the key, the value and the rule.
     """
     file = find_spec(str(path))
+    parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
     try:
-        described = tomllib.loads(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
+        described = parse(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{file}: is not valid TOML: {error}") from error
+    except ValueError as error:
+        raise SpecError(f"{file}: is not valid {language}: {error}") from error
     return parse_spec(described, where=str(file), beside=file.parent)
 
 

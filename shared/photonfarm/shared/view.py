@@ -61,10 +61,13 @@ class Camera:
         rotation = np.stack([self.right, self.down, self.forward])
         return np.concatenate([rotation, -(rotation @ self.origin)[:, None]], axis=1)
 
-    def rays(self) -> NDArray[np.float32]:
-        """Unit world directions through the pixel centres, (H, W, 3): normalise(T⁻¹ K⁻¹ (u+.5, v+.5, 1))."""
-        x = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_px
-        y = (np.arange(self.height) + 0.5 - 0.5 * self.height) / self.focal_px
+    def rays(self, u: float = 0.5, v: float = 0.5) -> NDArray[np.float32]:
+        """Unit world directions through one point of each pixel, (H, W, 3): normalise(T⁻¹ K⁻¹ (x+u, y+v, 1)).
+
+        Through the pixels' centres, unless told otherwise.
+        """
+        x = (np.arange(self.width) + u - 0.5 * self.width) / self.focal_px
+        y = (np.arange(self.height) + v - 0.5 * self.height) / self.focal_px
         direction = x[None, :, None] * self.right + y[:, None, None] * self.down + self.forward
         return _unit(direction).astype(np.float32)
 

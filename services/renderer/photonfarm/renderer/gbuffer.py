@@ -1,4 +1,8 @@
-"""Image-space buffers: what one ray through each pixel centre meets first [supplement 1.3]. Free of noise.
+"""Image-space buffers of a view [supplement 1.3]. Free of noise.
+
+**Depth and normal** are of what one ray through each pixel centre meets first; **albedo** is a mean over the pixel's
+area, by a regular grid of 4 × 4 rays, as the radiance of a box filter is: one ray's albedo is another texel's, and at
+edges another surface's.
 
 **Albedo** is the diffuse reflectance of the first surface, and 0 for surfaces without a diffuse part (glass, mirrors,
 metals, null). Mitsuba's `eval_diffuse_reflectance` answers for those that lack one of their own with π times the whole
@@ -24,31 +28,57 @@ import mitsuba as mi
 import numpy as np
 
 from photonfarm.renderer.arrays import floats, points, rows
-from photonfarm.shared.records import ViewBuffers
+from photonfarm.shared.records import F32, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import Camera, View
+
+
+GRID = 4
+"""Rays along each axis of a pixel, of which albedo is the mean."""
+
+RAYS = 1 << 20
+"""Rays traced at a time, at least those of one point of each pixel: 16 of them for an image of 256²."""
 
 
 def view_buffers(scene: Any, view: View, spec: SceneSpec) -> ViewBuffers:
     """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is there."""
     camera = Camera.of(view, spec)
-    directions = camera.rays().reshape(-1, 3)
-    along = directions.astype(np.float64) @ camera.forward  # cosine to the forward axis
-    near, far = spec.view.near / along, spec.view.far / along
-    origins = camera.origin + directions * near[:, None]
-    ray = mi.Ray3f(o=points(origins), d=mi.Vector3f(points(directions)))
-    ray.maxt = floats(far - near)
-
-    si = scene.ray_intersect(ray)
+    directions = camera.rays()
+    si = _first_surfaces(scene, camera, directions, spec)
     hit = si.is_valid()
-    albedo = dr.select(hit, diffuse_reflectance(si, hit), 0)
     normal = dr.select(hit, si.sh_frame.n, 0)
     distance = dr.select(hit, si.t, 0)
-    dr.eval(hit, albedo, normal, distance)
+    dr.eval(hit, normal, distance)
 
+    along = directions.reshape(-1, 3).astype(np.float64) @ camera.forward
     depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
     shape = (camera.height, camera.width)
-    return ViewBuffers(depth.astype(np.float32).reshape(shape), rows(albedo, *shape), rows(normal, *shape))
+    return ViewBuffers(depth.astype(np.float32).reshape(shape), _mean_albedo(scene, camera, spec), rows(normal, *shape))
+
+
+def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec) -> F32:
+    """Over the area of each pixel, (H, W, 3)."""
+    steps = (np.arange(GRID) + 0.5) / GRID
+    within = [(u, v) for v in steps for u in steps]
+    at_once = max(1, RAYS // (camera.height * camera.width))
+    total = np.zeros((camera.height, camera.width, 3))
+    for start in range(0, len(within), at_once):
+        directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
+        si = _first_surfaces(scene, camera, directions, spec)
+        hit = si.is_valid()
+        albedo = dr.select(hit, diffuse_reflectance(si, hit), 0)
+        total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
+    return (total / len(within)).astype(np.float32)
+
+
+def _first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
+    """What rays from the camera along unit directions (..., 3) meet between the near and the far plane."""
+    flat = directions.reshape(-1, 3)
+    along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis
+    near, far = spec.view.near / along, spec.view.far / along
+    ray = mi.Ray3f(o=points(camera.origin + flat * near[:, None]), d=mi.Vector3f(points(flat)))
+    ray.maxt = floats(far - near)
+    return scene.ray_intersect(ray)
 
 
 def diffuse_reflectance(si: Any, active: Any) -> Any:

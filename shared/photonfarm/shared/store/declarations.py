@@ -19,7 +19,7 @@ from photonfarm.shared.errors import StoreError
 from photonfarm.shared.keys import KEY_BYTES
 
 FORMAT = "photonfarm store"
-VERSION = 3
+VERSION = 4
 
 
 def stamp() -> dict[str, Any]:
@@ -124,7 +124,7 @@ OUTPUTS = (
         ("R", "H", "W", 3),
         "<f2",
         "1",
-        "diffuse reflectance, linear RGB; 0: nothing is met, or it has no diffuse part",
+        "diffuse reflectance, linear RGB, mean over the pixel; 0: nothing is met, or it has no diffuse part",
     ),
     Declared(
         "normal",

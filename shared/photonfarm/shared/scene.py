@@ -244,7 +244,9 @@ def _canonical(value: Any) -> str:
 
 
 def load_spec(path: str | Path) -> SceneSpec:
-    """The checked spec in a file, TOML or, as stores have it, JSON; a bare name such as `room` is looked up among the built-in and ready specs.
+    """The checked spec in a file, TOML or, as stores have it, JSON.
+
+    A bare name such as `room` is looked up among the built-in and ready specs.
 
     Raises SpecError with one sentence that names the key, the value and the rule.
     """

@@ -32,7 +32,6 @@ from photonfarm.shared.records import F32, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import Camera, View
 
-
 GRID = 4
 """Rays along each axis of a pixel, of which albedo is the mean."""
 

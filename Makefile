@@ -44,6 +44,10 @@ bench-render: $(VENV)/.bench-ready
 bench-%: $(STAMP)
 	$(BIN)/python bench/$(subst -,_,$*).py
 
+# Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
+experiments-%: $(STAMP)
+	$(BIN)/python experiments/run.py --size $*
+
 # The exact versions in constraints.txt, made from a fresh environment.
 lock:
 	PYTHON="$(PYTHON)" ./scripts/lock.sh

@@ -94,6 +94,8 @@ def find(
 @click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
 @click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
 @click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
+@click.option("--least", type=click.IntRange(1), default=1, show_default=True,
+              help="Leave out views with fewer complete passes, so that only what was topped up is merged.")  # fmt: skip
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="A folder.")
 @json_option
 def merge(
@@ -102,6 +104,7 @@ def merge(
     modification: str | None,
     view: str | None,
     row: int | None,
+    least: int,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -121,5 +124,5 @@ def merge(
     with store_errors("make the folder", out):
         out.mkdir(parents=True, exist_ok=True)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
-    merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query))
+    merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
     show_store.merged(merged, out, as_json)

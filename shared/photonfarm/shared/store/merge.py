@@ -207,13 +207,18 @@ def merge_rows(reader: SceneReader, rows: Iterable[int]) -> Moments:
     return moments
 
 
-def merge_views(scene: SceneStore, query: Query) -> Iterator[tuple[str, Merged]]:
-    """The views that some complete sample of a query shows: their content keys, and all complete passes of each."""
+def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, Merged]]:
+    """The views that some complete sample of a query shows: their content keys, and all complete passes of each.
+
+    Views with less than `least` complete passes are left out.
+    """
     reader = SceneReader(scene.storage.where, scene.scene_id)
     complete = set(reader.refresh().tolist())
     rows = [row for row in SceneMatch(scene, query).rows.tolist() if row in complete]
     views = {reader.view_row(row): row for row in reversed(rows)}
     for view_row, row in sorted(views.items()):
+        if len(reader.rows_of_view(view_row)) < least:
+            continue
         yield reader.view_key(row).hex(), merge_view(reader, view_row)
 
 

@@ -1,0 +1,113 @@
+"""An experiment as its file describes it: a scene with changes, and for each size what is rendered and trained."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, Self
+
+from pydantic import ValidationError
+
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.scene import Frozen, Name, SceneSpec, parse_spec, sentences
+
+HERE = Path(__file__).parent
+SIZES = "sizes.toml"
+
+SizeName = Literal["small", "paper"]
+
+
+class References(Frozen):
+    """Converged images of some of what is held out."""
+
+    views: int
+    spp: int
+
+
+class Run(Frozen):
+    """One network, trained with some settings on top of the size's."""
+
+    name: Name
+    train: Mapping[str, Any]
+
+
+class Size(Frozen):
+    """How large an experiment is."""
+
+    about: str
+    changes: Mapping[str, Any] = MappingProxyType({})  # of the scene's spec
+    modifications: int
+    views: int
+    seed: int
+    hold_out: float
+    references: References
+    architectures: tuple[str, ...]
+    untrained: tuple[str, ...]
+    kept: tuple[int, ...]
+    train: Mapping[str, Any]
+    train_denoisers: Mapping[str, Any]
+
+
+class Experiment(Frozen):
+    """One experiment of one size."""
+
+    name: Name
+    title: str
+    about: str  # what was made movable, and why
+    published: Literal["fixed lights", "movable lights"] | None = None  # whose table of the paper it repeats
+    scene: str  # the spec, beside the file
+    changes: Mapping[str, Any] = MappingProxyType({})  # of the spec, for every size
+    runs: tuple[Run, ...] = ()  # beside one of each architecture
+    size: Size
+
+    @classmethod
+    def load(cls, name: str, size: SizeName) -> Self:
+        """The experiment in NAME.toml; raises SpecError with a sentence for each fault."""
+        file = HERE / f"{name}.toml"
+        if not file.is_file():
+            raise SpecError(f"{name}: no such experiment; there are {', '.join(names())}")
+        described, sizes = _toml(file), _toml(HERE / SIZES)
+        own = {key: described.pop(key, {}) for key in sizes}
+        try:
+            return cls.model_validate({**described, "name": name, "size": merged(sizes[size], own[size])})
+        except ValidationError as error:
+            raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
+
+    def spec(self) -> SceneSpec:
+        """The scene's spec with the changes of the experiment and of the size; raises SpecError."""
+        file = HERE / self.scene
+        described = merged(merged(_toml(file), self.changes), self.size.changes)
+        described["name"] = self.name
+        return parse_spec(described, where=str(HERE / f"{self.name}.toml"), beside=file.parent)
+
+    def trained(self) -> list[Run]:
+        """Every network: one of each architecture, then the experiment's own."""
+        alike = [Run(name=name, train={"architecture": name}) for name in self.size.architectures]
+        return [Run(name=run.name, train=self._settings(run)) for run in (*alike, *self.runs)]
+
+    def _settings(self, run: Run) -> dict[str, Any]:
+        denoises = str(run.train["architecture"]).startswith("denoise")
+        return {**self.size.train, **(self.size.train_denoisers if denoises else {}), **run.train}
+
+
+def names() -> list[str]:
+    """All experiments, in the order of their files' names."""
+    return sorted(file.stem for file in HERE.glob("*.toml") if file.name != SIZES)
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables merged key by key, as deep as they go; of anything else, what is above."""
+    found = dict(below)
+    for key, value in above.items():
+        old = found.get(key)
+        found[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return found
+
+
+def _toml(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SpecError(f"{file}: cannot be read: {error}") from error

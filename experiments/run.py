@@ -1,0 +1,58 @@
+#!/usr/bin/env python3
+"""Runs experiments from nothing to their reports, and goes on where it was interrupted.
+
+    python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments]
+
+Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered and
+trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 3 for a file that is wrong, 7 where
+a stage ended with an error: the others are run all the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import get_args
+
+from experiment import Experiment, SizeName, names
+from photonfarm.shared.errors import IncompleteError, SpecError
+from stages import StageError, Stages, tell
+
+ROOT = Path(__file__).parents[1]
+
+
+def options() -> argparse.ArgumentParser:
+    """What can be told."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
+    parser.add_argument("--size", choices=get_args(SizeName), default="small")
+    parser.add_argument("--workers", type=int, default=2, help="processes at a time, a core each (2)")
+    parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
+    return parser
+
+
+def main() -> int:
+    """Run them; returns the exit code."""
+    told = options().parse_args()
+    try:
+        experiments = [Experiment.load(name, told.size) for name in told.names or names()]
+        for experiment in experiments:
+            experiment.spec()  # what is wrong should be said before hours go by
+    except SpecError as error:
+        tell(f"error: {error}")
+        return SpecError.exit_code
+    failed = False
+    for experiment in experiments:
+        try:
+            tell(
+                f"{experiment.name}: {Stages(experiment, told.work / told.size / experiment.name, told.workers).run()}"
+            )
+        except StageError as error:
+            failed = True
+            tell(f"error: {error}")
+    return IncompleteError.exit_code if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

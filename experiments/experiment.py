@@ -5,10 +5,9 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, Self
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.scene import Frozen, Name, SceneSpec, parse_spec, sentences
@@ -37,7 +36,7 @@ class Size(Frozen):
     """How large an experiment is."""
 
     about: str
-    changes: Mapping[str, Any] = MappingProxyType({})  # of the scene's spec
+    changes: Mapping[str, Any] = Field(default_factory=dict)  # of the scene's spec
     modifications: int
     views: int
     seed: int
@@ -58,7 +57,7 @@ class Experiment(Frozen):
     about: str  # what was made movable, and why
     published: Literal["fixed lights", "movable lights"] | None = None  # whose table of the paper it repeats
     scene: str  # the spec, beside the file
-    changes: Mapping[str, Any] = MappingProxyType({})  # of the spec, for every size
+    changes: Mapping[str, Any] = Field(default_factory=dict)  # of the spec, for every size
     runs: tuple[Run, ...] = ()  # beside one of each architecture
     size: Size
 

@@ -95,7 +95,7 @@ def find(
 @click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
 @click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
 @click.option("--least", type=click.IntRange(1), default=1, show_default=True,
-              help="Leave out views with fewer complete passes, so that only what was topped up is merged.")  # fmt: skip
+              help="Leave out views with fewer complete passes: only what was topped up is merged.")  # fmt: skip
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="A folder.")
 @json_option
 def merge(

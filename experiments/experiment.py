@@ -55,7 +55,6 @@ class Experiment(Frozen):
     name: Name
     title: str
     about: str  # what was made movable, and why
-    published: Literal["fixed lights", "movable lights"] | None = None  # whose table of the paper it repeats
     scene: str  # the spec, beside the file
     changes: Mapping[str, Any] = Field(default_factory=dict)  # of the spec, for every size
     runs: tuple[Run, ...] = ()  # beside one of each architecture

@@ -73,8 +73,8 @@ class Stages:
         arguments += ["--references", self.folder / "references"]
         arguments += [argument for name in size.untrained for argument in ("--denoiser", name)]
         arguments += [argument for kept in size.kept for argument in ("--kept", kept)]
-        if self.experiment.published:
-            arguments += ["--published", self.experiment.published]
+        held_out = size.modifications * size.views * size.hold_out
+        arguments += ["--samples", round(held_out)]  # further passes of the same views come after these
         self._verb("report", arguments)
         return out
 

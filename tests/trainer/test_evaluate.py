@@ -92,8 +92,9 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(
     rows = [row for row in held_out(store, scene, 0.4)[:3] if row == reader.rows_of_view(reader.view_row(row))[0]]
     exposure = scene.spec.exposure
     images = [exposure * reader.read(row).radiance[0] for row in rows]
-    wanted = [exposure * Merged.read(references / f"{reader.view_key(row).hex()}.npz").mean for row in rows]
-    expected = mse(metric_space(np.array(images, np.float32)), metric_space(np.array(wanted, np.float32)))
+    wanted = [Merged.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
+    halves = (np.array([exposure * getattr(of, half) for of in wanted], np.float32) for half in ("half_a", "half_b"))
+    expected = mse(metric_space(np.array(images, np.float32)), *map(metric_space, halves))
     assert found.rows[1].name == "none 1/1"
     assert found.rows[1].metrics.mse.values == pytest.approx(expected.tolist(), rel=1e-5)
 

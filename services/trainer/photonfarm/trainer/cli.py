@@ -1,4 +1,4 @@
-"""The verbs of the trainer service: train, report."""
+"""The verb train of the trainer service."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.shared.cli import json_option, redis_option, store_option
+from photonfarm.shared.cli import redis_option, store_option
 from photonfarm.trainer.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
 
 run_option = click.option(
@@ -120,16 +120,3 @@ def train(
         click.echo(service.summarise(spec, store, preset, changes))
     else:
         service.run(spec, store, run, preset, changes, redis_url)
-
-
-@click.command()
-@store_option
-@run_option
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
-@json_option
-def report(store: str | Path, run: Path, out: Path, as_json: bool) -> None:
-    """Write report.html and report.json: what was learned, at which cost, with pictures."""
-    from photonfarm.trainer.report import write_report
-
-    figures = write_report(store, run, out)
-    click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")

@@ -36,6 +36,9 @@ from photonfarm.trainer.untrained import Untrained
 
 EVALUATION = "evaluation.json"
 
+Choose = Callable[[Mapping[int, F32]], Sequence[int]]
+"""Rows to show beside the first ones, given the first predictor's images (H, W, 3) of all that have references."""
+
 Tell = Callable[[str, int, int], object]
 """Told of a predictor, by its name, on how many samples of how many it has been measured."""
 
@@ -126,6 +129,7 @@ def compare(
     most: int = MOST_HELD_OUT,
     device: str = "auto",
     tell: Tell | None = None,
+    choose: Choose | None = None,
 ) -> Evaluation:
     """The runs, and denoisers of one of so many pixels, on the first `most` samples that no run was trained on.
 
@@ -142,12 +146,15 @@ def compare(
     for _, kept in denoisers:
         kept_count(spec, kept)
     found = {} if references is None else read_references(references, samples)
-    targets = tuple(samples.target(row, found.get(row)) for row in samples.to_show(found))
+    shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found else None
-    shown = [target.row for target in targets]
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
-    untrained = (Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers)
-    predictors: tuple[TrainedRun | Untrained, ...] = (*runs, *untrained)
+    leading = test.measured(first)
+    if choose:
+        shown += [row for row in choose(leading.images) if row not in shown]
+    others: list[TrainedRun | Untrained] = list(runs[1:])
+    others += [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    rows = [leading.row(shown), *(test.measured(other).row(shown) for other in others)]
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
@@ -156,8 +163,8 @@ def compare(
         device=described(place),
         threads=first.settings.threads,
         references=References.of(found, spec.transport.half_spp),
-        rows=tuple(test.row(predictor) for predictor in predictors),
-        shown=targets,
+        rows=tuple(rows),
+        shown=tuple(samples.target(row, found.get(row)) for row in shown),
     )
 
 
@@ -206,6 +213,23 @@ class _Watched:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """A predictor that was put to the test, with its images of all rows that may be shown."""
+
+    predictor: TrainedRun | Untrained
+    held_out: HeldOut
+    seconds: float
+    metrics: ImageMetrics | None
+    images: dict[int, F32]
+
+    def row(self, shown: Sequence[int]) -> Row:
+        """Its row, with the images of some rows of the store."""
+        images = {row: self.images[row] for row in shown if row in self.images}
+        predictor = self.predictor
+        return Row(predictor.name, predictor.needs.kept, self.held_out, self.seconds, self.metrics, images)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Test:
     """What all predictors are put to."""
 
@@ -217,7 +241,7 @@ class _Test:
     device: str
     tell: Tell
 
-    def row(self, predictor: TrainedRun | Untrained) -> Row:
+    def measured(self, predictor: TrainedRun | Untrained) -> _Measured:
         settings = predictor.settings.model_copy(update={"device": self.device})
         rows, total = self.samples.rows, len(self.samples.rows)
         with Feed(StoreSource(self.store, self._scene_id), settings, needs=predictor.needs) as feed:
@@ -227,9 +251,7 @@ class _Test:
             )
             held_out = measure(watched, batches(feed, rows, settings.batch))
             seconds = predict.seconds(next(batches(feed, rows, 1)).inputs)
-        shown = {row: watched.images[row] for row in self.shown if row in watched.images}
-        metrics = self._metrics(watched)
-        return Row(predictor.name, predictor.needs.kept, held_out, seconds, metrics, shown)
+        return _Measured(predictor, held_out, seconds, self._metrics(watched), watched.images)
 
     @property
     def _scene_id(self) -> str:
@@ -240,6 +262,9 @@ class _Test:
         if not rows:
             return None
         exposure = np.float32(self.samples.source.spec.exposure)
-        references = np.stack([exposure * self.references[row].mean.astype(np.float32) for row in rows])
-        units = [watched.units[row] for row in rows]
-        return image_metrics(np.stack([watched.images[row] for row in rows]), references, self.inception, units)
+        mean, a, b = (
+            np.stack([exposure * getattr(self.references[row], image).astype(np.float32) for row in rows])
+            for image in ("mean", "half_a", "half_b")
+        )
+        images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
+        return image_metrics(images, mean, self.inception, units, halves=(a, b))

@@ -1,4 +1,4 @@
-"""The verbs that ask what was learned: evaluate, infer."""
+"""The verbs that ask what was learned: evaluate, infer, report."""
 
 from __future__ import annotations
 
@@ -29,23 +29,50 @@ device_option = click.option(
 )
 
 
-@click.command()
-@store_option
-@click.option(
+runs_option = click.option(
     "--run", "runs", cls=Several, multiple=True, type=click.Path(path_type=Path, file_okay=False), default=["run"],
     envvar="PHOTONFARM_RUN", show_default=True, help="Folder of a training run; several give several rows.",
 )  # fmt: skip
-@click.option("--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
-              help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.")  # fmt: skip
-@click.option("--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=Several, multiple=True,
-              help="Measure one that is not trained too, or several. none: dropped pixels stay black.")  # fmt: skip
-@click.option("--kept", type=click.IntRange(1), cls=Several, multiple=True, metavar="K",
-              help="These denoisers are given one of K pixels; may be repeated.  [default: 1]")  # fmt: skip
-@click.option("--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True,
-              help="At most so many.")  # fmt: skip
-@click.option("--inception", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
-              )  # fmt: skip
+references_option = click.option(
+    "--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
+    help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
+)  # fmt: skip
+denoisers_option = click.option(
+    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=Several, multiple=True,
+    help="Measure one that is not trained too, or several. none: dropped pixels stay black.",
+)  # fmt: skip
+kept_option = click.option(
+    "--kept", type=click.IntRange(1), cls=Several, multiple=True, metavar="K",
+    help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
+)  # fmt: skip
+samples_option = click.option(
+    "--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True, help="At most so many."
+)
+inception_option = click.option(
+    "--inception", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
+)  # fmt: skip
+
+
+def _asked(
+    denoisers: tuple[UntrainedDenoiser, ...], kept: tuple[int, ...], references: Path | None, inception: Path | None
+) -> list[tuple[UntrainedDenoiser, int]]:
+    """Every denoiser with every share of the pixels; raises UsageError for options that need others."""
+    if kept and not denoisers:
+        raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
+    if inception and references is None:
+        raise click.UsageError("--inception is for the columns that compare with references; name these: --references")
+    return list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
+
+
+@click.command()
+@store_option
+@runs_option
+@references_option
+@denoisers_option
+@kept_option
+@samples_option
+@inception_option
 @device_option
 @json_option
 def evaluate(
@@ -65,16 +92,12 @@ def evaluate(
     With references there are the columns of the paper too: of clip(exposure · I, 0, 1)^(1/2.2). In each run's folder
     this leaves evaluation.json, with every figure, and comparison.png, a few of the images side by side.
     """
-    if kept and not denoisers:
-        raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
-    if inception and references is None:
-        raise click.UsageError("--inception is for the columns that compare with references; name these: --references")
+    chosen = _asked(denoisers, kept, references, inception)
     from photonfarm.trainer.evaluate import compare, write
     from photonfarm.trainer.evaluation_table import told
     from photonfarm.trainer.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    chosen = list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
     with _progress() as tell:
         found = compare(
             store, loaded, chosen, references=references, inception=inception, most=most, device=device, tell=tell
@@ -82,6 +105,45 @@ def evaluate(
     pictures = write(found, loaded)
     click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
+
+
+@click.command()
+@store_option
+@runs_option
+@references_option
+@denoisers_option
+@kept_option
+@samples_option
+@inception_option
+@device_option
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
+@json_option
+def report(
+    store: str | Path,
+    runs: tuple[Path, ...],
+    references: Path | None,
+    denoisers: tuple[UntrainedDenoiser, ...],
+    kept: tuple[int, ...],
+    most: int,
+    inception: Path | None,
+    device: str,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Write report.html, report.md and report.json: what was learned, at which cost, with pictures.
+
+    Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
+    from the scene to the image; with references, the worst cases of the first run are found and shown.
+    """
+    chosen = _asked(denoisers, kept, references, inception)
+    from photonfarm.trainer.report import write_report
+
+    with _progress() as tell:
+        figures = write_report(
+            store, list(dict.fromkeys(runs)), out, denoisers=chosen, references=references, inception=inception,
+            most=most, device=device, tell=tell,
+        )  # fmt: skip
+    click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 
 
 @contextmanager

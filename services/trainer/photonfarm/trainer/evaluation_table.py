@@ -42,7 +42,8 @@ def _of_references(references: References, *, denoisers: bool) -> list[str]:
     converged = (
         "converged"
         if references.spp >= CONVERGED_SPP
-        else f"not converged, which takes {CONVERGED_SPP}: their noise is in the columns from MSE on"
+        else f"not converged, which takes {CONVERGED_SPP}: their noise is in the columns from MSSIM on; "
+        "out of MSE it is taken by their halves, but for what the display's curve makes of it"
     )
     views = _counted(references.views, "view")
     found = [f"references: of {views}, of {references.spp} samples per pixel or more; {converged}"]

@@ -59,25 +59,30 @@ def image_metrics(
     references: F32 | Tensor,
     inception: Inception | None,
     groups: Sequence[Hashable] | None = None,
+    halves: tuple[F32, F32] | None = None,
 ) -> ImageMetrics:
     """All metrics of exposed linear images, 2 × (N, H, W, 3), N ≥ 1; reference i is the converged view of prediction i.
 
-    Intervals are over images, or over `groups` of them such as configurations, where one is named per image. Raises
-    ValueError for shapes that do not fit, SpecError for values that are not numbers.
+    With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE; it is in all
+    other metrics, which have no such estimate. Intervals are over images, or over `groups` of them such as
+    configurations, where one is named per image. Raises ValueError for shapes that do not fit, SpecError for values
+    that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)
     check_pairs(shown, wanted)
+    a, b = (metric_space(half) for half in halves) if halves else (wanted, wanted)
+    errors = PerImage.of(mse(shown, a, b), groups)
 
     def each(metric: Callable[[Tensor, Tensor], NDArray[np.float64]]) -> PerImage:
         chunks = (slice(start, start + CHUNK) for start in range(0, len(shown), CHUNK))
         return PerImage.of(np.concatenate([metric(shown[chunk], wanted[chunk]) for chunk in chunks]), groups)
 
     if inception is None:
-        return ImageMetrics(len(shown), each(mse), each(mssim), each(flip), None, None, None, None)
+        return ImageMetrics(len(shown), errors, each(mssim), each(flip), None, None, None, None)
     of_shown, of_wanted = (inception.features(images, CHUNK) for images in (shown, wanted))
     blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
     sets = _set_metrics(of_shown, of_wanted)
-    return ImageMetrics(len(shown), each(mse), each(mssim), each(flip), blocks, *sets, inception.weights)
+    return ImageMetrics(len(shown), errors, each(mssim), each(flip), blocks, *sets, inception.weights)
 
 
 def _set_metrics(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:

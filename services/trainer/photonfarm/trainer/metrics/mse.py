@@ -12,12 +12,15 @@ from torch import Tensor
 from photonfarm.trainer.metrics.metric_space import check_pairs
 
 
-def mse(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
+def mse(predictions: Tensor, references: Tensor, other_halves: Tensor | None = None) -> NDArray[np.float64]:
     """Mean squared difference of each pair of display images, 2 × (N, H, W, 3) → (N,) [supplement 4].
 
-    The display's curve is not linear, so that noise of a reference cannot be taken out of it: references are to be
-    converged. The error in linear radiance needs none (`evaluation.measure`).
+    With references in two independent halves it is mean (f − A)(f − B), whose noise averages to nothing; what stays is
+    the shift that the display's curve makes of their noise, of second order. It may be negative below the noise.
     """
-    check_pairs(predictions, references)
-    errors: NDArray[np.float64] = (predictions.double() - references.double()).square().mean((1, 2, 3)).cpu().numpy()
+    halves = references, references if other_halves is None else other_halves
+    for half in halves:
+        check_pairs(predictions, half)
+    f, a, b = (images.double() for images in (predictions, *halves))
+    errors: NDArray[np.float64] = ((f - a) * (f - b)).mean((1, 2, 3)).cpu().numpy()
     return errors

@@ -1,0 +1,56 @@
+"""The report of one or several runs on one store: report.html, report.md and report.json.
+
+The page holds its pictures and plots; the Markdown has them beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from photonfarm.shared.store import store_errors
+from photonfarm.trainer.animation import write_png
+from photonfarm.trainer.comparison import COMPARISON, comparison
+from photonfarm.trainer.evaluate import Tell
+from photonfarm.trainer.report.contents import gathered
+from photonfarm.trainer.report.markdown_page import markdown
+from photonfarm.trainer.report.page import page
+from photonfarm.trainer.report.plots import plots
+from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.trained import TrainedRun
+
+
+def write_report(
+    store: str | Path,
+    runs: Sequence[Path],
+    out: Path,
+    *,
+    denoisers: Sequence[tuple[UntrainedDenoiser, int]] = (),
+    references: Path | None = None,
+    inception: Path | None = None,
+    most: int = MOST_HELD_OUT,
+    device: str = "auto",
+    tell: Tell | None = None,
+) -> dict[str, Any]:
+    """Write the report of the runs into the folder `out`; returns the figures of report.json.
+
+    Runs, and denoisers of one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder is
+    not a run or what is asked for cannot be compared, StoreError without a readable checkpoint or store or if `out`
+    cannot be written, IncompleteError if nothing is held out.
+    """
+    contents = gathered(
+        store, [TrainedRun.load(run) for run in runs], denoisers, references=references, inception=inception, most=most,
+        device=device, tell=tell,
+    )  # fmt: skip
+    document, drawn = contents.document(), plots(contents)
+    with store_errors("write the report", out):
+        out.mkdir(parents=True, exist_ok=True)
+        for plot in drawn:
+            (out / f"{plot.name}.svg").write_bytes(plot.svg)
+        (out / "report.json").write_text(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+        (out / "report.md").write_text(markdown(contents, drawn, COMPARISON))
+        (out / "report.html").write_text(page(contents, drawn))
+    write_png(comparison(contents.evaluation), out / COMPARISON)
+    return document

@@ -1,0 +1,83 @@
+"""What the data are that a network was trained on: their scene, what they cost, and how they can be made again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import SceneStatus, Store, store_status
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DatasetCard:
+    """A scene of a store, as its plans and markers tell."""
+
+    spec: SceneSpec
+    status: SceneStatus
+    requests: tuple[dict[str, Any], ...]  # of each plan: all that its rows follow from
+    versions: dict[str, list[str]]  # of the packages that rendered, each with all that took part
+    workers: int  # how many took part
+
+    @classmethod
+    def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
+        """The card of one scene; raises StoreError for one that the store does not hold."""
+        opened = Store(store)
+        status = next((found for found in store_status(opened) if found.scene_id == scene_id), None)
+        if status is None:
+            raise StoreError(f"{store}: holds no scene {scene_id}")
+        scene = opened.scene(scene_id)
+        versions: dict[str, set[str]] = {}
+        workers = set()
+        for job in scene.committed_jobs():
+            figures = scene.marker(job)["figures"]
+            workers.add(figures["worker"])
+            for package, version in figures["versions"].items():
+                versions.setdefault(package, set()).add(version)
+        requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
+        known = {package: sorted(found) for package, found in sorted(versions.items())}
+        return cls(scene.spec, status, requests, known, len(workers))
+
+    @property
+    def core_s_per_sample(self) -> float:
+        """Processor time of a complete sample, buffers and photons included; 0 without one."""
+        return self.status.core_s / self.status.samples_complete if self.status.samples_complete else 0.0
+
+    def document(self) -> dict[str, Any]:
+        """What report.json says of it."""
+        spec, status = self.spec, self.status
+        return {
+            "scene": spec.name,
+            "scene_id": spec.scene_id,
+            "credits": None if spec.credits is None else spec.credits.model_dump(),
+            "source": spec.scene.file or f"built-in {spec.scene.builtin}",
+            "kind": kind(spec),
+            "width": spec.film.width,
+            "height": spec.film.height,
+            "exposure": spec.exposure,
+            "points": spec.points,
+            "transport": spec.transport.model_dump(),
+            "photons": spec.photons.model_dump(),
+            "spp_per_sample": 2 * spec.transport.half_spp,
+            "samples_planned": status.samples_planned,
+            "samples_complete": status.samples_complete,
+            "requests": list(self.requests),
+            "bytes": status.size_bytes,
+            "core_seconds": status.core_s,
+            "core_seconds_per_sample": self.core_s_per_sample,
+            "redrawn": status.redrawn,
+            "workers": self.workers,
+            "versions": self.versions,
+        }
+
+
+def kind(spec: SceneSpec) -> str:
+    """What may change in a scene, in words."""
+    if not spec.groups:
+        return "static: views alone differ"
+    movable = [
+        f"{len(groups)} {name}" for name, groups in (("objects", spec.objects), ("lights", spec.lights)) if groups
+    ]
+    return f"dynamic: {' and '.join(movable)} move"

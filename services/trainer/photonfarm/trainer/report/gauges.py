@@ -1,0 +1,53 @@
+"""What an error is measured by who knows nothing: the mean colour, and the network before its first step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.shared.errors import IncompleteError
+from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.evaluation import (
+    HeldOut,
+    batches,
+    constant_predictor,
+    mean_colour,
+    measure,
+    network_predictor,
+)
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.loop import INITIAL
+from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+
+MOST_TRAINING = 1024  # samples to take the mean colour of
+MOST_HELD_OUT = 64  # samples that both are measured on: enough, as both are far off
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gauges:
+    """Errors to compare with, in linear radiance × exposure, the targets' noise removed."""
+
+    mean_colour: HeldOut  # of the training samples, everywhere
+    untrained: HeldOut  # the first run's network before its first step
+
+    @classmethod
+    def of(cls, store: str | Path, run: TrainedRun) -> Gauges:
+        """On the first held-out samples of a run. Raises IncompleteError without samples of both kinds."""
+        settings = run.settings.model_copy(update={"device": "cpu"})
+        source = StoreSource(store, run.scene_id)
+        rows = source.refresh().tolist()
+        held = rows_held_out(source, rows, settings.hold_out)
+        held_out = [row for row, is_held in zip(rows, held, strict=True) if is_held][:MOST_HELD_OUT]
+        training = [row for row, is_held in zip(rows, held, strict=True) if not is_held]
+        if not held_out or not training:
+            raise IncompleteError(
+                f"{len(training)} training and {len(held_out)} held-out samples are complete; a report needs both"
+            )
+        with Feed(StoreSource(store, run.scene_id), settings, needs=run.needs) as feed:
+            colour = mean_colour(batches(feed, training[:: -(-len(training) // MOST_TRAINING)], settings.batch))
+            network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
+            return cls(
+                measure(constant_predictor(colour), batches(feed, held_out, settings.batch)),
+                measure(network_predictor(network), batches(feed, held_out, settings.batch)),
+            )

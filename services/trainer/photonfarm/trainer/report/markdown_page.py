@@ -1,0 +1,25 @@
+"""The report as Markdown, with its plots and pictures in files beside it."""
+
+from __future__ import annotations
+
+from photonfarm.trainer.markdown import markdown_table
+from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.plots import Plot
+from photonfarm.trainer.report.tables import Table, facts, tables
+
+
+def markdown(contents: Contents, drawn: list[Plot], pictures: str) -> str:
+    """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
+    first, *others = tables(contents)
+    images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
+    card = "\n".join(f"- **{name}**: {value}" for name, value in facts(contents))
+    blocks = [
+        f"# {contents.card.spec.name}", _table(first), f"## Plots\n\n{images}",
+        f"## Held-out views\n\n![targets and predictions]({pictures})", *map(_table, others), f"## The data\n\n{card}",
+    ]  # fmt: skip
+    return "\n\n".join(blocks) + "\n"
+
+
+def _table(table: Table) -> str:
+    notes = "".join(f"\n- {note}." for note in table.notes)
+    return f"## {table.title}\n\n{markdown_table(table.head, table.rows)}\n{notes}".rstrip()

@@ -1,0 +1,137 @@
+"""The report as one HTML file that needs nothing else: pictures and plots are in it."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+
+from photonfarm.shared.pictures import Picture, png_uri
+from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.pictures import LARGEST, Case, cases
+from photonfarm.trainer.report.plots import Plot
+from photonfarm.trainer.report.tables import Table, facts, tables
+
+STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 76rem; margin: 1.5rem auto;
+       padding: 0 1rem; }
+h1 { font-size: 1.5rem; overflow-wrap: anywhere; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+.figures { display: flex; flex-wrap: wrap; gap: .8rem; }
+.figures div { border: 1px solid #ddd; border-radius: 6px; padding: .5rem .9rem; }
+.figures b { display: block; font-size: 1.25rem; }
+.plots { display: flex; flex-wrap: wrap; gap: 1rem; }
+.plots img { width: 30rem; max-width: 100%; height: auto; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; }
+td, th { padding: .25rem .8rem .25rem 0; text-align: left; font-weight: normal; vertical-align: top; }
+thead th { color: #555; border-bottom: 1px solid #ccc; vertical-align: bottom; }
+tbody tr:nth-child(even) { background: #f7f7f7; }
+td:first-child { position: sticky; left: 0; background: inherit; overflow-wrap: anywhere; min-width: 8rem; }
+tbody tr { background: #fff; }
+.case { display: flex; flex-wrap: wrap; gap: .6rem; margin-bottom: 1.6rem; }
+figure { margin: 0; width: 8.5rem; } figure img { width: 100%; image-rendering: pixelated; display: block; }
+figcaption { font-size: .72rem; line-height: 1.3; overflow-wrap: anywhere; }
+p, li { max-width: 52rem; } code { overflow-wrap: anywhere; }
+ul { padding-left: 1.2rem; font-size: .88rem; color: #444; }
+.facts td { overflow-wrap: anywhere; } .facts td:first-child { color: #555; }
+"""
+PICTURE_WIDTH = 128  # px, at least, of a picture as it is stored in the page
+
+
+def page(contents: Contents, drawn: list[Plot]) -> str:
+    """The report's HTML."""
+    title = f"photonfarm: {contents.card.spec.name}"
+    first, *others = tables(contents)
+    over_time = [plot for plot in drawn if plot.name.startswith("time-")]
+    curves = [plot for plot in drawn if plot.name.startswith("curve-")]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        _headline(contents),
+        _table(first),
+        _plots("Error over the time of a frame", over_time),
+        _plots("Learning", curves),
+        _pictures(cases(contents), contents),
+        *map(_table, others),
+        _facts(contents),
+    ]
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>\n'
+        + "\n".join(part for part in parts if part)
+        + "\n</body></html>\n"
+    )
+
+
+def _headline(contents: Contents) -> str:
+    card, evaluation = contents.card, contents.evaluation
+    status, colour = card.status, contents.gauges.mean_colour.error.mean
+    best = min(contents.entries[: len(contents.stories)], key=lambda entry: entry.row.held_out.error.mean)
+    error = best.row.held_out.error
+    spread = "–" if error.standard_error is None else f"{error.standard_error:.2g}"
+    rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
+    cells = [
+        (f"{status.samples_complete}", f"samples of {status.samples_planned} planned"),
+        ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
+        (f"{error.mean:.4g}", f"held-out error (± {spread}), {best.name}"),
+        (f"{colour:.4g}", f"mean colour: {colour / error.mean:.1f} ×" if error.mean > 0 else "mean colour"),
+        (f"{contents.gauges.untrained.error.mean:.4g}", "before training"),
+        (f"{evaluation.noise_floor:.4g}", "noise of the targets"),
+    ]
+    boxes = "".join(f"<div><b>{value}</b>{escape(name)}</div>" for value, name in cells)
+    return (
+        f'<div class="figures">{boxes}</div>\n<p>Errors are mean squared errors of linear radiance × exposure, on '
+        f"{evaluation.samples} samples of {evaluation.units} {evaluation.unit}s that were never trained on. The noise "
+        "of the targets is taken out exactly: each sample has two independent renders A and B, and (f − A)(f − B) "
+        "averages to the error against the clean image, which nobody rendered. Noise would add the last figure on "
+        "top.</p>"
+    )
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in table.head)
+    rows = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in table.rows)
+    notes = "".join(f"<li>{escape(note)}.</li>" for note in table.notes)
+    return (
+        f'<h2>{escape(table.title)}</h2>\n<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody>'
+        f"</table></div>{f'<ul>{notes}</ul>' if notes else ''}"
+    )
+
+
+def _plots(title: str, drawn: list[Plot]) -> str:
+    if not drawn:
+        return ""
+    images = "".join(
+        f'<img alt="{escape(plot.about)}" src="data:image/svg+xml;base64,{base64.b64encode(plot.svg).decode()}">'
+        for plot in drawn
+    )
+    return f'<h2>{escape(title)}</h2>\n<div class="plots">{images}</div>'
+
+
+def _pictures(found: list[Case], contents: Contents) -> str:
+    blocks = []
+    for case in found:
+        figures = [_figure(case.target, "target", "target")]
+        for shown in case.shown:
+            figures.append(_figure(shown.picture, f"{shown.name}, MSE {shown.mse:.4f}", f"image by {shown.name}"))
+            figures.append(_figure(shown.difference, "difference to the target", f"difference of {shown.name}"))
+        blocks.append(f'<h3>{escape(case.caption)}</h3><div class="case">{"".join(figures)}</div>')
+    legend = (
+        f"<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>; differences to the target from black (0) to pale "
+        f"yellow ({LARGEST:g} and more). The first are the first samples of the first configurations, the others the "
+        f"worst cases of {escape(contents.entries[0].name)}, found automatically.</p>"
+    )
+    return f"<h2>Held-out views</h2>\n{legend}\n{''.join(blocks)}"
+
+
+def _figure(picture: Picture, caption: str, alt: str) -> str:
+    scale = max(1, -(-PICTURE_WIDTH // picture.shape[1]))
+    return (
+        f'<figure><img alt="{escape(alt)}" src="{png_uri(picture, scale)}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _facts(contents: Contents) -> str:
+    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in facts(contents))
+    return f'<h2>The data</h2>\n<table class="facts"><tbody>{rows}</tbody></table>'

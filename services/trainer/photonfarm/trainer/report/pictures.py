@@ -1,0 +1,61 @@
+"""Held-out views in a report: the target, each predictor's image, and where it is wrong [supplement Figs. 6 to 8]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonfarm.shared.pictures import Picture, display, display_values
+from photonfarm.shared.records import F32
+from photonfarm.trainer.evaluation_samples import Target
+from photonfarm.trainer.report.contents import Contents
+
+LARGEST = 0.25  # difference in the metric space that is drawn brightest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """One predictor's image of a view."""
+
+    name: str
+    picture: Picture
+    difference: Picture  # |prediction − target| in the metric space, mean of the channels, as colours
+    mse: float  # in the metric space, with the target's noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One view."""
+
+    caption: str
+    target: Picture
+    shown: tuple[Shown, ...]
+
+
+def cases(contents: Contents) -> list[Case]:
+    """Some views as they come, then the worst."""
+    return [_case(contents, target) for target in contents.evaluation.shown]
+
+
+def _case(contents: Contents, target: Target) -> Case:
+    kinds = [f"worst of {case.kind}" for case in contents.worst if case.row == target.row]
+    what = "reference" if target.is_reference else "noisy target"
+    caption = f"row {target.row}{''.join(f', {kind}' for kind in kinds)}; {what} of {target.spp} samples per pixel"
+    images = ((entry.name, entry.row.shown.get(target.row)) for entry in contents.entries)
+    shown = tuple(_shown(name, image, target.image) for name, image in images if image is not None)
+    return Case(caption, display(target.image, 1.0), shown)
+
+
+def _shown(name: str, image: F32, target: F32) -> Shown:
+    apart = display_values(image) - display_values(target)
+    return Shown(name, display(image, 1.0), coloured(np.abs(apart).mean(axis=-1)), float(np.mean(apart**2)))
+
+
+def coloured(difference: F32) -> Picture:
+    """Differences (H, W) as colours (H, W, 3), from black at 0 over red to pale yellow at `LARGEST` and above."""
+    import matplotlib as mpl
+
+    shades = mpl.colormaps["magma"](np.clip(difference / LARGEST, 0, 1), bytes=True)
+    picture: Picture = np.ascontiguousarray(shades[..., :3])
+    return picture

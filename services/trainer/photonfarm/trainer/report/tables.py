@@ -1,0 +1,219 @@
+"""The tables of a report as cells of text, for its page and its Markdown alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from photonfarm.shared.estimate import Estimate
+from photonfarm.trainer.evaluation_table import notes
+from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.report.contents import Contents, Entry
+from photonfarm.trainer.report.plots import measures
+from photonfarm.trainer.waits import stated
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table with a head; `notes` are sentences below it."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+def tables(contents: Contents) -> list[Table]:
+    """All tables, in the order of the report."""
+    return [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
+
+
+def facts(contents: Contents) -> list[tuple[str, str]]:
+    """The dataset's card: names and values."""
+    card = contents.card
+    spec, status = card.spec, card.status
+    t, owed = spec.transport, spec.credits
+    return [
+        ("scene", f"{spec.name}, {card.document()['source']}, id {spec.scene_id}"),
+        ("credits", "not said" if owed is None else f"“{owed.title}” by {owed.author}, {owed.licence}"),
+        ("published at", NOT_AVAILABLE if owed is None or not owed.source else owed.source),
+        ("kind", card.document()["kind"]),
+        ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
+        ("samples", f"{status.samples_complete} of {status.samples_planned} planned, {2 * t.half_spp} samples per "
+                    "pixel each, in two independent halves"),
+        ("noise floor", f"{contents.evaluation.noise_floor:.4g}, of a target, squared exposed radiance"),
+        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {t.connections} connections, light ratio "
+                      f"{t.light_ratio:g}"),
+        ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
+        ("seeds", _seeds(contents)),
+        ("cost", f"{status.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample; "
+                 f"{status.redrawn} renders drawn again, as they were not finite"),
+        ("size", f"{status.size_bytes / 1e6:.1f} MB"),
+        ("rendered by", f"{card.workers} workers with " + _versions(card.versions)),
+    ]  # fmt: skip
+
+
+def _seeds(contents: Contents) -> str:
+    asked = []
+    for number, request in enumerate(contents.card.requests):
+        if request["kind"] == "samples":
+            asked.append(
+                f"plan {number}: seed {request['seed']}, {request['modifications']} configurations × "
+                f"{request['views_per_modification']} views × {request['passes']} passes"
+            )
+        else:
+            where = f" where {' and '.join(request['where'])}" if request["where"] else ""
+            asked.append(f"plan {number}: {'+' if request['adds'] else ''}{request['spp']} samples per pixel{where}")
+    trained = sorted({str(story.run.settings.seed) for story in contents.stories})
+    return f"{'; '.join(asked)}; training: {', '.join(trained)}"
+
+
+def _versions(versions: dict[str, list[str]]) -> str:
+    return ", ".join(f"{package} {' and '.join(found)}" for package, found in versions.items())
+
+
+# -------------------------------------------------------------------------------------------------- the paper's columns
+
+
+def _paper(contents: Contents) -> Table:
+    """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; published figures beside ours, where there are."""
+    beside = contents.published is not None
+    columns = ("time per frame, ms", "× light transport", "MSE (95 %)", "MSSIM (95 %)", "FID", "Feature L1 (95 %)")
+    head = ["architecture"]
+    for column in columns:
+        head.append(column)
+        if beside and column != columns[0]:
+            head.append("paper")
+    rows = tuple(_paper_row(contents, entry, beside=beside) for entry in contents.entries)
+    named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
+    said = [_of_time(contents), *notes(contents.evaluation)]
+    if beside:
+        said.append(
+            "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on "
+            "another machine: orders and ratios can be compared, values cannot"
+        )
+    return Table(named, tuple(head), rows, tuple(said))
+
+
+def _of_time(contents: Contents) -> str:
+    if contents.costs is None:
+        return "time per frame: n/a, as the renderer, which makes buffers and photons, is not installed here"
+    frames = contents.costs.render_s.shape[1]
+    return (
+        "time per frame: rendering, buffers, points, photons and network, each on one core of this machine, medians "
+        f"of {frames} frames in one run; editing the scene ({1e3 * contents.costs.medians()['edit_s']:.0f} ms), which "
+        "all need, is not in it"
+    )
+
+
+def _paper_row(contents: Contents, entry: Entry, *, beside: bool) -> tuple[str, ...]:
+    metrics, paper, unit = entry.row.metrics, entry.published, contents.measure
+    headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[3].estimate
+    cells = [
+        (f"{1e3 * entry.time.total:.1f}" if entry.time else NOT_AVAILABLE, None),
+        (_ratio(entry, unit), _published_ratio(entry, unit)),
+        (_interval(None if metrics is None else metrics.mse.estimate, 5), f"{paper.mse:.4f}" if paper else ""),
+        (_interval(None if metrics is None else metrics.mssim.estimate, 3), f"{paper.mssim:.3f}" if paper else ""),
+        (f"{metrics.fid.value:.1f}" if metrics and metrics.fid else NOT_AVAILABLE, f"{paper.fid:.1f}" if paper else ""),
+        (_interval(headline, 3), f"{paper.feature_l1:.3f}" if paper else ""),
+    ]
+    row = [entry.name]
+    for ours, theirs in cells:
+        row.append(ours)
+        if beside and theirs is not None:
+            row.append(theirs)
+    return tuple(row)
+
+
+def _ratio(entry: Entry, unit: Entry) -> str:
+    return NOT_AVAILABLE if entry.time is None or unit.time is None else f"{entry.time.total / unit.time.total:.2f}"
+
+
+def _published_ratio(entry: Entry, unit: Entry) -> str:
+    if entry.published is None or unit.published is None:
+        return ""
+    return f"{entry.published.seconds / unit.published.seconds:.2f}"
+
+
+def _interval(estimate: Estimate | None, digits: int) -> str:
+    if estimate is None:
+        return NOT_AVAILABLE
+    found = confidence_interval(estimate)
+    reach = "" if found is None else f" ({found[0]:.{digits}f} … {found[1]:.{digits}f})"
+    return f"{estimate.mean:.{digits}f}{reach}"
+
+
+# -------------------------------------------------------------------------------------------------------------- further
+
+
+def _further(contents: Contents) -> Table:
+    """What the paper does not have, and its Fig. 5 in numbers."""
+    shown = [m for m in measures() if m.name.startswith(("feature", "kid", "flip"))]
+    first = contents.evaluation.rows[0]
+    rows = []
+    for entry in contents.entries:
+        behind = None if entry.row is first else entry.row.behind(first)
+        linear = _interval(entry.row.held_out.error, 5)
+        values = (m.of(entry) for m in shown)
+        cells = [NOT_AVAILABLE if value is None else f"{value:.4f}" for value in values]
+        rows.append((entry.name, linear, "" if behind is None else _interval(behind, 5), *cells))
+    head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *(m.title for m in shown))
+    said = []
+    if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
+        said.append(
+            f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
+            f"{weights.source}, sha256 {weights.sha256}; images are resized to 299 × 299 bilinearly without aligned "
+            "corners"
+        )
+    return Table("Further metrics", head, tuple(rows), tuple(said))
+
+
+def _frame_parts(contents: Contents) -> list[Table]:
+    if contents.costs is None:
+        return []
+    rows = tuple(
+        (entry.name, *(f"{1e3 * part:.1f}" if part else "" for part in _parts(entry)), f"{1e3 * entry.time.total:.1f}")
+        for entry in contents.entries
+        if entry.time
+    )
+    head = ("architecture", "render 1/k", "buffers", "points seen", "photons", "network", "all")
+    said = (
+        "milliseconds. Denoisers are given one half-estimate of 1/k of the pixels; as splats of light paths do not "
+        "stop at these, their light paths are as many as for the whole image (up to 64 × as many per pixel)"
+    )
+    return [Table("Where the time of a frame goes", head, rows, (said,))]
+
+
+def _parts(entry: Entry) -> Sequence[float]:
+    time = entry.time
+    return () if time is None else (time.render, time.buffers, time.points, time.photons, time.network)
+
+
+# ---------------------------------------------------------------------------------------------------------- runs, cases
+
+
+def _runs(contents: Contents) -> Table:
+    rows = []
+    for story in contents.stories:
+        about = story.document()
+        rows.append(
+            (
+                story.name, f"{about['parameters']:,}", f"{about['steps']}", f"{about['draws_per_sample']:.1f}",
+                f"{about['seconds']['train'] / 60:.1f}", stated(about["waits"], about["samples_per_used"]),
+            )
+        )  # fmt: skip
+    head = ("run", "parameters", "steps", "draws per sample", "minutes of steps", "waits")
+    return Table("Training", head, tuple(rows))
+
+
+def _worst(contents: Contents) -> list[Table]:
+    if not contents.worst:
+        return []
+    rows = tuple((c.kind, f"{c.row}", f"{c.pixels:.1%}", f"{c.mse:.4f}") for c in contents.worst)
+    said = (
+        f"of all views with references, those in which pixels of one kind cost {contents.entries[0].name} most: the "
+        "sum of their squared error in the metric space, the references' noise taken out. Close: nearer than 5 % of "
+        "what is seen. Fine shadows: light steps where surface, normal and colour do not"
+    )
+    return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (said,))]

@@ -1,0 +1,120 @@
+"""Where a network fails most, found by what each pixel shows [supplement 4: its known failures; Figs. 6 to 8].
+
+Shape letters: H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.frame_costs import Surface
+from photonfarm.shared.pictures import display_values
+from photonfarm.shared.records import F32, ViewBuffers
+
+Mask = NDArray[np.bool_]
+
+CLOSE = 0.05  # quantile of all depths: what is nearer is close to the camera
+LEAST = 0.005  # share of the image's pixels that a case has at the least
+STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
+SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to which difference, cosine and ratio nothing else does
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One held-out view: what it shows, and the network's image of it."""
+
+    row: int
+    image: F32  # (H, W, 3) exposed linear radiance, by the network
+    half_a: F32  # of the reference, exposed; independent of `half_b`
+    half_b: F32
+    buffers: ViewBuffers
+    surface: NDArray[np.uint8] | None  # (H, W) kinds of `frame_costs.Surface`; None where the renderer is not at hand
+
+
+@dataclass(frozen=True, slots=True)
+class WorstCase:
+    """The view in which pixels of one kind have the largest error together."""
+
+    kind: str
+    row: int
+    pixels: float  # share of the image
+    mse: float  # of these pixels, in the metric space, the reference's noise taken out
+
+
+def worst_cases(views: list[View]) -> list[WorstCase]:
+    """For each kind of pixels the view that it costs most, in `kinds`' order; a view is named once.
+
+    What counts is the sum of the error over the pixels: of two views with one wrong mirror the larger mirror.
+    """
+    if not views:
+        return []
+    depths = np.concatenate([view.buffers.depth[view.buffers.depth > 0] for view in views])
+    close = float(np.quantile(depths, CLOSE)) if len(depths) else 0.0
+    scored: dict[str, list[tuple[float, WorstCase]]] = {}
+    for view in views:
+        error = squared_error(view)
+        for kind, mask in kinds(view, close):
+            if (share := float(mask.mean())) >= LEAST:
+                case = WorstCase(kind, view.row, share, float(error[mask].mean()))
+                scored.setdefault(kind, []).append((share * case.mse, case))
+    found: dict[int, WorstCase] = {}
+    for of_kind in scored.values():
+        for _, case in sorted(of_kind, key=lambda each: -each[0]):
+            if case.row not in found:
+                found[case.row] = case
+                break
+    return list(found.values())
+
+
+def squared_error(view: View) -> NDArray[np.float64]:
+    """Of each pixel (H, W), over channels, in the metric space: (f − A)(f − B), in which noise averages to nothing."""
+    shown, a, b = (display_values(image).astype(np.float64) for image in (view.image, view.half_a, view.half_b))
+    product: NDArray[np.float64] = ((shown - a) * (shown - b)).mean(axis=-1)
+    return product
+
+
+def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
+    """The kinds of pixels that are looked for, each with its mask (H, W)."""
+    if view.surface is not None:
+        yield "mirrors and clear glass", view.surface == Surface.MIRROR
+        yield "specular surfaces", view.surface == Surface.SPECULAR
+    yield "close to the camera", (view.buffers.depth > 0) & (view.buffers.depth < close)
+    yield "fine shadows", shadow_edges(view)
+    yield "all pixels", np.ones_like(view.buffers.depth, np.bool_)
+
+
+def shadow_edges(view: View) -> Mask:
+    """Where the irradiance of the reference steps between neighbours that are alike in all else, (H, W)."""
+    clean = (view.half_a + view.half_b) / 2
+    irradiance = np.log(clean.mean(axis=-1) + 1e-3) - np.log(view.buffers.albedo.mean(axis=-1) + 1e-2)
+    edges = np.zeros(irradiance.shape, np.bool_)
+    for axis in (0, 1):
+        first, second = _neighbours(len(edges) if axis == 0 else edges.shape[1], axis)
+        steps = np.abs(irradiance[second] - irradiance[first]) > STEP
+        edges[first] |= steps & _alike(view.buffers, first, second)
+    return edges
+
+
+Part = tuple[slice, slice]
+
+
+def _neighbours(length: int, axis: int) -> tuple[Part, Part]:
+    """All pixels but the last of an axis, and the next of each."""
+    first, second = slice(0, length - 1), slice(1, length)
+    every = slice(None)
+    return ((first, every), (second, every)) if axis == 0 else ((every, first), (every, second))
+
+
+def _alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
+    """Whether two pixels show one surface of one colour."""
+    depth, other = buffers.depth[first], buffers.depth[second]
+    near = (depth > 0) & (other > 0) & (np.abs(depth - other) < SAME_DEPTH * np.maximum(depth, other))
+    colour = np.abs(buffers.albedo[first] - buffers.albedo[second]).max(axis=-1) < SAME_ALBEDO
+    turned = (buffers.normal[first] * buffers.normal[second]).sum(axis=-1) > SAME_NORMAL
+    diffuse = buffers.albedo[first].max(axis=-1) > 0
+    found: Mask = near & colour & turned & diffuse
+    return found

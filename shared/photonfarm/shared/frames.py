@@ -6,7 +6,6 @@ H W image, P points, K photon slots.
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
@@ -14,10 +13,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.errors import StoreError
+from photonfarm.shared.archives import stored_arrays, write_arrays
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.store import store_errors
 from photonfarm.shared.view import View
 
 _OF_VIEWS = ("depth", "albedo", "normal", "point_seen", "photon_seen")
@@ -59,28 +57,16 @@ class Frames:
         }
         if self.photons is not None:
             arrays |= {f"photon_{name}": array for name, array in arrays_of(self.photons).items()}
-        part = file.with_suffix(".partial.npz")
-        with store_errors("write the buffers", file):
-            file.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(part, allow_pickle=False, **arrays)
-            part.replace(file)
+        write_arrays(file, arrays, "buffers")
 
     @classmethod
     def read(cls, file: Path) -> Self:
         """What `write` has stored; raises StoreError for anything else."""
-        try:
-            with (
-                file.open("rb") as archive,
-                np.load(archive, allow_pickle=False) as stored,
-            ):  # it leaves damaged ones open
-                views = tuple(View.from_vector(vector) for vector in stored["view"])
-                photons = None
-                if "photon_bounce" in stored:
-                    photons = Photons(*(stored[f"photon_{field.name}"] for field in fields(Photons)))
-                modification = Modification.from_vector(stored["modification"])
-                of_views = {name: stored[name] for name in _OF_VIEWS}
-                return cls(str(stored["scene_id"]), modification, views, photons=photons, **of_views)
-        except FileNotFoundError as error:
-            raise StoreError(f"{file}: there is no such file") from error
-        except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
-            raise StoreError(f"{file}: holds no buffers that `photonfarm buffers` wrote") from error
+        with stored_arrays(file, "buffers", "buffers") as stored:
+            views = tuple(View.from_vector(vector) for vector in stored["view"])
+            photons = None
+            if "photon_bounce" in stored:
+                photons = Photons(*(stored[f"photon_{field.name}"] for field in fields(Photons)))
+            modification = Modification.from_vector(stored["modification"])
+            of_views = {name: stored[name] for name in _OF_VIEWS}
+            return cls(str(stored["scene_id"]), modification, views, photons=photons, **of_views)

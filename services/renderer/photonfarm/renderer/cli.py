@@ -1,4 +1,4 @@
-"""The verbs of the render service: buffers, doctor, preview, scene plan, work."""
+"""The verbs of the render service: buffers, doctor, measure-frames, preview, report stability, scene plan, work."""
 
 from __future__ import annotations
 
@@ -133,6 +133,34 @@ def buffers(
         raise click.UsageError("one of --camera-path and --orbit is required")
     frames = write_buffers(store, scene, modification, orbit or CameraPath.load(path or Path()), out)
     click.echo(f"{out}: {frames} frames")
+
+
+@click.command("measure-frames")
+@store_option
+@click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
+@click.option("--rows", type=click.IntRange(0), multiple=True, required=True, metavar="ROW",
+              help="A complete sample, whose configuration and view are measured; may be repeated.")  # fmt: skip
+@click.option("--kept", type=click.IntRange(1), multiple=True, default=(1,), show_default=True, metavar="K",
+              help="Time a half-estimate of one of K pixels; may be repeated.")  # fmt: skip
+@click.option("--timed", type=click.IntRange(1), default=9, show_default=True, metavar="FRAMES",
+              help="Frames to time, after 2 that do not count.")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
+def measure_frames(
+    store: str | Path, scene: str, rows: tuple[int, ...], kept: tuple[int, ...], timed: int, out: Path
+) -> None:
+    """Measure what the parts of a frame cost here, on one core, and what kind of surface each pixel shows.
+
+    Nothing is written to the store. Rows of at least two configurations make edits what they are between samples.
+    """
+    from photonfarm.renderer import backend
+
+    backend.load(threads=1)
+    from photonfarm.renderer.frame_costs import write_frame_costs
+
+    costs = write_frame_costs(store, scene, rows, kept, timed, out)
+    parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
+    click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()), err=True)
+    click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
 
 
 @click.command()

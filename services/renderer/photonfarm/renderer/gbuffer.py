@@ -43,7 +43,7 @@ def view_buffers(scene: Any, view: View, spec: SceneSpec) -> ViewBuffers:
     """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is there."""
     camera = Camera.of(view, spec)
     directions = camera.rays()
-    si = _first_surfaces(scene, camera, directions, spec)
+    si = first_surfaces(scene, camera, directions, spec)
     hit = si.is_valid()
     normal = dr.select(hit, si.sh_frame.n, 0)
     distance = dr.select(hit, si.t, 0)
@@ -63,14 +63,14 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec) -> F32:
     total = np.zeros((camera.height, camera.width, 3))
     for start in range(0, len(within), at_once):
         directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        si = _first_surfaces(scene, camera, directions, spec)
+        si = first_surfaces(scene, camera, directions, spec)
         hit = si.is_valid()
         albedo = dr.select(hit, diffuse_reflectance(si, hit), 0)
         total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
     return (total / len(within)).astype(np.float32)
 
 
-def _first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
+def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
     """What rays from the camera along unit directions (..., 3) meet between the near and the far plane."""
     flat = directions.reshape(-1, 3)
     along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis

@@ -1,0 +1,270 @@
+"""`photonfarm measure-frames`: what kinds of surface a frame shows, and what its parts cost."""
+
+import re
+from collections.abc import Callable
+from itertools import islice, pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from photonfarm.renderer import backend
+from photonfarm.renderer.cli import measure_frames
+from photonfarm.renderer.frame_costs import WARM_UPS, Frame, frame_costs, in_turn
+from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.partial_film import PartialFilm, part_of
+from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.renderer.surfaces import surface_kinds
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.frame_costs import PARTS, FrameCosts, Surface
+from photonfarm.shared.modification import Modification, rest
+from photonfarm.shared.plan import Request
+from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.view import View
+
+DIFFUSE = {"type": "diffuse"}
+MIRROR = {"type": "conductor"}
+SHINES = {"type": "area", "radiance": {"type": "rgb", "value": [1, 1, 1]}}
+INTO_THE_BOX = View(np.array([0.1, 1, 3], np.float32), np.array([0, 1, 0], np.float32))
+
+
+def plain(film: int = 16, **changes: Any) -> SceneSpec:
+    """The static box, looked into from outside; anything in it is between near and far plane."""
+    point = {"min": [-1, -1, -1], "max": [1, 1, 1]}
+    described = {
+        "name": "plain",
+        "scene": {"builtin": "cornell"},
+        "view": {"origin": point, "look_at": point, "fov_deg": 60},
+        "film": {"width": film, "height": film},
+        "points": 64,
+        "photons": {"paths": 0},
+        **changes,
+    }
+    return parse_spec(described, where="test")
+
+
+def frame(view: View, modification: Modification, key: str = "same", row: int = 0) -> Frame:
+    return Frame(row, modification, key.encode(), view)
+
+
+# ------------------------------------------------------------------------------------------------------------- surfaces
+
+
+def kinds_of(shape: dict[str, Any], near: float = 0.01, far: float = 100) -> np.ndarray:
+    """Of a rectangle at the origin, ±1 across, from 3 in front of it: it fills the middle and no corner."""
+    mi = backend.load(1)
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", **shape}}, optimize=False)
+    spec = plain(view={**plain().view.model_dump(mode="json"), "near": near, "far": far})
+    return surface_kinds(scene, View(np.array([0, 0, 3], np.float32), np.zeros(3, np.float32)), spec)
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ({"bsdf": DIFFUSE}, Surface.DIFFUSE),
+        ({"bsdf": {"type": "twosided", "bsdf": DIFFUSE}}, Surface.DIFFUSE),
+        ({"bsdf": {"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}}, Surface.DIFFUSE),
+        ({"bsdf": {"type": "plastic"}}, Surface.SPECULAR),
+        ({"bsdf": {"type": "roughplastic"}}, Surface.SPECULAR),
+        ({"bsdf": {"type": "roughconductor"}}, Surface.SPECULAR),
+        ({"bsdf": {"type": "roughdielectric"}}, Surface.SPECULAR),
+        ({"bsdf": {"type": "blendbsdf", "weight": 0.5, "a": DIFFUSE, "b": MIRROR}}, Surface.SPECULAR),
+        ({"bsdf": MIRROR}, Surface.MIRROR),
+        ({"bsdf": {"type": "twosided", "bsdf": MIRROR}}, Surface.MIRROR),
+        ({"bsdf": {"type": "dielectric"}}, Surface.MIRROR),
+        ({"bsdf": {"type": "thindielectric"}}, Surface.MIRROR),
+        ({"bsdf": {"type": "null"}}, Surface.MIRROR),
+        ({"bsdf": DIFFUSE, "emitter": SHINES}, Surface.EMITTER),
+        ({"bsdf": MIRROR, "emitter": SHINES}, Surface.EMITTER),
+    ],
+)
+def test_a_surface_has_the_kind_of_its_lobes_and_around_it_is_nothing(shape: dict[str, Any], kind: Surface) -> None:
+    kinds = kinds_of(shape)
+    assert kinds.dtype == np.uint8
+    assert (kinds[4:12, 4:12] == kind).all()
+    assert (kinds[[0, 0, -1, -1], [0, -1, 0, -1]] == Surface.NOTHING).all()
+
+
+@pytest.mark.parametrize("limits", [{"near": 3.1}, {"far": 2.9}])
+def test_what_the_planes_cut_off_is_nothing(limits: dict[str, float]) -> None:
+    assert (kinds_of({"bsdf": DIFFUSE}, **limits) == Surface.NOTHING).all()
+
+
+@pytest.mark.parametrize(
+    ("target", "kind"),
+    [
+        ((0.75, 0.9, -1.75), Surface.MIRROR),
+        ((-2.1, 0.89, -1.35), Surface.MIRROR),  # a ball of glass
+        ((1.2, 2.58, 0), Surface.EMITTER),
+        ((-2.6, 1.0, 1.2), Surface.SPECULAR),  # the lacquered door
+        ((1.55, 0.3, 1.65), Surface.SPECULAR),  # the copper vase
+        ((0.9, 0, 0.9), Surface.DIFFUSE),
+    ],
+)
+def test_the_room_shows_its_mirror_its_glass_its_lamps_and_its_lacquer(
+    room: LoadedScene, target: tuple[float, float, float], kind: Surface
+) -> None:
+    room.apply(rest(room.spec))
+    view = View(np.array([0.3, 1.7, 0.9], np.float32), np.array(target, np.float32))
+    kinds = surface_kinds(room.scene, view, room.spec)
+    assert kinds.shape == (16, 24)
+    assert kinds[8, 12] == kind
+
+
+# ------------------------------------------------------------------------------------------------------ fewer pixels
+
+
+@pytest.mark.parametrize(("k", "size"), [(1, (24, 16)), (3, (14, 9)), (4, (12, 8)), (16, (6, 4)), (1000, (1, 1))])
+def test_one_of_k_pixels_are_a_smaller_film_with_as_many_light_paths(
+    small: Callable[..., SceneSpec], k: int, size: tuple[int, int]
+) -> None:
+    spec = small(load_spec("room"))
+    part = part_of(spec, k)
+    assert (part.film.width, part.film.height) == size
+    assert part.transport.half_spp == spec.transport.half_spp
+    light_paths = part.transport.light_ratio * size[0] * size[1]
+    assert light_paths == (pytest.approx(24 * 16) if k < 64 else 64)
+
+
+def test_all_pixels_are_the_scenes_own_image_and_fewer_show_the_same(room: LoadedScene, somewhere: View) -> None:
+    room.apply(rest(room.spec))
+    whole = PartialFilm(room.spec, 1).render(room.scene, somewhere, 5)
+    np.testing.assert_array_equal(whole, room.render_half(somewhere, 5))
+    spec = room.spec.model_copy(update={"transport": room.spec.transport.model_copy(update={"half_spp": 256})})
+    few = PartialFilm(spec, 16)
+    assert few.pixels == 24
+    image = few.render(room.scene, somewhere, 6)
+    averaged = PartialFilm(spec, 1).render(room.scene, somewhere, 7).reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(image, averaged, rtol=0.25, atol=0.02)
+
+
+# ---------------------------------------------------------------------------------------------------------------- times
+
+
+def test_a_sixteenth_of_the_pixels_takes_less_than_half_the_time_of_all() -> None:
+    transport = {"light_ratio": 0, "connections": 0, "half_spp": 16}
+    spec = plain(film=128, transport=transport)
+    scene = LoadedScene.load(spec)
+    costs = frame_costs(scene, scene.base()[1], [frame(INTO_THE_BOX, rest(spec))], kept=[16, 1], timed=5)
+    times = costs.render_medians()
+    assert costs.pixels.tolist() == [1024, 16384]
+    assert 0 < times[16] < 0.5 * times[1]
+    for name in PARTS:
+        assert (getattr(costs, name) > 0).all() == ("photons" not in name), name
+    assert costs.medians()["photons_s"] == costs.medians()["photons_seen_s"] == 0  # a scene without
+
+
+def test_neighbouring_frames_differ_in_configuration(somewhere: View) -> None:
+    at_rest = rest(plain())
+    frames = [frame(somewhere, at_rest, key, row) for row, key in enumerate("AAABBC")]
+    assert [each.row for each in islice(in_turn(frames), 10)] == [0, 3, 5, 1, 4, 5, 2, 3, 5, 0]
+    assert all(one.key != other.key for one, other in pairwise(islice(in_turn(frames), 50)))
+
+
+@pytest.mark.parametrize("configurations", [1, 2])
+def test_every_timed_frame_comes_from_another_configuration(
+    room: LoadedScene, somewhere: View, monkeypatch: pytest.MonkeyPatch, configurations: int
+) -> None:
+    shifted = [rest(room.spec) for _ in range(configurations)]
+    for place, modification in enumerate(shifted):
+        modification.translation[0] = 0.1 * (1 + place)
+    frames = [frame(somewhere, each, str(place), place) for place, each in enumerate(shifted)]
+    applied: list[float] = []
+    monkeypatch.setattr(room, "apply", lambda modification: applied.append(float(modification.translation[0, 0])))
+    frame_costs(room, room.base()[1], frames, kept=[1], timed=2)
+    timed = applied[-(WARM_UPS + 2) * (3 - configurations) :]  # a single one is left for the scene at rest in between
+    assert timed == pytest.approx([0, 0.1] * 4 if configurations == 1 else [0.1, 0.2] * 2)
+
+
+def test_each_part_is_charged_with_its_own_seconds(
+    room: LoadedScene, somewhere: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloud, photons, clock = room.base()[1], room.photons(0), [0.0]
+
+    def takes(seconds: Callable[..., float], result: Callable[..., Any]) -> Callable[..., Any]:
+        def work(*arguments: Any) -> Any:
+            clock[0] += seconds(*arguments)
+            return result(*arguments)
+
+        return work
+
+    monkeypatch.setattr("photonfarm.renderer.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
+    monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
+    monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
+    monkeypatch.setattr(
+        room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones(len(points), bool))
+    )
+    monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: 0.5 * film.pixels, lambda *_: None))
+    costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
+    assert costs.medians() == {
+        "edit_s": 1, "buffers_s": 10, "points_s": 4096, "photons_s": 100, "photons_seen_s": 8192
+    }  # fmt: skip
+    assert costs.render_medians() == {4: 48, 1: 192}
+
+
+# ------------------------------------------------------------------------------------------------------------- the verb
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, small: Callable[..., SceneSpec]) -> Store:
+    """With four rows of the room: two views of each of two configurations."""
+    made = Store(tmp_path_factory.mktemp("rows") / "store", create=True)
+    request = Request(modifications=2, views_per_modification=2)
+    scene_id = made.plan(small(load_spec("room")), request, shard_rows=4).scene_id
+    ShardRenderer(made, worker="test").render(scene_id, 0)
+    return made
+
+
+def verb(store: Store, out: Path, *more: str, scene: str = "room") -> list[str]:
+    return ["--store", str(store.root), "--scene", scene, "--out", str(out / "costs.npz"), *more]
+
+
+def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, store: Store, room: LoadedScene) -> None:
+    before = sorted(Path(store.root).rglob("*"))
+    options = ["--rows", "3", "--rows", "0", "--kept", "1", "--kept", "4", "--timed", "3"]
+    result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options), catch_exceptions=False)
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'costs.npz'}: 2 rows, 3 timed frames\n")
+    assert "render_s 1/4 0." in result.stderr
+    costs = FrameCosts.read(tmp_path / "costs.npz")
+    assert costs.scene_id == room.spec.scene_id
+    assert (costs.rows.tolist(), costs.kept.tolist(), costs.pixels.tolist()) == ([3, 0], [1, 4], [384, 96])
+    assert all((getattr(costs, name) > 0).all() and getattr(costs, name).shape == (3,) for name in PARTS)
+    assert costs.render_s.shape == (2, 3)
+    assert (costs.render_s > 0).all()
+    reader = SceneReader(store.root, room.spec.scene_id)
+    reader.refresh()
+    for row, surface in zip((3, 0), costs.surface, strict=True):
+        modification, view, _ = reader.inputs(row)
+        room.apply(modification)
+        np.testing.assert_array_equal(surface, surface_kinds(room.scene, view, room.spec))
+    assert len(np.unique(costs.surface)) >= 3
+    assert sorted(Path(store.root).rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("scene", "rows", "message"),
+    [
+        ("room", ["2", "4"], r"^row 4 of scene \w+ is not complete; 4 of 4 planned rows are, which `"),
+        ("attic", ["0"], "no scene that 'attic' stands for"),
+    ],
+)
+def test_a_row_or_a_scene_that_is_not_there_is_named(
+    tmp_path: Path, store: Store, scene: str, rows: list[str], message: str
+) -> None:
+    options = [part for row in rows for part in ("--rows", row)]
+    result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options, scene=scene))
+    assert isinstance(result.exception, StoreError)
+    assert result.exception.exit_code == 4
+    assert re.search(message, str(result.exception))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_verb_needs_rows(tmp_path: Path, store: Store) -> None:
+    result = CliRunner().invoke(measure_frames, verb(store, tmp_path))
+    assert result.exit_code == 2
+    assert "Missing option '--rows'" in result.output

@@ -1,0 +1,99 @@
+"""What a frame costs, as a file."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.frame_costs import PARTS, FrameCosts, Surface
+
+
+def made() -> FrameCosts:
+    """Two rows of 3 × 4 pixels, three timed frames, images of all pixels and of a quarter."""
+    rng = np.random.default_rng(0)
+    surface = rng.integers(0, len(Surface), (2, 3, 4)).astype(np.uint8)
+    parts = dict(zip(PARTS, rng.random((len(PARTS), 3)), strict=True))
+    kept, pixels = np.array([1, 4]), np.array([12, 3])
+    return FrameCosts("abc", np.array([7, 3]), surface, **parts, kept=kept, pixels=pixels, render_s=rng.random((2, 3)))
+
+
+def test_costs_come_back_as_they_were_written(tmp_path: Path) -> None:
+    costs = made()
+    costs.write(tmp_path / "new/costs.npz")
+    again = FrameCosts.read(tmp_path / "new/costs.npz")
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["costs.npz"]
+    assert again.scene_id == "abc"
+    for field in fields(FrameCosts)[1:]:
+        written, read = getattr(costs, field.name), getattr(again, field.name)
+        np.testing.assert_array_equal(read, written, err_msg=field.name)
+        assert read.dtype == written.dtype, field.name
+
+
+def test_medians_are_over_the_timed_frames() -> None:
+    times = np.array([3.0, 1.0, 100.0])
+    parts = {name: times * 10**place for place, name in enumerate(PARTS)}
+    costs = replace(made(), **parts, render_s=np.array([[5.0, 4.0, 6.0], [0.2, 0.1, 9.0]]))
+    assert costs.medians() == {
+        "edit_s": 3, "buffers_s": 30, "points_s": 300, "photons_s": 3000, "photons_seen_s": 30000
+    }  # fmt: skip
+    assert costs.render_medians() == {1: 5, 4: 0.2}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"edit_s": np.ones(2)}, r"^buffers_s: is float64 \(3,\); float64 \(T\) is required, with .*'T': 2"),
+        ({"render_s": np.ones((3, 2))}, r"^render_s: is float64 \(3, 2\); float64 \(K, T\)"),
+        ({"surface": np.zeros((2, 3, 4), np.int64)}, r"^surface: is int64 \(2, 3, 4\); uint8 \(N, H, W\)"),
+        ({"surface": np.zeros((1, 3, 4), np.uint8)}, r"^surface: is uint8 \(1, 3, 4\); .*'N': 2"),
+        ({"surface": np.full((2, 3, 4), 5, np.uint8)}, "^surface: holds 5; kinds up to 4 are allowed"),
+        ({"kept": np.array([1])}, r"^pixels: is int64 \(2,\); int64 \(K\) is required, with .*'K': 1"),
+        ({**dict.fromkeys(PARTS, np.ones(0)), "render_s": np.ones((2, 0))}, "^T is 0; at least 1 of each is required"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused(change: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(made(), **change)
+
+
+def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
+    costs = made()
+    costs.write(tmp_path / "whole.npz")
+    whole = (tmp_path / "whole.npz").read_bytes()
+    (tmp_path / "text.npz").write_text("no archive")
+    (tmp_path / "cut.npz").write_bytes(whole[:-40])
+    number = whole.index(costs.render_s.tobytes())
+    (tmp_path / "changed.npz").write_bytes(whole[:number] + b"~" + whole[number + 1 :])
+    with np.load(tmp_path / "whole.npz") as stored:
+        arrays = dict(stored)
+    np.savez(tmp_path / "lacking.npz", **{name: arrays[name] for name in arrays if name != "pixels"})
+    np.savez(tmp_path / "unfit.npz", **{**arrays, "pixels": np.array([12])})
+    for name in ("text", "cut", "changed", "lacking", "unfit"):
+        wanted = f"{name}.npz: holds no frame costs that `photonfarm measure-frames` wrote$"
+        with pytest.raises(StoreError, match=wanted):
+            FrameCosts.read(tmp_path / f"{name}.npz")
+    with pytest.raises(StoreError, match=r"missing\.npz: there is no such file$"):
+        FrameCosts.read(tmp_path / "missing.npz")
+    with pytest.raises(StoreError, match="cannot write the frame costs"):
+        costs.write(tmp_path / "text.npz" / "below.npz")
+
+
+def test_no_damaged_byte_gives_another_error_or_other_numbers(tmp_path: Path) -> None:
+    """Bytes that tell nothing, such as dates, may change."""
+    costs = made()
+    file = tmp_path / "costs.npz"
+    costs.write(file)
+    whole = file.read_bytes()
+    refused = 0
+    for place in range(0, len(whole), 7):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            again = FrameCosts.read(file)
+        except StoreError:
+            refused += 1
+            continue
+        np.testing.assert_array_equal(again.render_s, costs.render_s)
+        np.testing.assert_array_equal(again.surface, costs.surface)
+    assert refused > len(whole) / 7 / 2

@@ -116,6 +116,7 @@ def evaluate(
 @samples_option
 @inception_option
 @device_option
+@click.option("--untimed", is_flag=True, help="Leave out the time of a frame, which asks for a quiet machine.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
 def report(
@@ -127,6 +128,7 @@ def report(
     most: int,
     inception: Path | None,
     device: str,
+    untimed: bool,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -141,7 +143,7 @@ def report(
     with _progress() as tell:
         figures = write_report(
             store, list(dict.fromkeys(runs)), out, denoisers=chosen, references=references, inception=inception,
-            most=most, device=device, tell=tell,
+            most=most, device=device, tell=tell, timed=not untimed,
         )  # fmt: skip
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 

@@ -33,6 +33,7 @@ def write_report(
     most: int = MOST_HELD_OUT,
     device: str = "auto",
     tell: Tell | None = None,
+    timed: bool = True,
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
 
@@ -42,7 +43,7 @@ def write_report(
     """
     contents = gathered(
         store, [TrainedRun.load(run) for run in runs], denoisers, references=references, inception=inception, most=most,
-        device=device, tell=tell,
+        device=device, tell=tell, timed=timed,
     )  # fmt: skip
     document, drawn = contents.document(), plots(contents)
     with store_errors("write the report", out):

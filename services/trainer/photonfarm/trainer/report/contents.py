@@ -48,6 +48,7 @@ class Contents:
     evaluation: Evaluation
     entries: tuple[Entry, ...]
     costs: FrameCosts | None
+    untimed: str  # why there are no costs
     worst: tuple[WorstCase, ...]
     published: str | None  # which of the paper's tables stands beside ours
 
@@ -85,15 +86,17 @@ def gathered(
     most: int = MOST_HELD_OUT,
     device: str = "auto",
     tell: Tell | None = None,
+    timed: bool = True,
 ) -> Contents:
-    """Measure everything. Raises what `evaluate.compare` raises, and PhotonfarmError where the renderer fails."""
+    """Measure everything, without the times of frames where they are not wanted. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     gauges = Gauges.of(store, first)
     samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
     rows = list(read_references(references, samples)) if references else samples.rows[:TIMED]
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    costs = measured_costs(store, first.scene_id, rows, kept)
+    measured = measured_costs(store, first.scene_id, rows, kept) if timed else "it was not asked for"
+    costs = None if isinstance(measured, str) else measured
     worst: list[WorstCase] = []
 
     def choose(images: Mapping[int, F32]) -> list[int]:
@@ -114,6 +117,7 @@ def gathered(
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
+        untimed=measured if isinstance(measured, str) else "",
         worst=tuple(worst),
         published=found[0] if found else None,
     )

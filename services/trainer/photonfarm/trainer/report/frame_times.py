@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from photonfarm.shared.errors import PhotonfarmError
 from photonfarm.shared.frame_costs import FrameCosts
 from photonfarm.shared.verbs import GROUP
 from photonfarm.trainer.trained import TrainedRun
@@ -41,13 +40,10 @@ class FrameTime:
         return self.render + self.buffers + self.points + self.photons + self.network
 
 
-def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int]) -> FrameCosts | None:
-    """What the renderer measures of the frames in some rows; None where it is not installed.
-
-    Raises PhotonfarmError, with its exit code, where it failed: what it said stands above.
-    """
+def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int]) -> FrameCosts | str:
+    """What the renderer measures of the frames in some rows; or why it does not: what it said stands on stderr."""
     if not entry_points(group=GROUP, name=VERB):
-        return None
+        return "the renderer, which makes buffers and photons, is not installed here"
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
@@ -55,9 +51,7 @@ def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: 
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
         verb = [sys.executable, "-m", "photonfarm.shared.cli", VERB, *asked]
         if code := subprocess.run(verb, stdout=subprocess.DEVNULL, check=False).returncode:
-            error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
-            error.exit_code = code
-            raise error
+            return f"`photonfarm {VERB}` ended with exit code {code} here"
         return FrameCosts.read(file)
 
 

@@ -98,7 +98,7 @@ def _paper(contents: Contents) -> Table:
 
 def _of_time(contents: Contents) -> str:
     if contents.costs is None:
-        return "time per frame: n/a, as the renderer, which makes buffers and photons, is not installed here"
+        return f"time per frame: n/a, as {contents.untimed}"
     frames = contents.costs.render_s.shape[1]
     return (
         "time per frame: rendering, buffers, points, photons and network, each on one core of this machine, medians "

@@ -34,6 +34,7 @@ def analytic_spec(
     described = {
         "name": "analytic",
         "content": "analytic",
+        "credits": {"title": "A closed form", "author": "Lambert & Sons", "licence": "CC0-1.0"},
         "scene": {"builtin": "cornell"},
         "exposure": exposure,
         "view": {"origin": box, "look_at": box, "fov_deg": 75, "near": 0.05, "far": 10},

@@ -4,19 +4,34 @@ import json
 import re
 import threading
 import time
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.frame_costs import PARTS, FrameCosts
 from photonfarm.shared.plan import Request
-from photonfarm.trainer.curve import Level, learning_curve
+from photonfarm.shared.store import Store, store_status
+from photonfarm.shared.store.find import Query
+from photonfarm.shared.store.merge import merge_views
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.loop import SETTINGS, train
-from photonfarm.trainer.report import write_report
+from photonfarm.trainer.report import write_report as report_of
+from photonfarm.trainer.report.frame_times import frame_time
+from photonfarm.trainer.report.published import MOVABLE_LIGHTS
+from photonfarm.trainer.report.trained_runs import short_names
 from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.untrained import Untrained
 from photonfarm.trainer.waits import bottleneck
+
+
+def write_report(store, run, out, **asked):
+    """Of one run, without the times of frames, unless told otherwise."""
+    return report_of(store, [run] if isinstance(run, Path) else run, out, timed=False, **asked)
 
 
 def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, run, tmp_path) -> None:
@@ -40,21 +55,25 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     figures = write_report(store, run, tmp_path / "out")
 
     assert json.loads((tmp_path / "out/report.json").read_text()) == figures
-    assert figures["samples_committed"] == figures["samples_planned"] == 40
-    assert figures["train_steps"] == outcome.step == 40
-    waited_s, total_s = figures["seconds"]["wait_data"], sum(figures["seconds"].values())
+    dataset, (of_run,) = figures["dataset"], figures["runs"]
+    assert dataset["samples_complete"] == dataset["samples_planned"] == 40
+    assert of_run["steps"] == outcome.step == 40
+    waited_s, total_s = of_run["seconds"]["wait_data"], sum(of_run["seconds"].values())
     assert 0.35 < waited_s < total_s, "of the first job, at least, there was nothing but to wait"
-    assert figures["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
-    assert figures["bottleneck"] == bottleneck(figures["waits"])
-    assert figures["samples_per_used"] == 1.0
-    assert figures["samples_per_core_second"] == pytest.approx(40 / (5 * 0.5))
-    assert figures["val_error_last"] < figures["val_error_first"]
-    assert figures["noise_floor"] > 0
-    assert figures["val_error_mean_colour"] > 0
-    assert figures["samples_held_out"] == 4 * figures["configurations_held_out"], "two views of two passes each"
+    assert of_run["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
+    assert of_run["bottleneck"] == bottleneck(of_run["waits"])
+    assert of_run["samples_per_used"] == 1.0
+    assert dataset["core_seconds_per_sample"] == pytest.approx(5 * 0.5 / 40)
+    (row,) = figures["evaluation"]["rows"]
+    assert row["linear_mse"]["mean"] < figures["untrained"]
+    assert figures["evaluation"]["noise_floor"] > 0
+    assert figures["mean_colour"] > 0
+    assert figures["evaluation"]["samples"] == 4 * figures["evaluation"]["units"], "two views of two passes each"
 
     page = (tmp_path / "out/report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4 * min(6, figures["samples_held_out"])
+    shown = min(4, figures["evaluation"]["units"])
+    assert page.count("data:image/png;base64,") == 3 * shown, "target, prediction and difference"
+    assert page.count("data:image/svg+xml;base64,") == 3, "curves over samples, rendering and everything"
     assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
     assert not re.search(r"\bnan\b", page)
     assert_balanced(page)
@@ -115,7 +134,8 @@ def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene,
     settings = json.loads((run / SETTINGS).read_text())
     (run / SETTINGS).write_text(json.dumps({**settings, "device": "cuda"}))
     write_report(store, run, tmp_path / "out")
-    assert json.loads((tmp_path / "out/report.json").read_text())["val_error_last_standard_error"] is None
+    (row,) = json.loads((tmp_path / "out/report.json").read_text())["evaluation"]["rows"]
+    assert row["linear_mse"]["standard_error"] is None
     assert "NaN" not in (tmp_path / "out/report.json").read_text()
     assert "(± –)" in (tmp_path / "out/report.html").read_text()
     (tmp_path / "file").write_text("")
@@ -123,24 +143,93 @@ def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene,
         write_report(store, run, tmp_path / "file")
 
 
-def test_a_learning_curve_names_its_axes_and_puts_smaller_errors_lower() -> None:
-    svg = learning_curve([(0, 1.0), (50, 0.1), (100, 0.02)], [Level("mean colour", 0.3, "#123456")], "training steps")
-    assert_balanced(svg)
-    assert ">training steps<" in svg
-    assert ">held-out squared error<" in svg
-    assert ">mean colour<" in svg
-    assert ">100<" in svg
-    assert ">0.1<" in svg
-    points = [tuple(map(float, p.split(","))) for p in re.search(r'points="([^"]*)"', svg)[1].split()]
-    assert points == sorted(points)
-    assert [y for _, y in points] == sorted(y for _, y in points)
+@pytest.fixture
+def measured(scene, commit, tiny, tmp_path):
+    """A store of 16 configurations of two passes, references of all views, and two runs."""
+    scene.plan(Request(modifications=16, passes=2), shard_rows=8)
+    for job in range(scene.jobs()):
+        commit(scene, job)
+    store, references = scene.folder.parent.parent, tmp_path / "references"
+    references.mkdir()
+    for key, merged in merge_views(scene, Query()):
+        merged.write(references / f"{key}.npz")
+    runs = []
+    for architecture in ("light_transport", "denoise_4"):
+        settings = tiny(max_steps=4, hold_out=0.4, network={"width": 4, "architecture": architecture})
+        train(StoreSource(store, scene.scene_id), settings, tmp_path / architecture)
+        runs.append(tmp_path / architecture)
+    return store, runs, references
 
 
-@pytest.mark.parametrize("points", [[(0, 1.0)], [(0, -0.1), (10, -0.2)], []])
-def test_a_learning_curve_is_drawn_of_few_or_negative_errors_too(points: list[tuple[float, float]]) -> None:
-    svg = learning_curve(points, [], "steps")
-    assert_balanced(svg)
-    assert "nan" not in svg
+def test_several_runs_and_denoisers_stand_beside_the_published_figures(measured, scene, tmp_path) -> None:
+    store, runs, references = measured
+    figures = write_report(store, runs, tmp_path / "out", references=references, denoisers=[("fill-in", 4)])
+    rows = {row["name"]: row for row in figures["evaluation"]["rows"]}
+    assert list(rows) == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert scene.spec.lights, "of movable lights, so that the paper's second table is the one beside ours"
+    assert figures["published_table"].startswith("Table 2")
+    assert rows["light_transport"]["published"] == asdict(MOVABLE_LIGHTS["light_transport"])
+    assert rows["fill-in 1/4"]["published"] is None
+    text = (tmp_path / "out/report.md").read_text()
+    lines = [line for line in text.splitlines() if line.startswith("| light_transport |")]
+    mse = rows["light_transport"]["metric_space"]["mse"]["estimate"]["mean"]
+    assert f"| {mse:.5f} (" in lines[0]
+    assert "| 0.0029 |" in lines[0]
+    for name in re.findall(r"\]\(([^)]+)\)", text):
+        assert (tmp_path / "out" / name).stat().st_size > 0, "what the Markdown shows lies beside it"
+    weights = rows["light_transport"]["metric_space"]["inception"]
+    assert (weights is None) or (weights["sha256"] in text)
+
+
+def test_the_dataset_s_card_says_whom_it_is_owed_to_and_how_it_was_made(measured, scene, tmp_path) -> None:
+    store, runs, references = measured
+    card = write_report(store, runs, tmp_path / "out", references=references)["dataset"]
+    assert card["credits"] == scene.spec.credits.model_dump()
+    assert [request["seed"] for request in card["requests"]] == [0]
+    assert (card["bytes"], card["core_seconds"]) == (store_status(Store(store))[0].size_bytes, scene.jobs() * 0.5)
+    assert card["versions"] == {"test": ["1"]}
+    page = (tmp_path / "out/report.html").read_text()
+    assert scene.spec.credits.author in page
+    assert scene.spec.credits.licence in page
+
+
+def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measured, tmp_path) -> None:
+    """The renderer does not know the analytic scene, and ends with an error."""
+    store, runs, _ = measured
+    figures = report_of(store, runs[:1], tmp_path / "out")
+    assert figures["evaluation"]["rows"][0]["frame_seconds"] is None
+    assert "`photonfarm measure-frames` ended with exit code" in (tmp_path / "out/report.md").read_text()
+
+
+def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measured) -> None:
+    _, (transport, denoiser), _ = measured
+    parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 0.2, 0.4, 0.8), strict=True)}
+    surface = np.zeros((1, 8, 8), np.uint8)
+    kept = np.array([1, 4])
+    costs = FrameCosts(
+        "0" * 32, np.array([3]), surface, **parts, kept=kept, pixels=64 // kept, render_s=np.array([[5.0], [2.0]])
+    )
+    assert frame_time(TrainedRun.load(transport), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
+    assert frame_time(TrainedRun.load(denoiser), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 2.0)
+    settings = TrainedRun.load(transport).settings
+    assert frame_time(Untrained("none", 1, settings), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
+    with_photons = replace(
+        TrainedRun.load(transport),
+        settings=settings.model_copy(
+            update={"network": settings.network.model_copy(update={"architecture": "light_transport_photons"})}
+        ),
+    )
+    assert frame_time(with_photons, 1.0, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
+
+
+def test_runs_are_called_by_what_tells_them_apart(measured) -> None:
+    _, (transport, denoiser), _ = measured
+    runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
+    assert short_names(runs) == ["light_transport", "denoise_4"]
+    again = replace(runs[0], folder=runs[0].folder.parent / "again")
+    assert short_names([runs[0], again]) == ["light_transport", "again"]
+    elsewhere = replace(runs[0], folder=Path("elsewhere/light_transport"))
+    assert short_names([runs[0], elsewhere]) == [str(runs[0].folder), "elsewhere/light_transport"]
 
 
 class _Balance(HTMLParser):

@@ -45,13 +45,14 @@ def write_report(
         store, [TrainedRun.load(run) for run in runs], denoisers, references=references, inception=inception, most=most,
         device=device, tell=tell, timed=timed,
     )  # fmt: skip
-    document, drawn = contents.document(), plots(contents)
+    text, drawn = json.dumps(contents.document(), indent=2, ensure_ascii=False), plots(contents)
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
         for plot in drawn:
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
-        (out / "report.json").write_text(json.dumps(document, indent=2, ensure_ascii=False) + "\n")
+        (out / "report.json").write_text(text + "\n")
         (out / "report.md").write_text(markdown(contents, drawn, COMPARISON))
         (out / "report.html").write_text(page(contents, drawn))
     write_png(comparison(contents.evaluation), out / COMPARISON)
+    document: dict[str, Any] = json.loads(text)
     return document

@@ -1,0 +1,99 @@
+"""Which views are named as the worst, and which pixels count as of one kind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from photonfarm.shared.frame_costs import Surface
+from photonfarm.shared.records import ViewBuffers
+from photonfarm.trainer.report.worst_cases import View, kinds, shadow_edges, squared_error, worst_cases
+
+SIZE = 16
+
+
+def view(row: int, error: float = 0.0, where: tuple[slice, slice] = (slice(None), slice(None)), **changes) -> View:
+    """A grey wall at distance 5 under even light, which the network shows too bright by `error` in some pixels."""
+    clean = np.full((SIZE, SIZE, 3), 0.25, np.float32)
+    image = clean.copy()
+    image[where] += error
+    normal = np.zeros((SIZE, SIZE, 3), np.float32)
+    normal[..., 2] = 1
+    buffers = ViewBuffers(np.full((SIZE, SIZE), 5.0, np.float32), np.full((SIZE, SIZE, 3), 0.5, np.float32), normal)
+    surface = np.full((SIZE, SIZE), Surface.DIFFUSE, np.uint8)
+    return replace(View(row, image, clean, clean.copy(), buffers, surface), **changes)
+
+
+def mirror(pixels: int) -> np.ndarray:
+    surface = np.full((SIZE, SIZE), Surface.DIFFUSE, np.uint8)
+    surface[:pixels] = Surface.MIRROR
+    return surface
+
+
+def test_the_view_is_named_in_which_the_pixels_of_a_kind_cost_most_together() -> None:
+    """A small mirror that is far off costs less than a large one that is off; what is wrong elsewhere is another's."""
+    views = [
+        view(1, 0.30, (slice(0, 1), slice(None)), surface=mirror(1)),
+        view(2, 0.20, (slice(0, 8), slice(None)), surface=mirror(8)),
+        view(3, 0.70, (slice(4, 16), slice(None)), surface=mirror(2)),
+    ]
+    found = {case.kind: case for case in worst_cases(views)}
+    assert found["mirrors and clear glass"].row == 2
+    assert found["mirrors and clear glass"].pixels == 0.5
+    assert found["mirrors and clear glass"].mse == pytest.approx((0.45 ** (1 / 2.2) - 0.25 ** (1 / 2.2)) ** 2, rel=1e-4)
+    assert found["all pixels"].row == 3
+
+
+def test_no_view_is_named_twice_and_a_kind_that_no_view_shows_is_not_named() -> None:
+    views = [view(1, 0.5, surface=mirror(8)), view(2, 0.1, surface=mirror(8))]
+    found = worst_cases(views)
+    assert [(case.kind, case.row) for case in found] == [("mirrors and clear glass", 1), ("all pixels", 2)]
+    assert worst_cases([]) == []
+
+
+def test_without_the_renderer_s_surfaces_the_other_kinds_are_found() -> None:
+    assert "mirrors and clear glass" not in dict(kinds(view(1, surface=None), close=1.0))
+    assert [case.kind for case in worst_cases([view(1, 0.3, surface=None)])] == ["all pixels"]
+
+
+def test_what_is_nearer_than_most_that_is_seen_is_close_to_the_camera() -> None:
+    near = view(1).buffers.depth.copy()
+    near[:2] = 0.5
+    near[15] = 0  # nothing is there
+    masks = dict(kinds(view(1, buffers=replace(view(1).buffers, depth=near)), close=1.0))
+    assert masks["close to the camera"].sum() == 2 * SIZE
+
+
+def test_the_noise_of_the_reference_is_no_error_on_average() -> None:
+    rng = np.random.default_rng(1)
+    clean = view(1)
+    noisy = [
+        replace(clean, half_a=a, half_b=b) for a, b in rng.uniform(0.2, 0.3, (400, 2, SIZE, SIZE, 3)).astype(np.float32)
+    ]
+    with_noise = np.mean([(squared_error(replace(v, half_b=v.half_a))).mean() for v in noisy])
+    without = np.array([squared_error(v).mean() for v in noisy])
+    assert with_noise > 1e-4
+    assert abs(without.mean()) < 4 * without.std() / 20 + 2e-6  # what is left is the display's curve
+
+
+@pytest.mark.parametrize(
+    ("what", "expected"),
+    [("nothing", 0), ("light", SIZE), ("texture", 0), ("edge", 0), ("corner", 0), ("mirror", 0)],
+)
+def test_a_step_of_light_is_a_shadow_s_edge_unless_something_else_steps_there(what: str, expected: int) -> None:
+    """Left half lit, right half in shadow; each time another buffer steps at the same place."""
+    wall = view(1)
+    buffers = {name: getattr(wall.buffers, name).copy() for name in ("depth", "albedo", "normal")}
+    shadow = np.full((SIZE, SIZE, 3), 0.4, np.float32)
+    shadow[:, 8:] = 0.1
+    if what == "texture":
+        buffers["albedo"][:, 8:] = 0.125
+    if what == "edge":
+        buffers["depth"][:, 8:] = 9
+    if what == "corner":
+        buffers["normal"][:, 8:] = (1, 0, 0)
+    if what == "mirror":
+        buffers["albedo"][:] = 0
+    image = wall.half_a if what == "nothing" else shadow
+    stepped = replace(wall, half_a=image, half_b=image, buffers=ViewBuffers(**buffers))
+    assert shadow_edges(stepped).sum() == expected

@@ -1,0 +1,122 @@
+"""The experiments' files, and the way through all stages of a tiny one."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+import experiment
+from experiment import Experiment, SizeName, merged, names
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.scene import SCENES_VARIABLE
+from stages import StageError, Stages
+
+ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
+EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]
+EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen"]
+
+
+def test_the_paper_s_experiments_are_all_there() -> None:
+    assert names() == EXPECTED
+
+
+@pytest.mark.parametrize("size", get_args(SizeName))
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) -> None:
+    found = Experiment.load(name, size)
+    runs = {run.name: run.train for run in found.trained()}
+    assert {"light_transport", "cnn"} <= set(runs)
+    losses = {settings["loss"] for settings in runs.values() if not settings["architecture"].startswith("denoise")}
+    assert len(losses) == 1, "networks of one table are trained alike"
+
+
+@pytest.mark.skipif(SCENES_VARIABLE not in os.environ, reason=f"{SCENES_VARIABLE} names no folder with the rooms")
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
+    spec, paper = (Experiment.load(name, size).spec() for size in ("small", "paper"))
+    assert spec.credits is not None
+    assert bool(spec.lights) == name.startswith("movable")
+    assert bool(spec.objects) != name.startswith("static")
+    size = 128 if name == "static-ablation" else 256
+    assert (paper.film.width, paper.film.height) == (size, size)
+
+
+def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
+    below: dict[str, Any] = {"a": {"b": 1, "c": {"d": 2}}, "lights": [1, 2], "e": 3}
+    assert merged(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
+        "a": {"b": 1, "c": {"d": 2, "f": 4}}, "lights": [], "e": 3,
+    }  # fmt: skip
+    assert below["a"]["c"] == {"d": 2}
+
+
+def test_an_unknown_experiment_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(SpecError, match="no such experiment; there are fixed-dining-room, "):
+        Experiment.load("kitchen-sink", "small")
+
+
+TINY = """
+title = "A tiny room"
+about = "For the test."
+scene = "room.toml"
+
+[small]
+"""
+SIZES = """
+[small]
+about = "tiny"
+changes = { film = { width = 16, height = 16 }, transport = { half_spp = 1 }, points = 256, photons = { paths = 64 } }
+modifications = 12
+views = 1
+seed = 0
+hold_out = 0.4
+references = { views = 2, spp = 4 }
+architectures = ["light_transport", "denoise_4"]
+untrained = ["fill-in"]
+kept = [4]
+
+[small.train]
+preset = "small"
+max_steps = 3
+width = 4
+points = 128
+loss = "paired"
+
+[small.train_denoisers]
+loss = "relative"
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
+    from photonfarm.shared.scene import find_spec
+
+    monkeypatch.setattr(experiment, "HERE", tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY)
+    (tmp_path / "sizes.toml").write_text(SIZES)
+    (tmp_path / "room.toml").write_text(find_spec("room").read_text())
+    return Experiment.load("tiny", "small")
+
+
+@pytest.mark.slow
+def test_all_stages_lead_to_a_report(tiny: Experiment, tmp_path: Path) -> None:
+    stages = Stages(tiny, tmp_path / "work", workers=2)
+    out = stages.run()
+    report = json.loads((out / "report.json").read_text())
+    rows = report["evaluation"]["rows"]
+    assert [row["name"] for row in rows] == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert report["evaluation"]["references"]["views"] == 2
+    assert report["evaluation"]["references"]["spp"] == 4
+    assert rows[1]["frame_seconds"]["render"] > 0
+    assert rows[0]["frame_seconds"]["render"] == 0
+    assert [run["steps"] for run in report["runs"]] == [3, 3]
+
+
+def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
+    stages = Stages(tiny, tmp_path / "work", workers=1)
+    stages.write_spec()
+    with pytest.raises(StageError, match=r"tiny: train-light_transport ended with exit code \d+; .*train-light_trans"):
+        stages.train()

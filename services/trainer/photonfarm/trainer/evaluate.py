@@ -36,8 +36,9 @@ from photonfarm.trainer.untrained import Untrained
 
 EVALUATION = "evaluation.json"
 
-Choose = Callable[[Mapping[int, F32]], Sequence[int]]
-"""Rows to show beside the first ones, given the first predictor's images (H, W, 3) of all that have references."""
+Choose = Callable[[Mapping[int, F32], Mapping[int, Merged]], Sequence[int]]
+"""Rows to show beside the first ones: of the first predictor's images (H, W, 3), and of the references that some have.
+"""
 
 Tell = Callable[[str, int, int], object]
 """Told of a predictor, by its name, on how many samples of how many it has been measured."""
@@ -151,7 +152,7 @@ def compare(
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
     leading = test.measured(first)
     if choose:
-        shown += [row for row in choose(leading.images) if row not in shown]
+        shown += [row for row in choose(leading.images, found) if row not in shown]
     others: list[TrainedRun | Untrained] = list(runs[1:])
     others += [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     rows = [leading.row(shown), *(test.measured(other).row(shown) for other in others)]

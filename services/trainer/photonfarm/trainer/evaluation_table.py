@@ -23,12 +23,12 @@ def told(evaluation: Evaluation) -> str:
 def notes(evaluation: Evaluation) -> list[str]:
     """What is to be known of the columns, a sentence each."""
     denoisers = any(row.kept is not None for row in evaluation.rows)
-    threads = f", {_counted(evaluation.threads, 'thread')}" if evaluation.device == "cpu" else ""
+    threads = f", {counted(evaluation.threads, 'thread')}" if evaluation.device == "cpu" else ""
     rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
     making = "reading, or rendering buffers and photons, is not in it"
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over the "
-        f"{_counted(evaluation.units, evaluation.unit)}",
+        f"{counted(evaluation.units, evaluation.unit)}",
         f"network: one image, the median of {TIMED_CALLS} warm calls on {evaluation.device}{threads}; {making}"
         f"{rendering if denoisers else ''}",
     ]
@@ -45,7 +45,7 @@ def _of_references(references: References, *, denoisers: bool) -> list[str]:
         else f"not converged, which takes {CONVERGED_SPP}: their noise is in the columns from MSSIM on; "
         "out of MSE it is taken by their halves, but for what the display's curve makes of it"
     )
-    views = _counted(references.views, "view")
+    views = counted(references.views, "view")
     found = [f"references: of {views}, of {references.spp} samples per pixel or more; {converged}"]
     if denoisers:
         found.append(
@@ -71,8 +71,8 @@ def _of_inception(metrics: ImageMetrics) -> list[str]:
 
 def _head(evaluation: Evaluation) -> str:
     return (
-        f"{evaluation.scene}: {_counted(evaluation.samples, 'held-out sample')} of "
-        f"{_counted(evaluation.units, evaluation.unit)}; noise of the targets {evaluation.noise_floor:.5f}"
+        f"{evaluation.scene}: {counted(evaluation.samples, 'held-out sample')} of "
+        f"{counted(evaluation.units, evaluation.unit)}; noise of the targets {evaluation.noise_floor:.5f}"
     )
 
 
@@ -105,5 +105,6 @@ def _interval(estimate: Estimate) -> str:
     return NOT_AVAILABLE if found is None else f"{found[0]:.5f} … {found[1]:.5f}"
 
 
-def _counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """A number of things, in words."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

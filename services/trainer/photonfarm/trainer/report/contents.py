@@ -11,9 +11,9 @@ import numpy as np
 
 from photonfarm.shared.frame_costs import FrameCosts
 from photonfarm.shared.records import F32, ViewBuffers, arrays_of
+from photonfarm.shared.store.merge import Merged
 from photonfarm.trainer import evaluate
 from photonfarm.trainer.evaluate import Evaluation, Row, Tell
-from photonfarm.trainer.evaluation_samples import Samples, read_references
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs
 from photonfarm.trainer.report.gauges import Gauges
@@ -24,8 +24,6 @@ from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 from photonfarm.trainer.untrained import Untrained
-
-TIMED = 9  # frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,22 +90,13 @@ def gathered(
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     gauges = Gauges.of(store, first)
-    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
-    rows = list(read_references(references, samples)) if references else samples.rows[:TIMED]
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    measured = measured_costs(store, first.scene_id, rows, kept) if timed else "it was not asked for"
-    costs = None if isinstance(measured, str) else measured
-    worst: list[WorstCase] = []
-
-    def choose(images: Mapping[int, F32]) -> list[int]:
-        if references:
-            worst.extend(worst_cases(_views(samples, references, images, costs)))
-        return [case.row for case in worst]
-
+    close_look = _CloseLook(store, first.scene_id, kept, timed=timed)
     evaluation = evaluate.compare(
         store, runs, denoisers, references=references, inception=inception, most=most, device=device, tell=tell,
-        choose=choose,
+        choose=close_look,
     )  # fmt: skip
+    costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
     return Contents(
@@ -117,8 +106,8 @@ def gathered(
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
-        untimed=measured if isinstance(measured, str) else "",
-        worst=tuple(worst),
+        untimed=close_look.untimed,
+        worst=tuple(close_look.worst),
         published=found[0] if found else None,
     )
 
@@ -141,16 +130,36 @@ def _entries(
     return entries
 
 
-def _views(samples: Samples, folder: Path, images: Mapping[int, F32], costs: FrameCosts | None) -> list[View]:
-    """The views that have references, with the images that the first network made of them."""
-    exposure = np.float32(samples.source.spec.exposure)
-    surfaces = {} if costs is None else dict(zip(costs.rows.tolist(), costs.surface, strict=True))
-    views = []
-    for row, reference in read_references(folder, samples).items():
-        if row not in images:
-            continue
-        (sample,) = samples.source.read_batch([row])
-        buffers = ViewBuffers(**{name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()})
-        a, b = (exposure * half.astype(np.float32) for half in (reference.half_a, reference.half_b))
-        views.append(View(row, images[row], a, b, buffers, surfaces.get(row)))
-    return views
+class _CloseLook:
+    """What is measured of single frames once the first network has made its images: their costs, and the worst cases.
+
+    Called as `evaluate.Choose`, it names the worst cases' rows.
+    """
+
+    def __init__(self, store: str | Path, scene_id: str, kept: Sequence[int], *, timed: bool) -> None:
+        self._store, self._scene_id, self._kept, self._timed = store, scene_id, kept, timed
+        self.costs: FrameCosts | None = None
+        self.untimed = "it was not asked for"
+        self.worst: list[WorstCase] = []
+
+    def __call__(self, images: Mapping[int, F32], references: Mapping[int, Merged]) -> list[int]:
+        if self._timed:
+            found = measured_costs(self._store, self._scene_id, list(references or images), self._kept)
+            self.costs, self.untimed = (None, found) if isinstance(found, str) else (found, "")
+        self.worst = worst_cases(self._views(images, references))
+        return [case.row for case in self.worst]
+
+    def _views(self, images: Mapping[int, F32], references: Mapping[int, Merged]) -> list[View]:
+        """The views that have references, with the images that the first network made of them."""
+        source = StoreSource(self._store, self._scene_id)
+        source.refresh()
+        exposure = np.float32(source.spec.exposure)
+        surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
+        views = []
+        for row in references.keys() & images.keys():
+            (sample,) = source.read_batch([row])
+            read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
+            halves = (references[row].half_a, references[row].half_b)
+            a, b = (exposure * half.astype(np.float32) for half in halves)
+            views.append(View(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
+        return sorted(views, key=lambda view: view.row)

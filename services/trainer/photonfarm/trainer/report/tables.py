@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from photonfarm.shared.estimate import Estimate
-from photonfarm.trainer.evaluation_table import notes
+from photonfarm.trainer.evaluation_table import counted, notes
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Contents, Entry
@@ -50,7 +50,7 @@ def facts(contents: Contents) -> list[tuple[str, str]]:
         ("cost", f"{status.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample; "
                  f"{status.redrawn} renders drawn again, as they were not finite"),
         ("size", f"{status.size_bytes / 1e6:.1f} MB"),
-        ("rendered by", f"{card.workers} workers with " + _versions(card.versions)),
+        ("rendered by", f"{counted(card.workers, 'worker')} with " + _versions(card.versions)),
     ]  # fmt: skip
 
 

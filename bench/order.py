@@ -27,7 +27,7 @@ import results
 import room_study
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene import SceneSpec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer.metrics import flip, metric_space, mssim
@@ -297,7 +297,7 @@ def main() -> int:
     told = options().parse_args()
     torch.set_num_threads(1)
     folder, store = room_study.opened(told, str(told.configurations))
-    render(spec := room_study.room(), store, told)
+    render(spec := load_spec("room"), store, told)
     references = References.of(store, spec, told.reference_spp)
     measured = [measure(name, (folder, spec), references, told) for name in ARCHITECTURES]
     unlearned = photon_map((folder, spec), references, told)

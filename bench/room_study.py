@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 ROOT = Path(__file__).parents[1]
+EXPERIMENTS = ROOT / "experiments"
 CODE = ("services/trainer", "shared")  # what a trained network follows from, beside its settings and samples
 SHARD_ROWS = 64
 HELD_OUT = 1 / 16
@@ -60,11 +61,17 @@ def tell(line: str) -> None:
     print(f"{time.strftime('%H:%M:%S')} {line}", file=sys.stderr, flush=True)
 
 
-def room(half_spp: int | None = None) -> SceneSpec:
-    """The built-in room, with so many samples per pixel in a half-estimate if they are told."""
-    spec = load_spec("room")
-    if half_spp is None:
-        return spec
+def named_room(name: str) -> SceneSpec:
+    """A built-in spec, or the scene of an experiment in its small size; raises SpecError for any other name."""
+    if str(EXPERIMENTS) not in sys.path:
+        sys.path.insert(0, str(EXPERIMENTS))
+    from experiment import Experiment, names
+
+    return Experiment.load(name, "small").spec() if name in names() else load_spec(name)
+
+
+def in_passes(spec: SceneSpec, half_spp: int) -> SceneSpec:
+    """The scene with so many samples per pixel in a half-estimate."""
     return spec.model_copy(update={"transport": spec.transport.model_copy(update={"half_spp": half_spp})})
 
 
@@ -79,17 +86,6 @@ def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp]) -
     for job in (missing := scene.missing_jobs()):
         renderer.render(spec.scene_id, job)
         tell(f"rendered job {job} of {missing[-1]}")
-
-
-def ms_of_plans(store: Store, spec: SceneSpec) -> list[float]:
-    """CPU milliseconds that a sample of each plan took to render."""
-    scene = store.scene(spec.scene_id)
-    found = []
-    for plan in scene.plans():
-        jobs = range(plan.first_job, plan.end_job)
-        samples = sum(len(scene.job_rows(job).samples) for job in jobs)
-        found.append(1e3 * sum(scene.marker(job)["figures"]["core_s"] for job in jobs) / samples)
-    return found
 
 
 # ----------------------------------------------------------------------------------------------------------- training

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import order
-import room_study
 from order import ARCHITECTURES, METRICS, Measured
+from photonfarm.shared.scene import load_spec
 from room_study import Errors, References
 
 VIEWS, SIZE = 12, 16
@@ -54,7 +54,7 @@ def test_the_page_and_its_figures_and_the_picture_are_made(seeds: list[int]) -> 
     references, found = References(tuple(range(VIEWS)), UNITS, halves, 256), measured((0.4, 0.3, 0.2, 0.1))
     told = order.options().parse_args(["--seeds", *map(str, seeds)])
     unlearned = errors(0.5, 8), errors(0.25, 9)
-    page = order.page(told, room_study.room(), references, found, unlearned)
+    page = order.page(told, load_spec("room"), references, found, unlearned)
     assert all(page.count(f"`{name}`") >= 2 for name in ARCHITECTURES)
     assert f"measured on {VIEWS} views of {VIEWS} further configurations" in page
     assert all(f"By {metric}:" in page for metric in METRICS)

@@ -11,17 +11,17 @@ import pytest
 from analytic_scene import small_spec
 from numpy.typing import NDArray
 
-import noise_budget
-from noise_budget import Arm, slices_of
+from budget_arms import HALF_SPP, Arm, Share, requests
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.store import Store
+from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.store_source import StoreSource
-from room_study import Errors, References
+from room_study import HELD_OUT, Errors, References
 from store_contents import Pool, commit
 
-SIZE, SLOTS, BUDGET = 8, 8, 16
+SIZE, SLOTS = 8, 8
 Root = tuple[Path, str]
 
 
@@ -40,12 +40,13 @@ def pool() -> Pool:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
-    """Samples of a budget of 16 spp for two seeds: passes of 2 spp, 8 of the first views, then 2, then 1."""
+    """Passes of 2 spp: 8 of one view of the first configurations, 2 of two views of more, 1 of one view of the most."""
     store = Store(tmp_path_factory.mktemp("study") / "store", create=True)
-    spec = small_spec(film={"width": SIZE, "height": SIZE}, transport={"half_spp": noise_budget.HALF_SPP})
+    spec = small_spec(film={"width": SIZE, "height": SIZE}, transport={"half_spp": HALF_SPP})
     scene = store.add(spec)
-    for modifications, passes in ((8, 8), (20, 2), (40, 1)):
-        scene.plan(Request(modifications=modifications, passes=passes), shard_rows=16)
+    for modifications, views, passes in ((8, 1, 8), (20, 2, 2), (40, 1, 1)):
+        request = Request(modifications=modifications, views_per_modification=views, passes=passes)
+        scene.plan(request, shard_rows=16)
     for job in scene.missing_jobs():
         commit(scene, job, pool())
     return Path(store.root), spec.scene_id
@@ -55,9 +56,9 @@ def configurations(arm: Arm) -> set[bytes]:
     return set(arm.modification_keys(arm.rows))
 
 
-@pytest.mark.parametrize("spp", [4, 16])
+@pytest.mark.parametrize("spp", [2, 4, 16])
 def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
-    arm, source = Arm(*root, spp, BUDGET), StoreSource(*root)
+    arm, source = Arm(*root, Share(spp, 1, 1), 4), StoreSource(*root)
     complete = source.refresh().tolist()
     (key,) = arm.view_keys(arm.rows[:1])
     passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
@@ -69,34 +70,50 @@ def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: 
     np.testing.assert_allclose(sample.radiance.astype(np.float64) * sample.scale, expected, rtol=1e-6)
 
 
-def test_a_sample_of_one_spp_is_half_a_twice(root: Root) -> None:
-    arm, source = Arm(*root, 1, BUDGET), StoreSource(*root)
-    source.refresh()
-    (sample,), (read,) = arm.read_batch(arm.rows[:1]), source.read_batch(arm.rows[:1])
-    half_a = read.radiance[0].astype(np.float32) * read.scale
+def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view(root: Root) -> None:
+    arm = Arm(*root, Share(2, 2, 2), 5)
+    assert len(configurations(arm)) == 5
+    assert len(set(arm.view_keys(arm.rows))) == 10
+    assert len(arm.rows) == len(set(arm.rows)) == 20
+    first, second = (arm.read_batch([row])[0].radiance.copy() for row in arm.rows[:2])
+    assert arm.view_keys(arm.rows[:1]) == arm.view_keys(arm.rows[1:2])
+    assert np.any(first != second), "two passes of one view"
 
-    np.testing.assert_array_equal(sample.radiance * sample.scale, np.stack([half_a, half_a]))
-    assert np.any(read.radiance[0] != read.radiance[1])
+
+def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) -> None:
+    arm = Arm(*root, Share(2, 1, 1), 30)
+    assert not any(rows_held_out(arm, arm.rows, HELD_OUT))
+    new = arm.refresh().tolist()
+    assert new[:-1] == arm.rows
+    assert rows_held_out(arm, new[-1:], HELD_OUT) == [True], "one for the trainer to look at"
+    assert not len(arm.refresh())
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root: Root, number: int) -> None:
-    arms = [Arm(*root, spp, BUDGET, (number % slices_of(spp, 2), slices_of(spp, 2))) for spp in (1, 4, 16)]
+    arms = [Arm(*root, Share(spp, 1, 1), count, (number, 2)) for spp, count in ((2, 16), (4, 8), (16, 3))]
     noisy, medium, clean = map(configurations, arms)
 
-    assert [len(noisy), len(medium), len(clean)] == [16, 4, 1]
+    assert [len(noisy), len(medium), len(clean)] == [16, 8, 3]
     assert clean < medium < noisy
 
 
 def test_slices_share_no_configuration(root: Root) -> None:
-    first, second = (configurations(Arm(*root, 4, BUDGET, (number, 2))) for number in (0, 1))
-    assert len(first) == len(second) == 4
+    first, second = (configurations(Arm(*root, Share(4, 1, 1), 8, (number, 2))) for number in (0, 1))
+    assert len(first) == len(second) == 8
     assert not first & second
 
 
-def test_an_arm_of_more_samples_than_there_are_is_refused(root: Root) -> None:
-    with pytest.raises(ValueError, match="views have 8 passes, and 64 are needed"):
-        Arm(*root, 16, 64 * 16)
+def test_an_arm_of_more_configurations_than_there_are_is_refused(root: Root) -> None:
+    with pytest.raises(ValueError, match="configurations have 1 views of 8 passes, and 64 are needed"):
+        Arm(*root, Share(16, 1, 1), 64)
+
+
+def test_what_is_rendered_is_enough_for_every_share_and_slice() -> None:
+    shares = {Share(2, 1, 1): 40, Share(8, 4, 1): 5, Share(2, 1, 4): 10}
+    asked = requests(shares, slices=2, seed=1)
+    assert [(r.views_per_modification, r.passes) for r in asked] == [(4, 4), (1, 4), (1, 1)]
+    assert all(r.modifications > 2 * count for r, count in zip(asked, (5, 10, 40), strict=True))
 
 
 # ------------------------------------------------------------------------------------------------------------- errors

@@ -1,10 +1,11 @@
-"""Processes that end with the one that started them, and where the number of one means something."""
+"""Processes that end with the one that started them or when asked to, and where the number of one means something."""
 
 from __future__ import annotations
 
 import os
 import socket
 import sys
+import time
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -22,6 +23,35 @@ os.execv(sys.argv[2], sys.argv[2:])
 def tied(command: Sequence[str]) -> list[str]:
     """The command, to be started by the main thread: on Linux it gets SIGTERM when we end, however we do."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
+
+
+NAP_S = 0.1  # at the longest, until a `Stop` is noticed
+
+
+class Stop:
+    """Set by a signal's handler: `threading.Event` without its lock.
+
+    A handler interrupts the main thread anywhere, in another handler too. If that holds the event's lock, in `set` or
+    at the beginning of `wait`, the handler's `set` waits for ever.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self) -> None:
+        """Ask to stop."""
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        """Whether somebody has."""
+        return self._is_set
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for it so long at most; whether somebody has asked."""
+        end = time.monotonic() + seconds
+        while not self._is_set and (left := end - time.monotonic()) > 0:
+            time.sleep(min(left, NAP_S))
+        return self._is_set
 
 
 @cache

@@ -19,7 +19,7 @@ from photonfarm.renderer.worker_settings import GRACE_S, JOB_IN_HAND, RECYCLED, 
 from photonfarm.renderer.worker_talk import Tally
 from photonfarm.shared import queue
 from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.processes import process_space
+from photonfarm.shared.processes import Stop, process_space
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.find import scene_named
 from photonfarm.shared.store.storage import is_vacant
@@ -68,7 +68,7 @@ class Supervisor:
         self._settings = settings
         self._command = command
         self._say = say
-        self._stop = threading.Event()
+        self._stop = Stop()
         self._child: subprocess.Popen[bytes] | None = None
         self._tally = Tally()
 

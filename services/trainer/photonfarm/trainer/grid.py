@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -23,6 +22,7 @@ from pydantic import ValidationError
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.estimate import Estimate, group_means, stated
 from photonfarm.shared.keys import Key, make_key
+from photonfarm.shared.processes import Stop
 from photonfarm.shared.scene import sentences
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer.dataset import SampleSource, rows_held_out, units_of
@@ -81,7 +81,7 @@ def run_grid(
     folder: Path,
     axes: Axes = AXES,
     *,
-    stop: threading.Event | None = None,
+    stop: Stop | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> list[Cell]:
     """Train and measure every cell; returns those that are finished, all that the axes make unless `stop` was set.
@@ -93,7 +93,7 @@ def run_grid(
     out; SpecError for an axis that the settings do not have, and for a folder that holds a grid over other samples or
     settings; what a run raises, besides DivergedError.
     """
-    stop = stop or threading.Event()
+    stop = stop or Stop()
     wanted = _cells(settings, axes)
     equal = {key: value for key, value in settings.model_dump(mode="json").items() if key not in axes}
     about = {**_about(make_source(), settings), "settings": equal}
@@ -173,7 +173,7 @@ def _run_cell(
     settings: TrainSettings,
     changes: dict[str, Any],
     run: Path,
-    stop: threading.Event,
+    stop: Stop,
 ) -> Cell | None:
     """Train a cell to its end and measure it; None if it was stopped before."""
     try:

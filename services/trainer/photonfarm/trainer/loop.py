@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ import torch
 from pydantic import ValidationError
 
 from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.processes import Stop
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import sentences
 from photonfarm.shared.store import store_errors
@@ -55,9 +55,9 @@ class Outcome:
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGTERM and SIGINT set, for `train`; for the main thread of a process."""
-    stop = threading.Event()
+def stop_on_signals() -> Iterator[Stop]:
+    """What SIGTERM and SIGINT set, for `train`; for the main thread of a process."""
+    stop = Stop()
     names = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(name, lambda *_: stop.set()) for name in names]
     try:
@@ -73,7 +73,7 @@ class Surroundings:
 
     run: Path
     watch: Stopwatch
-    stop: threading.Event
+    stop: Stop
     group: Group
     script: Growth | None
     listen: Callable[[dict[str, Any]], object] | None
@@ -86,7 +86,7 @@ def train(
     settings: TrainSettings,
     run: Path,
     *,
-    stop: threading.Event | None = None,
+    stop: Stop | None = None,
     clock: Callable[[], float] = time.monotonic,
     script: Growth | None = None,
     listen: Callable[[dict[str, Any]], object] | None = None,
@@ -108,7 +108,7 @@ def train(
     """
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
-    stop, watch = stop or threading.Event(), Stopwatch(clock, "wait_data", waited)
+    stop, watch = stop or Stop(), Stopwatch(clock, "wait_data", waited)
     with held(run):
         while not source.ready():
             if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):

@@ -17,6 +17,7 @@ from redis import Redis, RedisError
 
 from photonfarm.shared.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.estimate import stated
+from photonfarm.shared.processes import Stop
 from photonfarm.shared.scene import load_spec, sentences
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.storage import is_vacant
@@ -71,7 +72,7 @@ def _lead(
     folder: Path,
     settings: TrainSettings,
     redis_url: str | None,
-    stop: threading.Event,
+    stop: Stop,
     group: Group,
 ) -> None:
     """Train as the only process or as rank 0: it waits for a scene, tells, and leaves event files for TensorBoard."""
@@ -208,7 +209,7 @@ def _only_scene(store: str | Path) -> str | None:
     return ids[0] if ids else None
 
 
-def _wait(look: Callable[[], T | None], stop: threading.Event, seconds: float) -> T | None:
+def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
     """What `look` finds at last; None once told to stop, or after so many seconds."""
     end = time.monotonic() + seconds
     while (found := look()) is None:

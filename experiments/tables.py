@@ -51,6 +51,16 @@ class Room:
         """Those of its evaluation, by name."""
         return {row["name"]: row for row in self.report["evaluation"]["rows"]}
 
+    def document(self) -> dict[str, Any]:
+        """What tables.json keeps of it."""
+        evaluation = self.report["evaluation"]
+        kept = {key: evaluation[key] for key in ("samples", "units", "noise_floor", "references", "device", "threads")}
+        runs = {
+            run["name"]: {key: run[key] for key in ("parameters", "steps", "seconds")} for run in self.report["runs"]
+        }
+        rows = {name: _compact(row) for name, row in self.rows.items()}
+        return {"dataset": self.report["dataset"], "evaluation": kept, "runs": runs, "rows": rows}
+
     def metric(self, architecture: str, metric: str, block: int | None = None) -> Estimate:
         """Mean and standard error of a metric that each image has."""
         found = self.rows[architecture]["metric_space"][metric]
@@ -61,6 +71,20 @@ class Room:
         """By how much the first's MSE is above the second's, in pairs of views; each view is a configuration."""
         values = [np.array(self.rows[name]["metric_space"]["mse"]["values"]) for name in (first, second)]
         return Estimate.of(values[0] - values[1])
+
+
+def _compact(row: dict[str, Any]) -> dict[str, Any]:
+    """Time, mean and interval of each metric, and the MSE of each image."""
+    shown, linear = row["metric_space"], row["linear_mse"]
+    metrics = {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
+    metrics |= {f"feature_l1_{block}": of["estimate"] for block, of in enumerate(shown["feature_l1"] or ())}
+    metrics |= {key: shown[key] for key in ("fid", "kid", "inception")}
+    return {
+        "frame_seconds": row["frame_seconds"],
+        "linear_mse": {key: linear[key] for key in ("mean", "standard_error", "count")},
+        "mse_of_images": [round(value, 6) for value in shown["mse"]["values"]],
+        **metrics,
+    }
 
 
 def mean(estimates: Sequence[Estimate]) -> Estimate:
@@ -204,8 +228,8 @@ def main() -> int:
         print(f"{told.work / told.size}: holds no report; `make experiments-{told.size}` makes them", file=sys.stderr)
         return IncompleteError.exit_code
     about = {name: Experiment.load(name, told.size).about.strip() for name in (room.name for room in found)}
-    values = {"size": told.size, "rooms": {room.name: {"about": about[room.name], **room.report} for room in found}}
-    results.write("tables", page(found, told.size), values, told.out)
+    rooms = {room.name: {"about": about[room.name], **room.document()} for room in found}
+    results.write("tables", page(found, told.size), {"size": told.size, "rooms": rooms}, told.out)
     return 0
 
 

@@ -79,7 +79,14 @@ def _versions(versions: dict[str, list[str]]) -> str:
 def _paper(contents: Contents) -> Table:
     """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; published figures beside ours, where there are."""
     beside = contents.published is not None
-    columns = ("time per frame, ms", "× light transport", "MSE (95 %)", "MSSIM (95 %)", "FID", "Feature L1 (95 %)")
+    columns = (
+        "time per frame, ms",
+        f"× {contents.measure.name}",
+        "MSE (95 %)",
+        "MSSIM (95 %)",
+        "FID",
+        "Feature L1 (95 %)",
+    )
     head = ["architecture"]
     for column in columns:
         head.append(column)

@@ -120,7 +120,7 @@ def opened(told: argparse.Namespace, size: str) -> tuple[Path, Store]:
     return folder, Store(folder / "store", create=True)
 
 
-def settings_of(architecture: str, seed: int, told: argparse.Namespace) -> TrainSettings:
+def settings_of(architecture: str, seed: int, told: argparse.Namespace, hold_out: float = HELD_OUT) -> TrainSettings:
     """Equal in all but the architecture and the seed."""
     network = {
         "architecture": architecture, "precision": told.precision, "demodulation": told.demodulation or None,
@@ -128,7 +128,7 @@ def settings_of(architecture: str, seed: int, told: argparse.Namespace) -> Train
     }  # fmt: skip
     return preset(
         "small", network=network, seed=seed, loss=told.loss, batch=told.batch, learning_rate=told.rate,
-        decay=told.decay, max_steps=told.steps, hold_out=HELD_OUT, validate_every=told.steps, validation_samples=1,
+        decay=told.decay, max_steps=told.steps, hold_out=hold_out, validate_every=told.steps, validation_samples=1,
         minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
 
@@ -191,11 +191,11 @@ class References:
     spp: int  # of both halves together, of the view that has fewest
 
     @classmethod
-    def of(cls, store: Store, spec: SceneSpec, spp: int) -> References:
-        """Those of held-out configurations that have `spp` at least."""
+    def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> References:
+        """Those of held-out configurations that have `spp` at least; `share` of all are held out."""
         reader, source = SceneReader(store.root, spec.scene_id), StoreSource(store.root, spec.scene_id)
         reader.refresh()
-        first = {reader.view_row(row): row for row in reversed(Samples.of(source, HELD_OUT, sys.maxsize).rows)}
+        first = {reader.view_row(row): row for row in reversed(Samples.of(source, share, sys.maxsize).rows)}
         passes = {view: len(reader.rows_of_view(view)) for view in sorted(first)}
         enough = [view for view, count in passes.items() if 2 * spec.transport.half_spp * count >= spp]
         merged = {first[view]: merge_view(reader, view) for view in enough}

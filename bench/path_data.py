@@ -1,0 +1,230 @@
+#!/usr/bin/env python3
+"""Training data made by `bdpt` against data made by Mitsuba's `path`, at equal core-seconds of rendering.
+
+    python bench/path_data.py [--experiment fixed-veach-ajar] [--samples 400] [--steps 2000] [--seeds 0 1]
+                              [--processes 2] [--out docs/results]
+
+Takes the room of an experiment of experiments/, times both integrators, and renders a store of each kind whose
+samples cost the same; PHOTONFARM_SCENES names the folder of its scene files. `light_transport` is trained alike on
+the first samples of either store, for budgets of a quarter to 1 of `bdpt` and of a quarter to 4 of `path`, and
+measured on held-out views. Leaves docs/results/path_data.{md,json,png}; what is rendered and trained stays in
+build/path_data, and the next call goes on with it. Times are best taken on a quiet machine; the first call settles
+what a sample of `path` is. Exit code 0, whatever comes out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import path_data_page
+import path_scene
+import results
+import room_study
+from path_data_study import BLOCK, Arm, Measured, Study, Targets
+from path_scene import Rendered
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import F32
+from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.top_up import TopUp
+from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.trained import TrainedRun
+from room_study import ROOT, Errors, References
+
+BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
+ARCHITECTURE = "light_transport"
+HELD_OUT = 1 / 8  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples
+PICTURE = "path_data.png"
+
+
+class FirstSamples(StoreSource):
+    """The first so many samples of a store that are not held out: those of fewer are among those of more."""
+
+    def __init__(self, root: Path, scene_id: str, samples: int) -> None:
+        """Raises ValueError where the store has too few."""
+        super().__init__(root, scene_id)
+        complete = super().refresh().tolist()
+        held_out = rows_held_out(self, complete, HELD_OUT)
+        trained_on = [row for row, held in zip(complete, held_out, strict=True) if not held]
+        self.rows = trained_on[:samples]
+        self._new = [*self.rows, *[row for row, held in zip(complete, held_out, strict=True) if held][:1]]
+        if len(self.rows) < samples:
+            raise ValueError(f"{root} has {len(trained_on)} samples to train on, and {samples} are needed")
+
+    def refresh(self) -> NDArray[np.int64]:
+        """The chosen samples at the first call, and one that is held out, as a trainer wants one to look at."""
+        new, self._new = self._new, []
+        return np.array(new, np.int64)
+
+    def taken_back(self) -> NDArray[np.int64]:
+        """None is."""
+        return np.empty(0, np.int64)
+
+    def planned(self) -> int:
+        """As many as were chosen."""
+        return len(self.rows) + 1
+
+
+def spec_of(told: argparse.Namespace) -> SceneSpec:
+    """The spec of an experiment; raises SpecError where there is none, or none of its scene file."""
+    sys.path.append(str(ROOT / "experiments"))
+    from experiment import Experiment
+
+    return Experiment.load(told.experiment, told.size).spec()
+
+
+def requests(told: argparse.Namespace) -> dict[str, list[Request | TopUp]]:
+    """A fifth of configurations more than are trained on, as an eighth of all is held out.
+
+    Both stores begin with the same plan, so that their first samples are of the same views.
+    """
+
+    def configurations(share: float) -> Request:
+        samples = round(share * told.samples)
+        return Request(modifications=samples + samples // 5 + 8, seed=told.plan_seed)
+
+    first, most = (configurations(shares[-1]) for shares in BUDGETS.values())
+    return {
+        "bdpt": [first, TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}"])],
+        "path": [first, most],
+    }
+
+
+# ----------------------------------------------------------------------------------------------------------- training
+
+
+def arms(told: argparse.Namespace) -> list[Arm]:
+    """Every budget of either kind."""
+    return [Arm(kind, share, round(share * told.samples)) for kind, shares in BUDGETS.items() for share in shares]
+
+
+def settings_of(seed: int, told: argparse.Namespace) -> TrainSettings:
+    """The same for all arms."""
+    return room_study.settings_of(ARCHITECTURE, seed, told, HELD_OUT)
+
+
+def trained(
+    arm: Arm, seed: int, made: Rendered, where: tuple[Path, str], told: argparse.Namespace
+) -> tuple[TrainedRun, float]:
+    """A network of one arm and one seed, and its steps' seconds; `where` is the folder and the scene's id."""
+    torch.set_num_threads(1)
+    folder, scene_id = where
+    source = partial(FirstSamples, made.root, scene_id, arm.samples)
+    name = f"{arm.kind}-{made.half_spp}-spp-{arm.samples}"
+    return room_study.trained(source, settings_of(seed, told), folder, name)
+
+
+def train_one(*arguments: Any) -> None:
+    """Train in a process of its own: what it leaves in the run's folder is all that is wanted."""
+    trained(*arguments)
+
+
+def measure(
+    arm: Arm, networks: Sequence[tuple[TrainedRun, float]], where: tuple[Path, str], references: References
+) -> Measured:
+    """Look at held-out views with an arm's networks, one from each seed; `where` is bdpt's store and the scene."""
+    made = [room_study.images(run, StoreSource(*where), references.rows) for run, _ in networks]
+
+    def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
+        return Errors(np.stack([error(images) for images in made]), references.units)
+
+    found = Measured(
+        arm,
+        train_s=sum(seconds for _, seconds in networks) / len(networks),
+        shown=each(references.shown_errors),
+        coarse=each(partial(references.shown_errors, block=BLOCK)),
+        linear=each(references.linear_errors),
+        images=made[0],
+    )
+    room_study.tell(f"{arm.kind} × {arm.share:g}: {room_study.each_seed(found.shown)}")
+    return found
+
+
+# ------------------------------------------------------------------------------------------------------------ targets
+
+
+def targets(made: dict[str, Rendered], spec: SceneSpec, references: References) -> Targets:
+    """What both kinds of samples show of the views that both stores have, as they are before training."""
+    sources = {kind: StoreSource(one.root, spec.scene_id) for kind, one in made.items()}
+    first = {kind: _first_rows(source) for kind, source in sources.items()}
+    held_out = sources["bdpt"].view_keys(list(references.rows))
+    common = [view for view in first["bdpt"] if view in first["path"]]
+    rows = {kind: [first[kind][view] for view in common] for kind in sources}
+    halves = {kind: _halves(source, rows[kind], spec.exposure) for kind, source in sources.items()}
+    place = {view: number for number, view in enumerate(common)}
+    keys = sources["bdpt"].modification_keys(rows["bdpt"])
+    return Targets(halves["bdpt"], halves["path"], tuple(keys), tuple(place[view] for view in held_out))
+
+
+def _first_rows(source: StoreSource) -> dict[bytes, int]:
+    """The first sample of each view, by the view's key."""
+    rows = source.refresh().tolist()
+    return dict(zip(reversed(source.view_keys(rows)), reversed(rows), strict=True))
+
+
+def _halves(source: StoreSource, rows: Sequence[int], exposure: float) -> F32:
+    """(N, 2, H, W, 3) exposed linear radiance."""
+    read = (source.read_batch([row])[0] for row in rows)
+    return np.stack([sample.radiance.astype(np.float32) * np.float32(exposure * sample.scale) for sample in read])
+
+
+def options() -> argparse.ArgumentParser:
+    """What can be told."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--experiment", default="fixed-veach-ajar", help="whose room it is (%(default)s)")
+    parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
+    parser.add_argument("--samples", type=int, default=400, help="of bdpt, trained on at budget 1 (%(default)s)")
+    parser.add_argument("--processes", type=int, default=2, help="that render or train at a time (%(default)s)")
+    room_study.add_options(parser, "path_data")
+    parser.set_defaults(steps=2000, decay=0.86, loss="paired", demodulation=0.2)
+    results.add_options(parser)
+    return parser
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    parser = options()
+    told = parser.parse_args()
+    try:
+        spec = spec_of(told)
+    except SpecError as error:
+        parser.error(str(error))
+    if not spec.groups:
+        parser.error(f"--experiment {told.experiment}: nothing moves in it; intervals need several configurations")
+    torch.set_num_threads(1)
+    folder, store = room_study.opened(told, f"{told.experiment}-{told.size}-{told.samples}")
+    costs = path_scene.costs_of(spec, folder)
+    made = path_scene.render(spec, (folder, store), requests(told), costs, told.processes)
+    references = References.of(store, spec, told.reference_spp, HELD_OUT)
+    runs = [
+        (arm, seed, made[arm.kind], (folder, spec.scene_id), told)
+        for seed in told.seeds
+        for arm in reversed(arms(told))
+    ]
+    path_scene.in_processes(train_one, runs, told.processes, "trained")
+    measured = []
+    for arm in arms(told):
+        networks = [trained(*run) for run in runs if run[0] == arm]
+        measured.append(measure(arm, networks, (made["bdpt"].root, spec.scene_id), references))
+    study = Study(told, spec, settings_of(told.seeds[0], told), costs, made, references, measured)
+    looked_at = targets(made, spec, references)
+    told.out.mkdir(parents=True, exist_ok=True)
+    path_data_page.picture(study, looked_at).save(told.out / PICTURE)
+    values = path_data_page.document(study, looked_at)
+    results.write("path_data", path_data_page.page(study, looked_at, PICTURE), values, told.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

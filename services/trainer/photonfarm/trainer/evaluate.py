@@ -28,7 +28,15 @@ from photonfarm.trainer.device import described, usable_device
 from photonfarm.trainer.evaluation import HeldOut, Predictor, batches, measure
 from photonfarm.trainer.evaluation_samples import References, Samples, Target, read_references
 from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.metrics import ImageMetrics, Inception, confidence_interval, image_metrics, load_inception
+from photonfarm.trainer.metrics import (
+    Features,
+    ImageMetrics,
+    Inception,
+    confidence_interval,
+    image_metrics,
+    load_inception,
+    reference_features,
+)
 from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
@@ -241,6 +249,7 @@ class _Test:
     inception: Inception | None
     device: str
     tell: Tell
+    known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
     def measured(self, predictor: TrainedRun | Untrained) -> _Measured:
         settings = predictor.settings.model_copy(update={"device": self.device})
@@ -268,4 +277,11 @@ class _Test:
             for image in ("mean", "half_a", "half_b")
         )
         images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
-        return image_metrics(images, mean, self.inception, units, halves=(a, b))
+        known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
+        return image_metrics(images, mean, self.inception, units, halves=(a, b), wanted_features=known)
+
+    def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
+        """Those of the references of some rows, which are the same for nearly all predictors."""
+        if rows not in self.known:
+            self.known[rows] = reference_features(references, inception)
+        return self.known[rows]

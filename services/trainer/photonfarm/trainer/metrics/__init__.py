@@ -3,7 +3,7 @@
 from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
 from photonfarm.trainer.metrics.fid import Fid, fid, kid
 from photonfarm.trainer.metrics.flip import flip
-from photonfarm.trainer.metrics.image_metrics import ImageMetrics, image_metrics
+from photonfarm.trainer.metrics.image_metrics import ImageMetrics, image_metrics, reference_features
 from photonfarm.trainer.metrics.inception import Features, FIDInceptionV3, Inception, load_inception
 from photonfarm.trainer.metrics.inception_weights import InceptionWeights, find_weights
 from photonfarm.trainer.metrics.intervals import PerImage, confidence_interval
@@ -31,4 +31,5 @@ __all__ = [
     "metric_space",
     "mse",
     "mssim",
+    "reference_features",
 ]

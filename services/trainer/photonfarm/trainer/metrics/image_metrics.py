@@ -60,13 +60,14 @@ def image_metrics(
     inception: Inception | None,
     groups: Sequence[Hashable] | None = None,
     halves: tuple[F32, F32] | None = None,
+    wanted_features: Features | None = None,
 ) -> ImageMetrics:
     """All metrics of exposed linear images, 2 × (N, H, W, 3), N ≥ 1; reference i is the converged view of prediction i.
 
     With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE; it is in all
     other metrics, which have no such estimate. Intervals are over images, or over `groups` of them such as
-    configurations, where one is named per image. Raises ValueError for shapes that do not fit, SpecError for values
-    that are not numbers.
+    configurations, where one is named per image. `wanted_features` are those of the references, where they are known
+    (`reference_features`). Raises ValueError for shapes that do not fit, SpecError for values that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)
     check_pairs(shown, wanted)
@@ -79,10 +80,16 @@ def image_metrics(
 
     if inception is None:
         return ImageMetrics(len(shown), errors, each(mssim), each(flip), None, None, None, None)
-    of_shown, of_wanted = (inception.features(images, CHUNK) for images in (shown, wanted))
+    of_shown = inception.features(shown, CHUNK)
+    of_wanted = inception.features(wanted, CHUNK) if wanted_features is None else wanted_features
     blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
     sets = _set_metrics(of_shown, of_wanted)
     return ImageMetrics(len(shown), errors, each(mssim), each(flip), blocks, *sets, inception.weights)
+
+
+def reference_features(references: F32 | Tensor, inception: Inception) -> Features:
+    """What `image_metrics` makes of references (N, H, W, 3), whatever they are compared with."""
+    return inception.features(metric_space(references), CHUNK)
 
 
 def _set_metrics(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -162,7 +163,9 @@ def scene_show(spec: str, as_json: bool) -> None:
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
 @click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
-@click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
+              "more at that cost; write nothing.")  # fmt: skip
+@click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
 @json_option
 def submit(
     spec: str,
@@ -171,6 +174,7 @@ def submit(
     no_queue: bool,
     retry: bool,
     dry_run: bool,
+    no_measure: bool,
     as_json: bool,
     **request: Any,
 ) -> None:
@@ -178,7 +182,10 @@ def submit(
     from photonfarm.shared import show, submission
 
     if dry_run:
-        show.submission(submission.preview(spec, store, **request), as_json)
+        from photonfarm.shared.dry_run import rehearse
+
+        tell = partial(click.echo, err=True)
+        show.dry_run(rehearse(spec, store, measure=not no_measure, tell=tell, **request), as_json)
     else:
         url = None if no_queue else redis_url
         show.submission(submission.submit(spec, store, url, retry=retry, **request), as_json)

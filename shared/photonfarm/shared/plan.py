@@ -45,6 +45,15 @@ UNUSED = -1
 Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 
 
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """What is rendered for new samples, beside themselves."""
+
+    configurations: int = 0  # that they show, new or not
+    modifications: int = 0  # of them, the new ones: their photons are stored
+    views: int = 0  # new ones: their buffers are stored
+
+
 class Request(Frozen):
     """What to plan: modifications × views × passes, under one master seed."""
 
@@ -64,6 +73,11 @@ class Request(Frozen):
     def samples(self) -> int:
         """How many samples it names, planned already or not."""
         return self.modifications * self.views_per_modification * self.passes
+
+    def extent(self, spec: SceneSpec) -> Extent:
+        """What is rendered for it where nothing is planned, if no two of its configurations are equal."""
+        configurations = self.modifications if spec.groups else 1
+        return Extent(configurations, configurations, self.modifications * self.views_per_modification)
 
     @classmethod
     def of(cls, **values: Any) -> Request:
@@ -164,6 +178,13 @@ class Candidates:
     sample_pass: NDArray[np.int32]  # (S,)
     sample_key: NDArray[np.uint8]  # (S, 16)
 
+    def extent(self) -> Extent:
+        """What is rendered for them."""
+        modifications, views = np.unique(self.sample_modification), np.unique(self.sample_view)
+        new_modifications = np.count_nonzero(self.modification_row[modifications] == UNUSED)
+        new_views = np.count_nonzero(self.view_row[views] == UNUSED)
+        return Extent(len(modifications), int(new_modifications), int(new_views))
+
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
@@ -172,6 +193,7 @@ class Expansion:
     rows: PlannedRows | None
     new: int  # samples
     known: int  # samples named by the request and planned already
+    extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
 
 
 def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
@@ -183,7 +205,7 @@ def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, s
     candidates, named = _candidates(spec, request, known)
     rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
     new = len(candidates.sample_pass)
-    return Expansion(rows, new, named - new)
+    return Expansion(rows, new, named - new, candidates.extent())
 
 
 def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import click
-import numpy as np
 from rich import markup
 from rich.console import Console
 from rich.table import Table
@@ -18,6 +17,7 @@ from rich.table import Table
 from photonfarm.shared.scene import SceneSpec, shape_ids
 
 if TYPE_CHECKING:
+    from photonfarm.shared.dry_run import DryRun
     from photonfarm.shared.queue import Cause, Failure, QueueStatus
     from photonfarm.shared.store import Store
     from photonfarm.shared.submission import Submission
@@ -102,11 +102,9 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
 
 def bytes_per_sample(spec: SceneSpec) -> int:
     """Stored bytes of one sample that has a view and a modification of its own, before compression."""
-    from photonfarm.shared.store.schema import output_arrays
+    from photonfarm.shared.store.schema import bytes_of_rows
 
-    arrays = [array for name, array in output_arrays(spec).items() if name != "radiance_wide"]
-    outputs = sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in arrays)
-    return outputs + 16 * len(spec.groups) + 24  # and the modification vector and the view
+    return sum(bytes_of_rows(spec).values())
 
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
@@ -134,6 +132,46 @@ def submission(result: Submission, as_json: bool) -> None:
         from photonfarm.shared.scene import SCENES_VARIABLE
 
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
+
+
+def dry_run(result: DryRun, as_json: bool) -> None:
+    """What would become of a request, its size and cost, and what should be better at that cost."""
+    submission(result, as_json)
+    if as_json or not result.planned:
+        return
+    size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"
+    if result.core_s is None or result.wall_s is None:
+        click.echo(size)
+        return
+    cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
+    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {_duration(result.wall_s)} on the {cores} here")
+    click.echo(_suggestion(result))
+
+
+def _suggestion(result: DryRun) -> str:
+    better = result.suggestion
+    if result.reduction is None:
+        return f"no suggestion: another half_spp would render the {result.planned_before} planned samples again"
+    if better is None:
+        return "what is asked for is within 5 % of the best at this cost"
+    request = f"{better.samples} views of one pass"
+    if better.views is not None:
+        options = f"--modifications {better.modifications} --views {better.views}"
+        request = f"{options} ({better.samples} samples of one pass)"
+    return (
+        f"suggested at this cost: half_spp = {better.half_spp} in [transport], {request}: "
+        f"{100 * result.reduction:.0f} % less excess error predicted"
+    )
+
+
+def _amount(seconds: float) -> str:
+    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.1f}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{_amount(seconds)} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:,.1f} h"
 
 
 # --------------------------------------------------------------------------------------------------------------- status

@@ -11,7 +11,6 @@ from photonfarm.shared.errors import QueueError, SpecError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.scene import SceneSpec, find_scene, find_spec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.shared.store.storage import is_vacant
 from photonfarm.shared.top_up import TopUp, spp_per_pass
 
 
@@ -34,15 +33,6 @@ class TopUpSubmission(Submission):
 
     spp_per_pass: int = field(kw_only=True)  # samples per pixel of one pass, both halves together
     passes: int = field(kw_only=True)  # how many passes the samples per pixel are that were asked for, rounded up
-
-
-def preview(spec: str, store: str | Path, *, shard_rows: int | None = None, **request: int) -> Submission:
-    """What `submit` would plan; nothing is written."""
-    loaded, wanted = load_spec(spec), request_of(**request)
-    if is_vacant(store):
-        return Submission(loaded.scene_id, None, wanted.samples, 0, None, dry_run=True)
-    planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
-    return Submission(loaded.scene_id, None, planned.new, planned.known, None, dry_run=True)
 
 
 def submit(

@@ -1,4 +1,4 @@
-"""The verbs of the render service: buffers, doctor, measure-frames, preview, report stability, scene plan, work."""
+"""Verbs of the render service: buffers, doctor, measure-frames, preview, report stability, scene cost/plan, work."""
 
 from __future__ import annotations
 
@@ -194,6 +194,26 @@ def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool)
             spec_file.write(file, plan.changes)
         for table in plan.settings:
             click.echo(f"{file}: [{table}] {'written' if table in plan.changes else 'stays as it is'}", err=True)
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
+              help="Random configurations that are measured, a view of each, after 2 that do not count.")  # fmt: skip
+@click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@json_option
+def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
+    """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are."""
+    from photonfarm.renderer import backend
+    from photonfarm.shared.scene import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.sample_costs import find_or_measure
+
+    talk = partial(click.echo, err=True)
+    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, talk=talk)
+    click.echo(costs.json() if as_json else costs.line())
 
 
 @click.command()

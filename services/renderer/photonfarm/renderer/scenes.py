@@ -82,10 +82,13 @@ class LoadedScene:
             for emitter in self._distant:
                 emitter.set_scene(self.scene)
 
-    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
-        """Half-estimates of linear radiance for each seed, (K, H, W, 3): the spec's integrator and `half_spp`."""
-        images = self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, self.spec.transport.half_spp)
-        return np.array(images, np.float32)
+    def render_halves(self, view: View, seeds: Sequence[int], half_spp: int | None = None) -> F32:
+        """Half-estimates of linear radiance for each seed, (K, H, W, 3): the spec's integrator and `half_spp`.
+
+        Or as many samples per pixel as are given.
+        """
+        spp = half_spp or self.spec.transport.half_spp
+        return np.array(self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, spp), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
         """One of them, (H, W, 3)."""

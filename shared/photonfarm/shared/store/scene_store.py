@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.shared.errors import CorruptError, SpecError, StoreError
-from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Request
+from photonfarm.shared.plan import MAX_SHARD_ROWS, SHARD_ROWS, Extent, Request
 from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.shared.store import declarations, markers, plans, schema
@@ -40,6 +40,7 @@ class PlanResult:
     new: int  # samples planned now
     known: int  # samples of the request that older plans hold
     jobs: int  # jobs of the new plan
+    extent: Extent  # as of `Expansion`
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +91,15 @@ class SceneStore:
                 )
             expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:
-                return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0)
+                return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
             with store_errors("write a plan", self.storage.where):
                 built = self.storage.part()
                 try:
                     plans.build(built, self.spec, request, expansion.rows, first_job=first_job, shard_rows=rows_per_job)
                     if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
-                        return PlanResult(self.scene_id, len(found), expansion.new, expansion.known, jobs)
+                        new, known, extent = expansion.new, expansion.known, expansion.extent
+                        return PlanResult(self.scene_id, len(found), new, known, jobs, extent)
                 finally:
                     shutil.rmtree(built, ignore_errors=True)
 

@@ -62,6 +62,15 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     return {declared.name: _resolved(declared, lengths, spec) for declared in wanted}
 
 
+def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
+    """Stored bytes of one sample, one view and one modification, before compression, with their inputs."""
+    found: dict[Kind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
+    for name, array in output_arrays(spec).items():
+        if name != "radiance_wide":  # few rows need it
+            found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
+    return found
+
+
 def bit_counts(spec: SceneSpec) -> dict[str, int]:
     """The bits of a row in the arrays that hold bits: one for each point, and one for each photon slot."""
     return {"point_seen": spec.points, "photon_seen": spec.photons.slots}

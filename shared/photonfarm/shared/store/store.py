@@ -107,7 +107,7 @@ class Store:
         """Plan what is new of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
         if dry_run and not self.has_scene(spec.scene_id):
             expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
-            return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0)
+            return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
         return scene.plan(request, shard_rows=shard_rows, dry_run=dry_run)
 

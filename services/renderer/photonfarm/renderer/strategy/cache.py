@@ -25,7 +25,12 @@ def digest(spec: SceneSpec) -> str:
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
     scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
-    return make_key("scene plan", scene.scene_id, repr(GRID), repr(_machine()), _revision()).hex()
+    return digest_here("scene plan", scene.scene_id, repr(GRID))
+
+
+def digest_here(*parts: str) -> str:
+    """32 hexadecimal digits: what was measured, by some parts, on which machine, and all code that renders."""
+    return make_key(*parts, repr(_machine()), _revision()).hex()
 
 
 def _machine() -> tuple[object, ...]:
@@ -59,9 +64,22 @@ def _revision() -> bytes:
     return hashed.digest()
 
 
-def _file(spec: SceneSpec) -> Path:
+def file_of(folder: str, digest: str) -> Path:
+    """Where a measurement of one kind, which has a folder of its own, is kept."""
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / "photonfarm/plans" / f"{digest(spec)}.json"
+    return Path(root) / "photonfarm" / folder / f"{digest}.json"
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write a file that appears whole. Raises OSError where it cannot be written."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    aside = file.with_suffix(f".{os.getpid()}.part")
+    aside.write_text(text)
+    aside.replace(file)
+
+
+def _file(spec: SceneSpec) -> Path:
+    return file_of("plans", digest(spec))
 
 
 def find(spec: SceneSpec) -> Measurement | None:
@@ -75,8 +93,5 @@ def find(spec: SceneSpec) -> Measurement | None:
 def keep(spec: SceneSpec, measurement: Measurement) -> Path:
     """Keep a measurement; returns its file, which appears whole. Raises OSError where it cannot be written."""
     file = _file(spec)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_suffix(f".{os.getpid()}.part")
-    aside.write_text(measurement.model_dump_json(indent=1) + "\n")
-    aside.replace(file)
+    write_whole(file, measurement.model_dump_json(indent=1) + "\n")
     return file

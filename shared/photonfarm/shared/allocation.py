@@ -1,0 +1,109 @@
+"""How to spend core-seconds on training samples: on configurations, on views of each, or on samples per pixel.
+
+This is optimum allocation in multistage sampling (W. G. Cochran, Sampling Techniques, 3rd ed. 1977, ch. 10), with
+configurations as first stage, their views as second, and the noisy light paths of a view as third. Of a training
+set of M configurations, V views of each, and P passes of s samples per pixel of each view, the held-out error beyond
+that of endless data, its excess, is taken to follow
+
+    excess = ρ/M + (1 + ν/(κ·P·s)) / (M·V)
+
+in units of what one noise-free view leaves: ν is the relative noise of one sample per pixel, κ how much the network
+averages it away, ρ how much configurations differ beside their views. A configuration with its views costs
+
+    c = c_configuration + V·(c_view + P·(c_pass + c_spp·s)).
+
+**The best s.** A budget B pays for M = B/c configurations, so that excess·B = (α + β/n)·(γ + δ·n), where n = P·s,
+α = ρ + 1/V, β = ν/(κ·V), γ = c_configuration + V·(c_view + P·c_pass) and δ = V·c_spp. Its derivative δα − βγ/n² is
+0 at n* = √(βγ/(αδ)), which with c₀ = γ/V, the cost of a view that does not grow with s, is
+
+    s* = n*/P = √(c₀·ν / (κ·c_spp·(1 + ρ·V))) / P.
+
+**Passes.** The excess depends on P and s by n alone, while P passes pay c_pass P times: one pass of n samples is
+never worse. Passes are for top-ups of what is there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from photonfarm.shared.sample_costs import SampleCosts
+
+KAPPA = 30.0
+"""κ, how much of the noise the network averages away over pixels and views; fitted by bench/noise_budget.py."""
+
+RHO = 1.0
+"""ρ, how much configurations differ beside what their views show; fitted by bench/noise_budget.py."""
+
+MOST_SPP, MOST_VIEWS = 1024, 16
+"""Of what `best` looks at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Allocation:
+    """Samples of a scene: how many of what, and how many samples per pixel of each."""
+
+    modifications: int  # configurations, M
+    views: int  # of each configuration, V
+    passes: int  # of each view, P
+    spp: int  # samples per pixel of a pass, both halves together, s: twice a spec's half_spp
+
+    @property
+    def samples(self) -> int:
+        """How many it has."""
+        return self.modifications * self.views * self.passes
+
+
+def seconds(costs: SampleCosts, of: Allocation) -> float:
+    """Core-seconds of an allocation."""
+    views = of.modifications * of.views
+    return costs.seconds(of.spp, configurations=of.modifications, views=views, samples=views * of.passes)
+
+
+def excess(noise: float, of: Allocation, *, kappa: float = KAPPA, rho: float = RHO) -> float:
+    """The excess of the held-out error, in the module's units, by the relative `noise` of one sample per pixel."""
+    of_view = 1 + noise / (kappa * of.passes * of.spp)
+    return (rho + of_view / of.views) / of.modifications
+
+
+def best_spp(costs: SampleCosts, views: int, passes: int = 1, *, kappa: float = KAPPA, rho: float = RHO) -> float:
+    """s*: the samples per pixel of a pass with the least excess at a fixed budget, as a real number.
+
+    Infinite where samples cost nothing, 0 where there is no noise.
+    """
+    besides = costs.configuration_s / views + costs.view_s + passes * costs.pass_s
+    gained, paid = besides * costs.relative_noise, kappa * costs.spp_s * (1 + rho * views)
+    if not gained:
+        return 0.0
+    return math.sqrt(gained / paid) / passes if paid else math.inf
+
+
+def best(
+    costs: SampleCosts,
+    budget_s: float,
+    *,
+    most_views: int = MOST_VIEWS,
+    kappa: float = KAPPA,
+    rho: float = RHO,
+) -> Allocation:
+    """The allocation of least excess that a budget of core-seconds pays for, of those that `_affordable` names.
+
+    Of equals it is the one of fewer views, then of fewer samples per pixel. Raises ValueError for a budget that pays
+    for none.
+    """
+    found = list(_affordable(costs, budget_s, range(1, most_views + 1)))
+    if not found:
+        raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {seconds(costs, Allocation(1, 1, 1, 2))}")
+    return min(found, key=partial(excess, costs.relative_noise, kappa=kappa, rho=rho))
+
+
+def _affordable(costs: SampleCosts, budget_s: float, views: Iterable[int]) -> Iterator[Allocation]:
+    """One pass of 2, 4, 8 … 1024 spp of each number of views, of as many configurations as the budget pays for."""
+    for of_each in views:
+        for spp in (2**power for power in range(1, MOST_SPP.bit_length())):
+            one = seconds(costs, Allocation(1, of_each, 1, spp))
+            count = int(budget_s / one * (1 + 1e-9)) if one else 0  # rounding must not take one of those asked for
+            if count:
+                yield Allocation(count, of_each, 1, spp)

@@ -16,8 +16,8 @@ from scipy.optimize import nnls
 
 from photonfarm.shared.allocation import Allocation, excess
 
-KAPPAS = np.geomspace(0.1, 3000, 90)
-RHOS = np.concatenate([[0.0], np.geomspace(0.03, 30, 40)])
+KAPPAS = np.geomspace(0.1, 3000, 160)
+RHOS = np.concatenate([[0.0], np.geomspace(0.03, 30, 80)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,7 @@ def document(path: Path):
 
 def main(store: Path, backend: str, out: Path) -> None:
     stated = document(store / "photonfarm.json")
-    assert (stated["format"], stated["version"]) == ("photonfarm store", 3)
+    assert (stated["format"], stated["version"]) == ("photonfarm store", 4)
     arrays = {}
     for folder in sorted((store / "scenes").iterdir()):
         if re.fullmatch("[0-9a-f]{32}", folder.name):

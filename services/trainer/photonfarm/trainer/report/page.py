@@ -27,7 +27,8 @@ table { border-collapse: collapse; font-size: .9rem; }
 td, th { padding: .25rem .8rem .25rem 0; text-align: left; font-weight: normal; vertical-align: top; }
 thead th { color: #555; border-bottom: 1px solid #ccc; vertical-align: bottom; }
 tbody tr:nth-child(even) { background: #f7f7f7; }
-td:first-child { position: sticky; left: 0; background: inherit; overflow-wrap: anywhere; min-width: 8rem; }
+.wide td { white-space: nowrap; }
+td:first-child { position: sticky; left: 0; background: inherit; }
 tbody tr { background: #fff; }
 .case { display: flex; flex-wrap: wrap; gap: .6rem; margin-bottom: 1.6rem; }
 figure { margin: 0; width: 8.5rem; } figure img { width: 100%; image-rendering: pixelated; display: block; }

@@ -18,6 +18,9 @@ from photonfarm.shared.records import F32, ViewBuffers
 Mask = NDArray[np.bool_]
 
 CLOSE = 0.05  # quantile of all depths: what is nearer is close to the camera
+MIRRORS, SPECULAR, NEAR, SHADOWS, ALL = KINDS = (
+    "mirrors and clear glass", "specular surfaces", "close to the camera", "fine shadows", "all pixels",
+)  # fmt: skip
 LEAST = 0.005  # share of the image's pixels that a case has at the least
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
 SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to which difference, cosine and ratio nothing else does
@@ -46,7 +49,7 @@ class WorstCase:
 
 
 def worst_cases(views: list[View]) -> list[WorstCase]:
-    """For each kind of pixels the view that it costs most, in `kinds`' order; a view is named once.
+    """For each kind of pixels the view that it costs most, in the order of `KINDS`; a view is named once.
 
     What counts is the sum of the error over the pixels: of two views with one wrong mirror the larger mirror.
     """
@@ -62,8 +65,8 @@ def worst_cases(views: list[View]) -> list[WorstCase]:
                 case = WorstCase(kind, view.row, share, float(error[mask].mean()))
                 scored.setdefault(kind, []).append((share * case.mse, case))
     found: dict[int, WorstCase] = {}
-    for of_kind in scored.values():
-        for _, case in sorted(of_kind, key=lambda each: -each[0]):
+    for kind in KINDS:
+        for _, case in sorted(scored.get(kind, []), key=lambda each: -each[0]):
             if case.row not in found:
                 found[case.row] = case
                 break
@@ -80,11 +83,11 @@ def squared_error(view: View) -> NDArray[np.float64]:
 def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
     """The kinds of pixels that are looked for, each with its mask (H, W)."""
     if view.surface is not None:
-        yield "mirrors and clear glass", view.surface == Surface.MIRROR
-        yield "specular surfaces", view.surface == Surface.SPECULAR
-    yield "close to the camera", (view.buffers.depth > 0) & (view.buffers.depth < close)
-    yield "fine shadows", shadow_edges(view)
-    yield "all pixels", np.ones_like(view.buffers.depth, np.bool_)
+        yield MIRRORS, view.surface == Surface.MIRROR
+        yield SPECULAR, view.surface == Surface.SPECULAR
+    yield NEAR, (view.buffers.depth > 0) & (view.buffers.depth < close)
+    yield SHADOWS, shadow_edges(view)
+    yield ALL, np.ones_like(view.buffers.depth, np.bool_)
 
 
 def shadow_edges(view: View) -> Mask:

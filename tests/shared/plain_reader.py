@@ -146,7 +146,7 @@ class Plan:
     def __init__(self, folder: Path, read) -> None:
         self.folder = folder
         attributes = document(folder / "zarr.json")["attributes"]
-        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 3)
+        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 4)
         self.shard_rows = attributes["shard_rows"]
         self.first_row = attributes["first_job"] * self.shard_rows
         self.rows = attributes["jobs"] * self.shard_rows

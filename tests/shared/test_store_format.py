@@ -116,7 +116,7 @@ def test_the_store_and_every_group_state_format_and_version(scene: SceneStore) -
     groups = [about["attributes"] for about in documents if about["node_type"] == "group"]
     assert len(groups) == 4
     for stated in [*groups, json.loads(scene.storage.read("photonfarm.json"))]:
-        assert (stated["format"], stated["version"]) == ("photonfarm store", 3)
+        assert (stated["format"], stated["version"]) == ("photonfarm store", 4)
 
 
 def test_each_store_has_an_id_of_its_own_which_it_keeps(store: Store, tmp_path: Path) -> None:

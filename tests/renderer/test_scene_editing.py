@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer import acceleration, backend
+from photonfarm.renderer.gbuffer import view_buffers
 from photonfarm.renderer.scenes import LoadedScene
 from photonfarm.shared.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene import SceneSpec, load_spec
@@ -58,6 +59,26 @@ def test_no_kernel_is_new_after_the_second_modification(small: Callable[..., Sce
             seen |= used.keys()
     finally:
         dr.set_flag(dr.JitFlag.KernelHistory, False)
+
+
+def test_recorded_buffers_and_photons_are_those_that_python_traces_anew(room: LoadedScene) -> None:
+    """Bit by bit, in every configuration, with pieces that come back and that are gone."""
+    from photonfarm.renderer.bdpt.photons import trace_photons
+
+    wanted = room.spec.photons
+    for i in range(5):
+        modification = sample_modification(room.spec, 11, i)
+        room.apply(modification)
+        view = sample_view(room.spec, modification.key(room.spec.scene_id), 11, i)
+        recorded, anew = room.buffers(view), view_buffers(room.scene, view, room.spec)
+        photons = room.photons(i)
+        assert photons is not None
+        hits = trace_photons(room.scene, seed=i, paths=wanted.paths, depth=wanted.depth)
+        for name in ("depth", "albedo", "normal"):
+            np.testing.assert_array_equal(getattr(recorded, name), getattr(anew, name))
+        for name in ("position", "direction", "normal", "power", "bounce"):
+            np.testing.assert_array_equal(getattr(photons, name), getattr(hits, name))
+        assert photons.power.sum() > 0
 
 
 def test_the_rest_state_comes_back_bit_by_bit(room: LoadedScene, somewhere: View) -> None:

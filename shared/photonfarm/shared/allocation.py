@@ -32,10 +32,10 @@ from functools import partial
 from photonfarm.shared.sample_costs import SampleCosts
 
 KAPPA = 30.0
-"""κ, how much of the noise the network averages away over pixels and views; fitted by bench/noise_budget.py."""
+"""κ, how much of the noise the network averages away over pixels and views. Provisional: bench/noise_budget.py fits it."""
 
 RHO = 1.0
-"""ρ, how much configurations differ beside what their views show; fitted by bench/noise_budget.py."""
+"""ρ, how much configurations differ beside what their views show. Provisional, likewise."""
 
 MOST_SPP, MOST_VIEWS = 1024, 16
 """Of what `best` looks at."""

@@ -21,7 +21,7 @@ opacity there, as the first intersection meets it.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -32,6 +32,9 @@ from photonfarm.shared.records import F32, ViewBuffers
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import Camera, View
 
+if TYPE_CHECKING:
+    from photonfarm.renderer.bdpt.recording import Recorder
+
 GRID = 4
 """Rays along each axis of a pixel, of which albedo is the mean."""
 
@@ -39,23 +42,22 @@ RAYS = 1 << 20
 """Rays traced at a time, at least those of one point of each pixel: 16 of them for an image of 256²."""
 
 
-def view_buffers(scene: Any, view: View, spec: SceneSpec) -> ViewBuffers:
-    """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is there."""
+def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
+    """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is there.
+
+    With a `recorder` of `look` Python runs but once, which is half of the time in scenes of many materials.
+    """
     camera = Camera.of(view, spec)
     directions = camera.rays()
-    si = first_surfaces(scene, camera, directions, spec)
-    hit = si.is_valid()
-    normal = dr.select(hit, si.sh_frame.n, 0)
-    distance = dr.select(hit, si.t, 0)
-    dr.eval(hit, normal, distance)
-
+    hit, normal, distance = _seen("centre", scene, _rays(camera, directions, spec), recorder)
     along = directions.reshape(-1, 3).astype(np.float64) @ camera.forward
     depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
     shape = (camera.height, camera.width)
-    return ViewBuffers(depth.astype(np.float32).reshape(shape), _mean_albedo(scene, camera, spec), rows(normal, *shape))
+    albedo = _mean_albedo(scene, camera, spec, recorder)
+    return ViewBuffers(depth.astype(np.float32).reshape(shape), albedo, rows(normal, *shape))
 
 
-def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec) -> F32:
+def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder | None) -> F32:
     """Over the area of each pixel, (H, W, 3)."""
     steps = (np.arange(GRID) + 0.5) / GRID
     within = [(u, v) for v in steps for u in steps]
@@ -63,21 +65,47 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec) -> F32:
     total = np.zeros((camera.height, camera.width, 3))
     for start in range(0, len(within), at_once):
         directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        si = first_surfaces(scene, camera, directions, spec)
-        hit = si.is_valid()
-        albedo = dr.select(hit, diffuse_reflectance(si, hit), 0)
+        (albedo,) = _seen("albedo", scene, _rays(camera, directions, spec), recorder)
         total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
     return (total / len(within)).astype(np.float32)
 
 
+What = Literal["centre", "albedo"]
+Rays = tuple[Any, Any, Any]
+"""Origins (Point3f), directions (Vector3f) and how far they reach (Float)."""
+
+
+def _seen(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
+    """What `look` returns, recorded by `what` and the number of rays."""
+    if recorder is None:
+        return look(scene, None, *rays, what)
+    found: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
+    return found
+
+
+def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
+    """Hit, normal and distance of the surfaces that rays meet first, or their albedo; zeros where they meet none."""
+    si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
+    hit = si.is_valid()
+    found: tuple[Any, ...] = (dr.select(hit, diffuse_reflectance(si, hit), 0),)
+    if what == "centre":
+        found = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
+    dr.eval(found)
+    return found
+
+
 def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
     """What rays from the camera along unit directions (..., 3) meet between the near and the far plane."""
+    origin, direction, reach = _rays(camera, directions, spec)
+    return scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
+
+
+def _rays(camera: Camera, directions: F32, spec: SceneSpec) -> Rays:
+    """From the near to the far plane, along unit directions (..., 3)."""
     flat = directions.reshape(-1, 3)
     along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis
     near, far = spec.view.near / along, spec.view.far / along
-    ray = mi.Ray3f(o=points(camera.origin + flat * near[:, None]), d=mi.Vector3f(points(flat)))
-    ray.maxt = floats(far - near)
-    return scene.ray_intersect(ray)
+    return points(camera.origin + flat * near[:, None]), mi.Vector3f(points(flat)), floats(far - near)
 
 
 def diffuse_reflectance(si: Any, active: Any) -> Any:

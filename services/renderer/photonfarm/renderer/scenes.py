@@ -24,6 +24,9 @@ class LoadedScene:
     """
 
     def __init__(self, spec: SceneSpec, scene: Any) -> None:
+        from photonfarm.renderer import gbuffer
+        from photonfarm.renderer.bdpt import photons
+        from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.editing import MovableGroup
         from photonfarm.renderer.loading import lower_corner
         from photonfarm.renderer.sensor import AimedSensor
@@ -32,6 +35,7 @@ class LoadedScene:
         self.scene = scene
         self._sensor = AimedSensor(spec)
         self._integrator = integrator_of(spec.transport)
+        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
@@ -111,7 +115,7 @@ class LoadedScene:
         """Depth, albedo and normal of what each pixel's centre sees in the present configuration."""
         from photonfarm.renderer.gbuffer import view_buffers
 
-        return view_buffers(self.scene, view, self.spec)
+        return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""
@@ -126,7 +130,9 @@ class LoadedScene:
         wanted = self.spec.photons
         if not wanted.paths:
             return None
-        hits = trace_photons(self.scene, seed=seed, paths=wanted.paths, depth=wanted.depth)
+        hits = trace_photons(
+            self.scene, seed=seed, paths=wanted.paths, depth=wanted.depth, recorder=self._photon_recorder
+        )
         return Photons(hits.position, hits.direction, hits.normal, hits.power, hits.bounce.astype(np.int8))
 
     def base(self) -> tuple[Geometry, BasePointCloud]:

@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from . import randomness
-from .emission import read_lights, sample_emission
+from .emission import Lights, read_lights, sample_emission
 from .light_paths import LightState, PathOptions, first_state, scatter
 from .loops import traced_once
+from .recording import Recorder
 from .scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
@@ -36,54 +37,58 @@ class Photons:
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
-def trace_photons(scene: Any, *, seed: int, paths: int, depth: int) -> Photons:
+def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
     emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
     Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see `emission`) emit none. Compiles
-    nothing again when the scene is edited in place or for another seed. Raises ValueError for scenes with media, and
-    for numbers below 1.
+    nothing again when the scene is edited in place or for another seed; with a ``recorder`` of `trace` Python runs but
+    once, which is most of the time in scenes of many materials. Raises ValueError for scenes with media, and for
+    numbers below 1.
     """
     if paths < 1 or depth < 1:
         raise ValueError(f"trace_photons: paths is {paths} and depth {depth}; each must be at least 1")
     check_scene(scene, light_paths=True)
-    slots = paths * depth
     if not scene.emitters():
-        zeros = np.zeros((slots, 3), np.float32)
-        return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(slots, -1, np.int32))
+        zeros = np.zeros((paths * depth, 3), np.float32)
+        return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(paths * depth, -1, np.int32))
     with dr.suspend_grad():
         lights = read_lights(scene)
-        sequence = randomness.stream(randomness.image_keys([seed & 0xFFFFFFFF]), randomness.PHOTONS)
-        path = dr.arange(mi.UInt32, paths)
-        rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, paths), path)
-        start = sample_emission(lights, rng, path, dr.opaque(mi.UInt32, paths))
-        out = (
-            dr.zeros(mi.Point3f, slots),
-            dr.zeros(mi.Vector3f, slots),
-            dr.zeros(mi.Normal3f, slots),
-            dr.zeros(mi.Spectrum, slots),
-        )
-        bounce = dr.full(mi.Int32, -1, slots)
-        zero = dr.opaque(mi.Float, 0)
-        options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
-        traced_once(
-            state=(first_state(scene, lights, start, rng),),
-            cond=lambda s: s.active,
-            body=partial(
-                _hit,
-                scene=scene,
-                options=options,
-                out=out,
-                bounce=bounce,
-                paths=dr.opaque(mi.UInt32, paths),
-            ),
-            labels=("photon",),
-            label="photons",
-        )
-        dr.eval(out, bounce)
+        keys = randomness.image_keys([seed & 0xFFFFFFFF])
+        arguments = (lights, keys, dr.opaque(mi.UInt32, paths), dr.opaque(mi.Float, 0), paths, depth)
+        traced = partial(recorder, (paths, depth, lights.kinds)) if recorder else trace
+        out, bounce = traced(scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
     return Photons(position, direction, normal, power / np.float32(paths), np.array(bounce))
+
+
+def trace(
+    scene: Any, _: Any, lights: Lights, keys: Any, count: Any, zero: Any, paths: int, depth: int
+) -> tuple[tuple[Any, ...], Any]:
+    """Positions, directions, normals and powers of all slots, and their bounces; ``count`` is ``paths``, opaque."""
+    slots = paths * depth
+    sequence = randomness.stream(keys, randomness.PHOTONS)
+    path = dr.arange(mi.UInt32, paths)
+    rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, paths), path)
+    start = sample_emission(lights, rng, path, count)
+    out = (
+        dr.zeros(mi.Point3f, slots),
+        dr.zeros(mi.Vector3f, slots),
+        dr.zeros(mi.Normal3f, slots),
+        dr.zeros(mi.Spectrum, slots),
+    )
+    bounce = dr.full(mi.Int32, -1, slots)
+    options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
+    traced_once(
+        state=(first_state(scene, lights, start, rng),),
+        cond=lambda s: s.active,
+        body=partial(_hit, scene=scene, options=options, out=out, bounce=bounce, paths=count),
+        labels=("photon",),
+        label="photons",
+    )
+    dr.eval(out, bounce)
+    return out, bounce
 
 
 def _hit(s: LightState, *, scene: Any, options: PathOptions, out: Any, bounce: Any, paths: Any) -> tuple[LightState]:

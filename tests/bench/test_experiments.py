@@ -116,7 +116,8 @@ def test_all_stages_lead_to_a_report(tiny: Experiment, tmp_path: Path) -> None:
 
 
 def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
-    wrong = tiny.size.model_copy(update={"train": {**tiny.size.train, "loss": "l1"}})
+    refused = {"train": {**tiny.size.train, "loss": "l1"}, "train_denoisers": {}}
+    wrong = tiny.size.model_copy(update=refused)
     stages = Stages(tiny.model_copy(update={"size": wrong}), tmp_path / "work", workers=1)
     stages.write_spec()
     with pytest.raises(StageError, match=r"tiny: train-light_transport ended with exit code 3; .*train-light_trans"):

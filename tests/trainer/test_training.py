@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from held_out_errors import held_out_errors
 
 from photonfarm.shared.scene import load_spec
 from photonfarm.trainer import checkpoint, loop, metrics_log, service
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.device import described, usable_device
-from photonfarm.trainer.figures import run_figures
 from photonfarm.trainer.following import Growth
 from photonfarm.trainer.learner import DivergedError
 from photonfarm.trainer.loop import CHECKPOINT, METRICS, stop_on_signals, train
@@ -34,11 +34,11 @@ def test_the_held_out_error_falls_fivefold_and_below_the_mean_colours(make_sourc
     how = {"batch": 4, "epoch_samples": 50_000, "learning_rate": 2e-3, "poll_seconds": 0.05}
     settings = small(network=NetworkSettings(width=8), max_steps=450, validate_every=450, **how)
     outcome = train(make_source(256, noise=0.7), settings, run)
-    found = run_figures(make_source(256, noise=0.7), settings, run)
-    assert outcome.last_error == pytest.approx(found.last.error.mean, rel=1e-5)
-    assert found.first.error.mean > 5 * found.last.error.mean
-    assert found.mean_colour.error.mean > 2 * found.last.error.mean
-    assert found.last.error.count >= 16
+    found = held_out_errors(lambda: make_source(256, noise=0.7), run)
+    assert outcome.last_error == pytest.approx(found.last, rel=1e-5)
+    assert found.first > 5 * found.last
+    assert found.mean_colour > 2 * found.last
+    assert found.configurations >= 16
 
 
 def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_and_another_growth_is_another_run(

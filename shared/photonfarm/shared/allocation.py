@@ -32,7 +32,8 @@ from functools import partial
 from photonfarm.shared.sample_costs import SampleCosts
 
 KAPPA = 30.0
-"""κ, how much of the noise the network averages away over pixels and views. Provisional: bench/noise_budget.py fits it."""
+"""κ, how much of the noise the network averages away over pixels and views. Provisional; bench/noise_budget.py fits it.
+"""
 
 RHO = 1.0
 """ρ, how much configurations differ beside what their views show. Provisional, likewise."""

@@ -89,7 +89,7 @@ def gathered(
     """Measure everything, without the times of frames where they are not wanted. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
-    gauges = Gauges.of(store, first)
+    gauges = Gauges.of(StoreSource(store, first.scene_id), first)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     close_look = _CloseLook(store, first.scene_id, kept, timed=timed)
     evaluation = evaluate.compare(

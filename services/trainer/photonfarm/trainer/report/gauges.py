@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from photonfarm.shared.errors import IncompleteError
-from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.dataset import SampleSource
 from photonfarm.trainer.evaluation import (
     HeldOut,
     batches,
@@ -17,7 +16,6 @@ from photonfarm.trainer.evaluation import (
 )
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import INITIAL
-from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 
 MOST_TRAINING = 1024  # samples to take the mean colour of
@@ -32,19 +30,17 @@ class Gauges:
     untrained: HeldOut  # the first run's network before its first step
 
     @classmethod
-    def of(cls, store: str | Path, run: TrainedRun) -> Gauges:
+    def of(cls, source: SampleSource, run: TrainedRun, most: int = MOST_HELD_OUT) -> Gauges:
         """On the first held-out samples of a run. Raises IncompleteError without samples of both kinds."""
         settings = run.settings.model_copy(update={"device": "cpu"})
-        source = StoreSource(store, run.scene_id)
-        rows = source.refresh().tolist()
-        held = rows_held_out(source, rows, settings.hold_out)
-        held_out = [row for row, is_held in zip(rows, held, strict=True) if is_held][:MOST_HELD_OUT]
-        training = [row for row, is_held in zip(rows, held, strict=True) if not is_held]
-        if not held_out or not training:
-            raise IncompleteError(
-                f"{len(training)} training and {len(held_out)} held-out samples are complete; a report needs both"
-            )
-        with Feed(StoreSource(store, run.scene_id), settings, needs=run.needs) as feed:
+        with Feed(source, settings, needs=run.needs) as feed:
+            arrived, _ = feed.arrivals()
+            held_out = [row for row, held in arrived if held][:most]
+            training = [row for row, held in arrived if not held]
+            if not held_out or not training:
+                raise IncompleteError(
+                    f"{len(training)} training and {len(held_out)} held-out samples are complete; a report needs both"
+                )
             colour = mean_colour(batches(feed, training[:: -(-len(training) // MOST_TRAINING)], settings.batch))
             network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
             return cls(

@@ -1,0 +1,31 @@
+"""Errors of a run's network before its first step and at its end, and of the mean colour, on what is held out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.trainer.dataset import SampleSource
+from photonfarm.trainer.evaluation import batches, measure, network_predictor
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.report.gauges import Gauges
+from photonfarm.trainer.settings import MOST_HELD_OUT
+from photonfarm.trainer.trained import TrainedRun
+
+
+@dataclass(frozen=True)
+class Errors:
+    first: float
+    last: float
+    mean_colour: float
+    configurations: int
+
+
+def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
+    """Of a run; `make` gives its source anew, as each is read once."""
+    run = TrainedRun.load(folder)
+    gauges = Gauges.of(make(), run, MOST_HELD_OUT)
+    with Feed(make(), run.settings.model_copy(update={"device": "cpu"}), needs=run.needs) as feed:
+        rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]
+        network = run.network(feed.spec, (feed.geometry, feed.cloud))
+        last = measure(network_predictor(network), batches(feed, rows, run.settings.batch)).error
+    return Errors(gauges.untrained.error.mean, last.mean, gauges.mean_colour.error.mean, last.count)

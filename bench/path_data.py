@@ -40,7 +40,7 @@ from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.settings import TrainSettings
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
-from room_study import ROOT, Errors, References
+from room_study import Errors, References
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
 ARCHITECTURE = "light_transport"
@@ -78,7 +78,7 @@ class FirstSamples(StoreSource):
 
 def spec_of(told: argparse.Namespace) -> SceneSpec:
     """The spec of an experiment; raises SpecError where there is none, or none of its scene file."""
-    sys.path.append(str(ROOT / "experiments"))
+    room_study.find_experiments()
     from experiment import Experiment
 
     return Experiment.load(told.experiment, told.size).spec()

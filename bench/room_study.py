@@ -61,10 +61,15 @@ def tell(line: str) -> None:
     print(f"{time.strftime('%H:%M:%S')} {line}", file=sys.stderr, flush=True)
 
 
-def named_room(name: str) -> SceneSpec:
-    """A built-in spec, or the scene of an experiment in its small size; raises SpecError for any other name."""
+def find_experiments() -> None:
+    """Make the modules of experiments/ importable."""
     if str(EXPERIMENTS) not in sys.path:
         sys.path.insert(0, str(EXPERIMENTS))
+
+
+def named_room(name: str) -> SceneSpec:
+    """A built-in spec, or the scene of an experiment in its small size; raises SpecError for any other name."""
+    find_experiments()
     from experiment import Experiment, names
 
     return Experiment.load(name, "small").spec() if name in names() else load_spec(name)

@@ -17,6 +17,7 @@ from typing import Any
 
 from experiment import Experiment, Run
 from photonfarm.shared.processes import tied
+from photonfarm.shared.verbs import command
 
 
 class StageError(RuntimeError):
@@ -93,7 +94,7 @@ class Stages:
         log = self.folder / "logs" / f"{stage}.log"
         log.parent.mkdir(exist_ok=True)
         began = time.monotonic()
-        verb = [sys.executable, "-m", "photonfarm.shared.cli", *map(str, arguments)]
+        verb = command(*map(str, arguments))
         with log.open("ab") as output:
             code = subprocess.run(tied(verb), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
         if code:

@@ -28,6 +28,7 @@ from photonfarm.shared.estimate import Estimate
 from photonfarm.trainer.markdown import markdown_table
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Table
+from photonfarm.trainer.report.tables import with_interval
 
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT / "bench"))
@@ -93,13 +94,6 @@ def mean(estimates: Sequence[Estimate]) -> Estimate:
     return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
 
 
-def stated(estimate: Estimate, digits: int) -> str:
-    """Mean and 95 % interval."""
-    interval = confidence_interval(estimate)
-    reach = "" if interval is None else f" ({interval[0]:.{digits}f} … {interval[1]:.{digits}f})"
-    return f"{estimate.mean:.{digits}f}{reach}"
-
-
 def paper_table(rooms: list[Room], published: Table) -> str:
     """The paper's columns, each a mean over the rooms; the published figure beside each."""
     head = (
@@ -116,10 +110,11 @@ def paper_table(rooms: list[Room], published: Table) -> str:
         sets = [np.mean([room.rows[name]["metric_space"][m][key] for room in rooms]) for m, key in SETS]
         lines.append([
             name, seconds, ratio, f"{paper.seconds / unit.seconds:.2f}" if paper and unit else "",
-            stated(mean([room.metric(name, "mse") for room in rooms]), 5), f"{paper.mse:.4f}" if paper else "",
-            stated(mean([room.metric(name, "mssim") for room in rooms]), 3), f"{paper.mssim:.3f}" if paper else "",
+            with_interval(mean([room.metric(name, "mse") for room in rooms]), 5), f"{paper.mse:.4f}" if paper else "",
+            with_interval(mean([room.metric(name, "mssim") for room in rooms]), 3),
+            f"{paper.mssim:.3f}" if paper else "",
             f"{sets[0]:.1f}", f"{paper.fid:.1f}" if paper else "", f"{sets[1]:.4f}",
-            stated(mean([room.metric(name, "feature_l1", 3) for room in rooms]), 3),
+            with_interval(mean([room.metric(name, "feature_l1", 3) for room in rooms]), 3),
             f"{paper.feature_l1:.3f}" if paper else "",
         ])  # fmt: skip
     return markdown_table(head, lines)

@@ -179,7 +179,7 @@ def test_what_cannot_be_shown_is_refused(
     ))  # fmt: skip
     with pytest.raises(SpecError, match="denoise_4 needs the noisy image of a view"):
         infer.show_frames(store, denoiser, path, tmp_path / "out")
-    monkeypatch.setattr(infer, "entry_points", lambda **_: ())
+    monkeypatch.setattr(infer, "is_installed", lambda _: False)
     with pytest.raises(SpecError, match=r"the renderer, which is not installed here; .*buffers --scene .* --orbit 3`"):
         infer.rendered_frames(store, run, ["--orbit", "3"])
     monkeypatch.undo()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from photonfarm.shared.allocation import MOST_VIEWS, RHO, Allocation, best, excess, seconds
@@ -19,7 +17,7 @@ from photonfarm.shared.store import Store
 from photonfarm.shared.store.schema import bytes_of_rows
 from photonfarm.shared.store.storage import is_vacant
 from photonfarm.shared.submission import Submission, request_of
-from photonfarm.shared.verbs import GROUP
+from photonfarm.shared.verbs import command, is_installed
 
 VERB = ("scene", "cost")  # of the renderer
 
@@ -92,10 +90,9 @@ def usable_cores() -> int:
 def measured_costs(spec: str) -> SampleCosts | str:
     """What the renderer measures of a spec, or has measured before; or why it does not: what it said is on stderr."""
     name = " ".join(VERB)
-    if not entry_points(group=GROUP, name=".".join(VERB)):
+    if not is_installed(".".join(VERB)):
         return "the renderer, which measures them, is not installed here"
-    verb = [sys.executable, "-m", "photonfarm.shared.cli", *VERB, "--json", "--", spec]
-    done = subprocess.run(verb, stdout=subprocess.PIPE, check=False)
+    done = subprocess.run(command(*VERB, "--json", "--", spec), stdout=subprocess.PIPE, check=False)
     if done.returncode:
         return f"`photonfarm {name}` ended with exit code {done.returncode} here"
     try:

@@ -25,6 +25,7 @@ from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import SCENES_VARIABLE, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store, store_errors
 from photonfarm.shared.submission import request_of, submit
+from photonfarm.shared.verbs import command
 
 POLL_S = 0.5
 PLAIN_LINE_S = 15.0  # between lines where there is no terminal to draw bars on
@@ -112,12 +113,8 @@ def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]
     return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
 
 
-def _verb(arguments: list[str]) -> list[str]:
-    return [sys.executable, "-m", "photonfarm.shared.cli", *arguments]
-
-
 def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
-    code = subprocess.run(_verb(arguments), env=environment, check=False).returncode
+    code = subprocess.run(command(*arguments), env=environment, check=False).returncode
     if code:
         raise IncompleteError(f"photonfarm {arguments[0]} ended with exit code {code}; what it said stands above")
 
@@ -142,7 +139,8 @@ def _processes(
 def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
     with log.open("ab") as output:
         return subprocess.Popen(
-            tied(_verb(arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+            tied(command(*arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output,
+            stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
         )  # fmt: skip
 

@@ -7,9 +7,11 @@ becomes a bare group.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 import click
@@ -23,6 +25,16 @@ _BARE = {"store": "Look into the sample store, check it, and mend it."}
 @cache
 def _installed() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def is_installed(name: str) -> bool:
+    """Whether a verb such as "buffers" or "scene.cost" is there, of whichever service."""
+    return bool(entry_points(group=GROUP, name=name))
+
+
+def command(*arguments: str | Path) -> list[str]:
+    """A verb with its arguments, to be run as a process of its own: by this Python, whatever is on PATH."""
+    return [sys.executable, "-m", "photonfarm.shared.cli", *map(str, arguments)]
 
 
 class Umbrella(click.Group):

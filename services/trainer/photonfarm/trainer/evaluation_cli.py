@@ -54,97 +54,74 @@ inception_option = click.option(
 )  # fmt: skip
 
 
-def _asked(
-    denoisers: tuple[UntrainedDenoiser, ...], kept: tuple[int, ...], references: Path | None, inception: Path | None
-) -> list[tuple[UntrainedDenoiser, int]]:
-    """Every denoiser with every share of the pixels; raises UsageError for options that need others."""
+def measuring(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say what is measured, against what and on which device; `_how` takes all but the runs."""
+    options = (
+        store_option, runs_option, references_option, denoisers_option, kept_option, samples_option, inception_option,
+        device_option,
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _how(
+    denoisers: tuple[UntrainedDenoiser, ...],
+    kept: tuple[int, ...],
+    references: Path | None,
+    inception: Path | None,
+    **others: Any,
+) -> dict[str, Any]:
+    """What `compare` takes, every denoiser with every share of the pixels; UsageError for options that need others."""
     if kept and not denoisers:
         raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
     if inception and references is None:
         raise click.UsageError("--inception is for the columns that compare with references; name these: --references")
-    return list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
+    chosen = list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
+    return {"denoisers": chosen, "references": references, "inception": inception, **others}
 
 
 @click.command()
-@store_option
-@runs_option
-@references_option
-@denoisers_option
-@kept_option
-@samples_option
-@inception_option
-@device_option
+@measuring
 @json_option
-def evaluate(
-    store: str | Path,
-    runs: tuple[Path, ...],
-    references: Path | None,
-    denoisers: tuple[UntrainedDenoiser, ...],
-    kept: tuple[int, ...],
-    most: int,
-    inception: Path | None,
-    device: str,
-    as_json: bool,
-) -> None:
+def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: Any) -> None:
     """Measure trained networks on samples that none of them was trained on.
 
     The linear error is mean squared, of radiance × exposure, against the clean images: the targets' noise is taken out.
     With references there are the columns of the paper too: of clip(exposure · I, 0, 1)^(1/2.2). In each run's folder
     this leaves evaluation.json, with every figure, and comparison.png, a few of the images side by side.
     """
-    chosen = _asked(denoisers, kept, references, inception)
+    how = _how(**asked)
     from photonfarm.trainer.evaluate import compare, write
     from photonfarm.trainer.evaluation_table import told
     from photonfarm.trainer.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
     with _progress() as tell:
-        found = compare(
-            store, loaded, chosen, references=references, inception=inception, most=most, device=device, tell=tell
-        )
+        found = compare(store, loaded, tell=tell, **how)
     pictures = write(found, loaded)
     click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 
 @click.command()
-@store_option
-@runs_option
-@references_option
-@denoisers_option
-@kept_option
-@samples_option
-@inception_option
-@device_option
+@measuring
 @click.option("--untimed", is_flag=True, help="Leave out the time of a frame, which asks for a quiet machine.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
 def report(
-    store: str | Path,
-    runs: tuple[Path, ...],
-    references: Path | None,
-    denoisers: tuple[UntrainedDenoiser, ...],
-    kept: tuple[int, ...],
-    most: int,
-    inception: Path | None,
-    device: str,
-    untimed: bool,
-    out: Path,
-    as_json: bool,
-) -> None:
+    store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, as_json: bool, **asked: Any
+) -> None:  # fmt: skip
     """Write report.html, report.md and report.json: what was learned, at which cost, with pictures.
 
     Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
     from the scene to the image; with references, the worst cases of the first run are found and shown.
     """
-    chosen = _asked(denoisers, kept, references, inception)
+    how = _how(**asked)
     from photonfarm.trainer.report import write_report
 
     with _progress() as tell:
-        figures = write_report(
-            store, list(dict.fromkeys(runs)), out, denoisers=chosen, references=references, inception=inception,
-            most=most, device=device, tell=tell, timed=not untimed,
-        )  # fmt: skip
+        figures = write_report(store, list(dict.fromkeys(runs)), out, tell=tell, timed=not untimed, **how)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 
 

@@ -7,12 +7,10 @@ wrote, or from that verb, run as a process of its own where it is installed.
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,7 @@ from photonfarm.shared.records import F32, BasePointCloud, ViewBuffers, Visibili
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store, store_errors
 from photonfarm.shared.store.find import Query, find_samples
-from photonfarm.shared.verbs import GROUP
+from photonfarm.shared.verbs import command, is_installed
 from photonfarm.shared.view import View
 from photonfarm.trainer import animation
 from photonfarm.trainer.dataset import Batch, fill, rows_held_out
@@ -102,7 +100,7 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
 
     Raises SpecError where the verb is not installed, PhotonfarmError with its exit code where it failed.
     """
-    if not entry_points(group=GROUP, name=VERB):
+    if not is_installed(VERB):
         raise SpecError(
             "the buffers of a camera path come from the renderer, which is not installed here; where it is, run "
             f"`photonfarm {VERB} --scene {run.scene_id} {' '.join(arguments)}`, and give its file as --buffers FILE"
@@ -110,8 +108,7 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "buffers.npz"
         named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        verb = [sys.executable, "-m", "photonfarm.shared.cli", VERB, *named, *arguments]
-        code = subprocess.run(verb, stdout=subprocess.DEVNULL, check=False).returncode
+        code = subprocess.run(command(VERB, *named, *arguments), stdout=subprocess.DEVNULL, check=False).returncode
         if code:
             raise _ended(code)
         return Frames.read(file)

@@ -68,7 +68,7 @@ class Contents:
             "mean_colour": self.gauges.mean_colour.error.mean,
             "untrained": self.gauges.untrained.error.mean,
             "evaluation": rows,
-            "edit_seconds": None if self.costs is None else float(np.median(self.costs.edit_s)),
+            "edit_seconds": None if self.costs is None else self.costs.medians()["edit_s"],
             "published_table": self.published,
             "worst_cases": [asdict(case) for case in self.worst],
         }

@@ -6,15 +6,13 @@ The parts that a renderer makes are measured by its verb, in a process of its ow
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 
 from photonfarm.shared.frame_costs import FrameCosts
-from photonfarm.shared.verbs import GROUP
+from photonfarm.shared.verbs import command, is_installed
 from photonfarm.trainer.trained import TrainedRun
 from photonfarm.trainer.untrained import Untrained
 
@@ -42,15 +40,14 @@ class FrameTime:
 
 def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int]) -> FrameCosts | str:
     """What the renderer measures of the frames in some rows; or why it does not: what it said stands on stderr."""
-    if not entry_points(group=GROUP, name=VERB):
+    if not is_installed(VERB):
         return "the renderer, which makes buffers and photons, is not installed here"
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
         asked += [argument for row in rows for argument in ("--rows", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
-        verb = [sys.executable, "-m", "photonfarm.shared.cli", VERB, *asked]
-        if code := subprocess.run(verb, stdout=subprocess.DEVNULL, check=False).returncode:
+        if code := subprocess.run(command(VERB, *asked), stdout=subprocess.DEVNULL, check=False).returncode:
             return f"`photonfarm {VERB}` ended with exit code {code} here"
         return FrameCosts.read(file)
 

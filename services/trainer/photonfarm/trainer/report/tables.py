@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from photonfarm.shared.estimate import Estimate
 from photonfarm.trainer.evaluation_table import counted, notes
-from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Contents, Entry
 from photonfarm.trainer.report.plots import measures
@@ -31,14 +31,14 @@ def tables(contents: Contents) -> list[Table]:
 
 def facts(contents: Contents) -> list[tuple[str, str]]:
     """The dataset's card: names and values."""
-    card = contents.card
+    card, about = contents.card, contents.card.document()
     spec, status = card.spec, card.status
     t, owed = spec.transport, spec.credits
     return [
-        ("scene", f"{spec.name}, {card.document()['source']}, id {spec.scene_id}"),
+        ("scene", f"{spec.name}, {about['source']}, id {spec.scene_id}"),
         ("credits", "not said" if owed is None else f"“{owed.title}” by {owed.author}, {owed.licence}"),
         ("published at", NOT_AVAILABLE if owed is None or not owed.source else owed.source),
-        ("kind", card.document()["kind"]),
+        ("kind", about["kind"]),
         ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
         ("samples", f"{status.samples_complete} of {status.samples_planned} planned, {2 * t.half_spp} samples per "
                     "pixel each, in two independent halves"),
@@ -116,14 +116,14 @@ def _of_time(contents: Contents) -> str:
 
 def _paper_row(contents: Contents, entry: Entry, *, beside: bool) -> tuple[str, ...]:
     metrics, paper, unit = entry.row.metrics, entry.published, contents.measure
-    headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[3].estimate
+    headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[HEADLINE_BLOCK].estimate
     cells = [
         (f"{1e3 * entry.time.total:.1f}" if entry.time else NOT_AVAILABLE, None),
         (_ratio(entry, unit), _published_ratio(entry, unit)),
-        (_interval(None if metrics is None else metrics.mse.estimate, 5), f"{paper.mse:.4f}" if paper else ""),
-        (_interval(None if metrics is None else metrics.mssim.estimate, 3), f"{paper.mssim:.3f}" if paper else ""),
+        (with_interval(None if metrics is None else metrics.mse.estimate, 5), f"{paper.mse:.4f}" if paper else ""),
+        (with_interval(None if metrics is None else metrics.mssim.estimate, 3), f"{paper.mssim:.3f}" if paper else ""),
         (f"{metrics.fid.value:.1f}" if metrics and metrics.fid else NOT_AVAILABLE, f"{paper.fid:.1f}" if paper else ""),
-        (_interval(headline, 3), f"{paper.feature_l1:.3f}" if paper else ""),
+        (with_interval(headline, 3), f"{paper.feature_l1:.3f}" if paper else ""),
     ]
     row = [entry.name]
     for ours, theirs in cells:
@@ -143,7 +143,8 @@ def _published_ratio(entry: Entry, unit: Entry) -> str:
     return f"{entry.published.seconds / unit.published.seconds:.2f}"
 
 
-def _interval(estimate: Estimate | None, digits: int) -> str:
+def with_interval(estimate: Estimate | None, digits: int) -> str:
+    """Mean and 95 % interval."""
     if estimate is None:
         return NOT_AVAILABLE
     found = confidence_interval(estimate)
@@ -161,10 +162,10 @@ def _further(contents: Contents) -> Table:
     rows = []
     for entry in contents.entries:
         behind = None if entry.row is first else entry.row.behind(first)
-        linear = _interval(entry.row.held_out.error, 5)
+        linear = with_interval(entry.row.held_out.error, 5)
         values = (m.of(entry) for m in shown)
         cells = [NOT_AVAILABLE if value is None else f"{value:.4f}" for value in values]
-        rows.append((entry.name, linear, "" if behind is None else _interval(behind, 5), *cells))
+        rows.append((entry.name, linear, "" if behind is None else with_interval(behind, 5), *cells))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *(m.title for m in shown))
     said = []
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:

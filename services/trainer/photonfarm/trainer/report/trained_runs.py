@@ -32,7 +32,7 @@ class RunStory:
 
     name: str
     run: TrainedRun
-    state: dict[str, Any]  # of the checkpoint, without weights
+    state: dict[str, Any]  # of the checkpoint: step, following and seconds
     curve: tuple[Point, ...]
 
     @classmethod
@@ -44,7 +44,8 @@ class RunStory:
             for r in records
             if r["kind"] == "validation"
         )
-        return cls(name, run, checkpoint.load(run.folder / CHECKPOINT), tuple(points))
+        state = checkpoint.load(run.folder / CHECKPOINT)
+        return cls(name, run, {key: state[key] for key in ("step", "following", "seconds")}, tuple(points))
 
     def document(self) -> dict[str, Any]:
         """What report.json says of it."""
@@ -75,11 +76,7 @@ class RunStory:
 
 def short_names(runs: list[TrainedRun]) -> list[str]:
     """What each is called in a report: by its architecture, or its folder where that says more."""
-    architectures = [run.settings.network.architecture for run in runs]
-    if len(set(architectures)) == len(runs):
-        return list(architectures)
-    return (
-        [run.folder.name for run in runs]
-        if len({run.folder.name for run in runs}) == len(runs)
-        else [str(run.folder) for run in runs]
-    )
+    for names in ([run.settings.network.architecture for run in runs], [run.folder.name for run in runs]):
+        if len(set(names)) == len(runs):
+            return [*names]
+    return [str(run.folder) for run in runs]

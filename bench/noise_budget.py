@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
 """What a budget of core-seconds is best spent on: samples per pixel, views of a configuration, or configurations.
 
-    python bench/noise_budget.py [--rooms room movable-living-room-2] [--budget 200] [--steps 2000] [--seeds 0 1]
-                                 [--plan-seed 1] [--out docs/results]
+    python bench/noise_budget.py [--rooms movable-living-room-2 movable-dining-room] [--budget 200] [--steps 2000]
+                                 [--seeds 0 1] [--plan-seed 1] [--out docs/results]
 
 A room is a built-in spec, or an experiment of experiments/ in its small size. Costs and noise are measured as by
 `photonfarm scene cost`; each arm of `budget_arms.SHARES` gets as many configurations as the budget pays for, is trained
 on from each seed, on other configurations each time, and measured on the same held-out views. The constants of
 `photonfarm.shared.allocation` are fitted to all arms of all rooms. What is rendered and trained stays in
-build/noise_budget, and the next call goes on with it. Exit code 0, whatever comes out.
+build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene files.
+Exit code 0, whatever comes out.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
 from budget_fit import Fit, Point, fit
 from photonfarm.shared import allocation
 from photonfarm.shared.allocation import Allocation
+from photonfarm.shared.errors import SpecError
 from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer.store_source import StoreSource
 from room_study import HELD_OUT, Errors, References, each_seed, settings_of, stated
 
+ROOMS = ["movable-living-room-2", "movable-dining-room"]
 HELD_OUT_VIEWS = 48
 ARCHITECTURE = "light_transport"
 
@@ -234,14 +237,17 @@ def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dic
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", nargs="+", default=["room", "movable-living-room-2"], help="(%(default)s)")
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
     parser.add_argument("--budget", type=float, default=200.0, help="core-seconds of each arm (200)")
     room_study.add_options(parser, "noise_budget")
     parser.set_defaults(steps=2000, decay=0.88, loss="paired", demodulation=0.2)
     results.add_options(parser)
     told = parser.parse_args()
     torch.set_num_threads(1)
-    rooms = [measured_room(name, told) for name in told.rooms]
+    try:
+        rooms = [measured_room(name, told) for name in told.rooms]
+    except SpecError as error:
+        parser.error(str(error))
     found = fit([point for room in rooms for point in room.points()])
     results.write("noise_budget", page(told, rooms, found), document(told, rooms, found), told.out)
     return 0

@@ -1,0 +1,164 @@
+"""Farm and worker ended in the middle in several ways: nothing stays behind, and started again the farm goes on."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.submission import submit
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc"),
+]
+
+
+def processes_in(folder: Path) -> dict[int, str]:
+    """Command lines of all processes that run in a folder or below it, by process id."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if (process / "cwd").resolve().is_relative_to(folder.resolve()):
+                found[int(process.name)] = (process / "cmdline").read_text().replace("\0", " ")
+        except OSError:
+            continue  # ended meanwhile
+    return found
+
+
+def wait_until(reached: Callable[[], object], seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.1)
+
+
+def interruptible() -> None:
+    """A shell starts what it runs in the background deaf to SIGINT, and its children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_behind(
+    tmp_path: Path, small_room: Path
+) -> None:
+    def start(modifications: int, steps: int) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "photonfarm.shared.cli", "up", small_room.name, "--shard-rows", "4"]
+        command += ["--modifications", str(modifications), "--train-steps", str(steps)]
+        return subprocess.Popen(
+            command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True, preexec_fn=interruptible
+        )
+
+    def markers() -> int:
+        return len(list(tmp_path.glob("store/scenes/*/committed/*.json")))
+
+    def logged() -> int:
+        log = tmp_path / "run/metrics.jsonl"
+        return log.stat().st_mtime_ns if log.exists() else 0
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        before = logged()
+        farm = start(60, steps=1_000_000)
+        wait_until(lambda earlier=before: logged() > earlier)  # the trainer is at work
+        farm.send_signal(number)
+        farm.wait(150)  # a busy machine compiles kernels for a minute, and a worker ends its job first
+        assert farm.returncode != 0
+        wait_until(lambda: not processes_in(tmp_path), 60)
+
+    so_far = [json.loads(line)["step"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    committed = markers()
+    farm = start(200, steps=max(so_far) + 200)
+    wait_until(lambda: markers() > committed)
+    (redis,) = processes_in(tmp_path / "run/redis")
+    os.kill(redis, signal.SIGKILL)
+    assert farm.wait(300) == 0
+    assert markers() == 100
+    assert json.loads((tmp_path / "out/report.json").read_text())["train_steps"] == max(so_far) + 200
+    assert not processes_in(tmp_path)
+
+
+DOCKER_S = 10  # from its SIGTERM to its SIGKILL
+
+
+@pytest.fixture
+def endless_room(small_room: Path) -> Path:
+    """`small_room` with as many samples per pixel as there may be: native code that is busy for minutes."""
+    small_room.write_text(re.sub(r"(?m)^half_spp = .*$", "half_spp = 65536", small_room.read_text()))
+    return small_room
+
+
+def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[bytes]:
+    """A verb in a folder, with what it says in the file `said`."""
+    with (folder / "said").open("wb") as said:
+        return subprocess.Popen(
+            [sys.executable, "-m", "photonfarm.shared.cli", *verb],
+            cwd=folder, stderr=said, start_new_session=True, preexec_fn=interruptible, env=os.environ | environment,
+        )  # fmt: skip
+
+
+def wait_for_native_code(folder: Path) -> None:
+    """The base is written right before the first sample is rendered."""
+    wait_until(lambda: list(folder.glob("store/scenes/*/base/zarr.json")))
+    time.sleep(3)
+
+
+def assert_nothing_is_torn(folder: Path) -> None:
+    (scene,) = Store(folder / "store").scenes()
+    assert isinstance(scene, SceneStore)
+    assert scene.has_base()
+    assert scene.committed_jobs() == set()
+    assert not [file for file in scene.folder.glob("plans/*/*/c.*") if file.parent.name in ("radiance", "depth")]
+
+
+@pytest.mark.parametrize(
+    ("signals", "code", "within_s"),
+    [
+        ([signal.SIGINT], 130, DOCKER_S),
+        ([signal.SIGTERM], 143, DOCKER_S),
+        ([signal.SIGINT, signal.SIGINT], 130, 4),
+    ],
+)
+def test_up_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
+    tmp_path: Path, endless_room: Path, signals: list[signal.Signals], code: int, within_s: float
+) -> None:
+    options = ("--modifications", "8", "--views", "1", "--shard-rows", "4", "--hold-out", "0.5")
+    farm = started(tmp_path, "up", endless_room.name, *options)
+    wait_for_native_code(tmp_path)
+    told = time.monotonic()
+    for number in signals:
+        farm.send_signal(number)
+        time.sleep(0.5)
+    assert farm.wait(60) == code
+    assert time.monotonic() - told < within_s
+    assert not processes_in(tmp_path)
+    said = (tmp_path / "said").read_text()
+    assert said.count("stopping; a job in hand that is not nearly done will be rendered again") == 1
+    for log in (tmp_path / "said", *(tmp_path / "run").glob("*.log")):
+        assert "Traceback" not in log.read_text()
+    assert_nothing_is_torn(tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_work_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
+    tmp_path: Path, endless_room: Path, number: signal.Signals
+) -> None:
+    with EmbeddedRedis(tmp_path / "redis") as redis:
+        submit(str(endless_room), tmp_path / "store", redis.url, modifications=4, views=1, passes=1, seed=0)
+        worker = started(tmp_path, "work", PHOTONFARM_REDIS_URL=redis.url)
+        wait_for_native_code(tmp_path)
+        told = time.monotonic()
+        worker.send_signal(number)
+        assert worker.wait(60) == 0
+        assert time.monotonic() - told < DOCKER_S
+        assert processes_in(tmp_path).keys() == {redis.pid}
+    said = (tmp_path / "said").read_text()
+    assert said.count("stopping; a job in hand that takes longer than 5 s will be rendered again") == 1
+    assert "Traceback" not in said
+    assert_nothing_is_torn(tmp_path)

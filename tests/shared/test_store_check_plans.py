@@ -1,0 +1,283 @@
+"""`photonfarm store check` finds damage of plans, base and spec, and `--repair` has it written again."""
+
+import contextlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import checked_store as stores
+import pytest
+
+from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.plan import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.shared.top_up import TopUp
+
+scene = stores.scene
+samples, commit_all, checked, found = stores.samples, stores.commit_all, stores.checked, stores.found
+noted, data, shard, flip = stores.noted, stores.data, stores.shard, stores.flip
+marker = stores.marker
+
+
+# --------------------------------------------------------------------------------------------------- plans and base
+
+
+@pytest.mark.parametrize("name", ["view", "sample_modification", "sample_key"])
+@pytest.mark.parametrize("gone", [False, True], ids=["flipped", "missing"])
+def test_damaged_inputs_of_a_plan_are_found_and_what_is_rendered_is_checked_all_the_same(
+    store: Store, scene: SceneStore, name: str, gone: bool
+) -> None:
+    (path,) = (scene.folder / "plans/000000" / name).glob("c.0*")
+    path.unlink() if gone else flip(path, path.stat().st_size - 1)
+    flip(shard(scene, "depth", 1), 20)
+    report = checked(store, repair=True)
+    assert found(report) == {"plan-inputs": 1, "checksum": 1}
+    assert report.exit_code == 7
+    assert report.scenes[0].samples == 10
+    assert not marker(scene, 1).exists()
+    assert not shard_or_none(scene, "depth", 1)
+
+
+def test_what_is_damaged_or_missing_of_a_plan_is_named(store: Store, scene: SceneStore) -> None:
+    (view,) = (scene.folder / "plans/000000/view").glob("c.0*")
+    flip(view, view.stat().st_size - 1)
+    with pytest.raises(CorruptError, match="view: Stored and computed checksum do not match") as caught:
+        SceneStore(scene.storage, scene.scene_id).plans()
+    assert "b'" not in str(caught.value)
+    (scene.folder / "plans/000000/radiance/zarr.json").unlink()
+    (group,) = checked(store).scenes[0].groups
+    assert [finding.detail for finding in group.first if "radiance/" in str(finding.file)] == [
+        "cannot be read: radiance is missing"
+    ]
+
+
+def shard_or_none(scene: SceneStore, name: str, job: int) -> list[Path]:
+    return list((scene.folder / "plans/000000" / name).glob(f"c.{job}.*"))
+
+
+def test_a_plan_whose_keys_are_not_those_of_its_content_is_found(store: Store, scene: SceneStore) -> None:
+    """Whole by every checksum: another scene's plan."""
+    other = Store(Path(store.root).with_name("other"), create=True)
+    request = Request(modifications=5, views_per_modification=2, seed=1)
+    theirs = other.scene(other.plan(samples.small_spec(), request, shard_rows=4).scene_id)
+    for name in ("view", "sample_key"):
+        shutil.rmtree(scene.folder / "plans/000000" / name)
+        shutil.copytree(theirs.folder / "plans/000000" / name, scene.folder / "plans/000000" / name)
+    assert found(checked(store)) == {"plan": 1}
+
+
+def test_a_plan_that_is_missing_among_others_is_found(store: Store, scene: SceneStore) -> None:
+    scene.plan(Request(modifications=6, views_per_modification=2))
+    (scene.folder / "plans/000000").rename(Path(store.root).with_name("gone"))
+    assert "plan" in found(checked(store))
+
+
+@pytest.mark.parametrize("gone", ["000000", "000001", "000002"])
+@pytest.mark.parametrize("what", ["folder", "zarr.json"])
+def test_a_plan_that_is_lost_is_told_and_none_of_its_jobs_is_set_aside(
+    store: Store, scene: SceneStore, gone: str, what: str
+) -> None:
+    """Without it they cannot be rendered again; and once it is put back, nothing is wrong."""
+    for n in (6, 7):
+        scene.plan(Request(modifications=n, views_per_modification=2))
+    commit_all(scene)
+    path, aside = scene.folder / "plans" / gone, Path(store.root).with_name("aside")
+    path = path if what == "folder" else path / "zarr.json"
+    path.rename(aside)
+    report = checked(store, repair=True)
+    assert (found(report), report.scenes[0].set_aside) == ({"plan": 1}, ())
+    (group,) = report.scenes[0].groups
+    assert group.first[0].file == f"{scene.name}/plans/{gone}/zarr.json"
+    assert "the plan is missing" in group.first[0].detail
+    aside.rename(path)
+    assert noted(checked(store)) == {}
+
+
+def test_a_plan_that_is_claimed_and_not_written_yet_is_no_finding(store: Store, scene: SceneStore) -> None:
+    (scene.folder / "plans/000001/view").mkdir(parents=True)
+    (scene.folder / "plans/000001.claim").write_bytes(b"")
+    assert noted(checked(store)) == {}
+
+
+def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_away(
+    store: Store, scene: SceneStore
+) -> None:
+    """As docs/store-check.md tells it."""
+    scene.plan(Request(modifications=7, views_per_modification=2))
+    commit_all(scene)
+    clean, aside = data(scene), Path(store.root) / "quarantine/by-hand"
+    (scene.folder / "plans/000001/zarr.json").unlink()
+    assert found(checked(store)) == {"plan": 1}
+    aside.mkdir(parents=True)
+    (scene.folder / "plans/000001").rename(aside / "000001")
+    with pytest.raises(CorruptError, match="no plan has this job"):
+        Store(store.root).plan(samples.small_spec(), Request(modifications=7, views_per_modification=2))
+    marker(scene, 3).rename(aside / marker(scene, 3).name)
+    again = Store(store.root).scene(scene.scene_id)
+    assert (found(checked(store)), again.missing_jobs()) == ({}, [])
+    assert again.plan(Request(modifications=7, views_per_modification=2)).plan == 1
+    commit_all(again)
+    assert (found(checked(store)), data(scene)) == ({}, clean)
+
+
+@pytest.mark.parametrize("version", [1, 2, 4, None])
+def test_a_plan_of_another_version_is_refused_in_a_sentence_by_all_who_load_it(
+    store: Store, scene: SceneStore, version: int | None
+) -> None:
+    about = scene.folder / "plans/000000/zarr.json"
+    document = json.loads(about.read_text())
+    document["attributes"]["version"] = version
+    about.write_text(json.dumps(document))
+    said = f"has format 'photonfarm store' version {version}; this program reads and writes"
+    for look in (
+        lambda: Store(store.root).scene(scene.scene_id).plans(),
+        lambda: Store(store.root).plan(samples.small_spec(), Request(modifications=9)),
+        SceneReader(store.root, scene.scene_id).refresh,
+    ):
+        with pytest.raises(StoreError, match=said):
+            look()
+    assert said in str(store_status(Store(store.root))[0].error)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code) == ({"plan": 1}, 4)
+    assert said in report.scenes[0].groups[0].first[0].detail
+
+
+@pytest.mark.parametrize("harm", ["flip", "chunk", "marker", "index", "removed"])
+def test_a_damaged_base_is_set_aside_and_the_next_job_writes_it(store: Store, scene: SceneStore, harm: str) -> None:
+    clean = data(scene)
+    file = scene.folder / "base/cloud/position/c.0.0"
+    if harm == "flip":
+        flip(file, 20)
+    elif harm == "chunk":
+        file.unlink()
+    elif harm == "marker":
+        (scene.folder / "base/zarr.json").unlink()
+    elif harm == "removed":
+        shutil.rmtree(scene.folder / "base")
+    else:
+        geometry, cloud = samples.base()
+        shutil.rmtree(scene.folder / "base")
+        scene.write_base(replace(geometry, faces=geometry.faces + 1), cloud)
+    assert found(checked(store)) == {"base": 1}
+    report = checked(store, repair=True)
+    assert report.exit_code == 7
+    assert scene.missing_jobs() == [2]  # whole, but no other job is left to write the base
+    moved = () if harm == "removed" else ("base",)
+    assert report.scenes[0].set_aside == (*moved, "job 2 (whole; rendered again, as a job writes the base)")
+    again = checked(store, repair=True)
+    assert (noted(again), again.exit_code, again.scenes[0].set_aside) == ({"base-to-come": 1}, 0, ())
+    commit_all(scene)
+    scene.write_base(*samples.base())
+    assert data(scene) == clean
+    assert found(checked(store)) == {}
+
+
+def test_a_damaged_spec_is_set_aside_and_the_next_submission_writes_it(store: Store, scene: SceneStore) -> None:
+    clean = data(scene)
+    file = scene.folder / "spec.json"
+    whole = file.read_bytes()
+    flip(file, 30)
+    assert checked(store, repair=True).exit_code == 7
+    with pytest.raises(
+        CorruptError, match=r"spec\.json: is missing, .* `photonfarm submit` of the same spec writes it"
+    ):
+        Store(store.root).scene(scene.scene_id)
+    assert checked(store).exit_code == 4  # its plans are there without it
+    Store(store.root).plan(samples.small_spec(), Request(modifications=5, views_per_modification=2))
+    assert file.read_bytes() == whole
+    assert (found(checked(store)), data(scene)) == ({}, clean)
+
+
+# ---------------------------------------------------------------------------------------------------- plans, repaired
+
+INPUTS = ("modification", "view", "sample_modification", "sample_view", "sample_pass", "sample_key")
+
+
+@pytest.fixture
+def planned_thrice(store: Store, scene: SceneStore) -> SceneStore:
+    """A plan, one that adds to it, and a top-up."""
+    scene.plan(Request(modifications=7, views_per_modification=3))
+    scene.plan(TopUp.of("+40", ["views=first:4"]))
+    commit_all(scene)
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("name", "gone", "number"),
+    [
+        *((name, number == 1, number) for number, name in enumerate(INPUTS[:3])),
+        *((name, number != 1, number) for number, name in enumerate(INPUTS[3:])),
+        ("view/zarr.json", False, 0),
+        ("sample_key/zarr.json", True, 1),
+        ("depth/zarr.json", False, 2),
+    ],
+)
+def test_a_damaged_file_of_a_plan_is_written_again_from_the_request(
+    store: Store, planned_thrice: SceneStore, name: str, gone: bool, number: int
+) -> None:
+    scene, clean = planned_thrice, data(planned_thrice)
+    (path,) = (scene.folder / f"plans/{number:06d}").glob(name if "/" in name else f"{name}/c.0*")
+    whole = path.read_bytes()
+    path.unlink() if gone else path.write_bytes(whole.replace(b'"chunk', b'"chunc') if "/" in name else flipped(whole))
+    with contextlib.suppress(CorruptError):
+        if SceneReader(store.root, scene.scene_id).refresh().size:
+            assert name == "depth/zarr.json"  # which we do not read
+    damaged = None if gone else path.read_bytes()
+    report = checked(store)
+    assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 4)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 7)
+    assert report.scenes[0].set_aside == (f"plan {number}, written again from its request",)
+    assert data(scene) == clean
+    quarantine = Path(store.root) / report.quarantine
+    aside = quarantine / path.relative_to(store.root)
+    assert (aside.read_bytes() if aside.exists() else None) == damaged
+    (record,) = [json.loads(p.read_text()) for p in quarantine.glob("plan-*.json")]
+    assert record["why"][0]["cause"] == "plan-inputs"
+    assert found(checked(store)) == {}
+    assert SceneReader(store.root, scene.scene_id).refresh().size == sum(plan.samples for plan in scene.plans())
+
+
+def flipped(content: bytes) -> bytes:
+    return content[:-1] + bytes([content[-1] ^ 1])
+
+
+def test_several_damaged_plans_are_written_again_in_their_order(store: Store, planned_thrice: SceneStore) -> None:
+    scene, clean = planned_thrice, data(planned_thrice)
+    for number in range(3):
+        for name in ("view", "sample_view", "sample_pass"):
+            (path,) = (scene.folder / f"plans/{number:06d}/{name}").glob("c.0*")
+            flip(path, 3)
+    report = checked(store, repair=True)
+    assert (found(report), report.exit_code, data(scene) == clean) == ({"plan-inputs": 9}, 7, True)
+    assert len(report.scenes[0].set_aside) == 3
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (lambda plan: change(plan, seed=1), "its request gives another modification than is there"),
+        (lambda plan: change(plan, modifications=40), "its request does not give its 3 jobs"),
+        (lambda plan: change(plan, modifications=0), "its zarr.json cannot be read"),
+        (lambda plan: flip(plan / "sample_key/c.0.0", 30), "too little of it can be read"),
+    ],
+)
+def test_a_plan_is_not_written_again_where_its_request_may_be_another(
+    store: Store, scene: SceneStore, harm: Callable[[Path], None], said: str
+) -> None:
+    flip(scene.folder / "plans/000000/view/c.0.0", 30)
+    harm(scene.folder / "plans/000000")
+    before = data(scene)
+    report = checked(store, repair=True)
+    assert (report.exit_code, report.scenes[0].set_aside, data(scene) == before) == (4, (), True)
+    (group,) = [group for group in report.scenes[0].groups if group.cause.label == "plan"]
+    assert said in group.first[0].detail
+    assert "back from a copy of the store" in group.first[0].detail
+
+
+def change(plan: Path, **request: int) -> None:
+    about = json.loads((plan / "zarr.json").read_text())
+    about["attributes"]["request"].update(request)
+    (plan / "zarr.json").write_text(json.dumps(about))

@@ -31,7 +31,8 @@ tbody tr:nth-child(even) { background: #f7f7f7; }
 td:first-child { position: sticky; left: 0; background: inherit; }
 tbody tr { background: #fff; }
 .case { display: flex; flex-wrap: wrap; gap: .6rem; margin-bottom: 1.6rem; }
-figure { margin: 0; width: 8.5rem; } figure img { width: 100%; image-rendering: pixelated; display: block; }
+figure { margin: 0; width: 8.5rem; }
+figure img { width: 100%; image-rendering: pixelated; display: block; margin-bottom: 2px; }
 figcaption { font-size: .72rem; line-height: 1.3; overflow-wrap: anywhere; }
 p, li { max-width: 52rem; } code { overflow-wrap: anywhere; }
 ul { padding-left: 1.2rem; font-size: .88rem; color: #444; }
@@ -112,25 +113,26 @@ def _plots(title: str, drawn: list[Plot]) -> str:
 def _pictures(found: list[Case], contents: Contents) -> str:
     blocks = []
     for case in found:
-        figures = [_figure(case.target, "target", "target")]
+        figures = [_figure("target", (case.target, "target"))]
         for shown in case.shown:
-            figures.append(_figure(shown.picture, f"{shown.name}, MSE {shown.mse:.4f}", f"image by {shown.name}"))
-            figures.append(_figure(shown.difference, "difference to the target", f"difference of {shown.name}"))
+            images = (shown.picture, f"image by {shown.name}"), (shown.difference, f"difference of {shown.name}")
+            figures.append(_figure(f"{shown.name}, MSE {shown.mse:.4f}", *images))
         blocks.append(f'<h3>{escape(case.caption)}</h3><div class="case">{"".join(figures)}</div>')
     legend = (
-        f"<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>; differences to the target from black (0) to pale "
-        f"yellow ({LARGEST:g} and more). The first are the first samples of the first configurations, the others the "
-        f"worst cases of {escape(contents.entries[0].name)}, found automatically.</p>"
+        f"<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>; below each image its difference to the target, from "
+        f"black (0) to pale yellow ({LARGEST:g} and more). The first are the first samples of the first "
+        f"configurations, the others the worst cases of {escape(contents.entries[0].name)}, found automatically.</p>"
     )
     return f"<h2>Held-out views</h2>\n{legend}\n{''.join(blocks)}"
 
 
-def _figure(picture: Picture, caption: str, alt: str) -> str:
-    scale = max(1, -(-PICTURE_WIDTH // picture.shape[1]))
-    return (
-        f'<figure><img alt="{escape(alt)}" src="{png_uri(picture, scale)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
+def _figure(caption: str, *pictures: tuple[Picture, str]) -> str:
+    """Pictures with the words that stand for them, one below the other."""
+    images = "".join(
+        f'<img alt="{escape(alt)}" src="{png_uri(picture, max(1, -(-PICTURE_WIDTH // picture.shape[1])))}">'
+        for picture, alt in pictures
     )
+    return f"<figure>{images}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def _facts(contents: Contents) -> str:

@@ -14,6 +14,7 @@ from photonfarm.trainer.report.trained_runs import Point
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
 SIZE = (5.2, 3.6)  # inches, of 72 CSS pixels and a third each
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
@@ -23,7 +24,8 @@ STYLE: dict[Any, Any] = {  # names of matplotlib
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.alpha": 0.3,
-    "axes.prop_cycle": "cycler('color', ['#1f5fa8', '#c2571a', '#3b8f4d', '#8a4fa3', '#8c6d31', '#777777'])",
+    "axes.prop_cycle": "cycler('color', ['#1f5fa8', '#c2571a', '#3b8f4d', '#8a4fa3', '#8c6d31', '#777777', '#d62728', "
+    "'#17a2b8', '#e377c2', '#a6a61a'])",
 }
 
 
@@ -74,15 +76,16 @@ def _curve(axes: Axes, contents: Contents, x: Callable[[Point], float], label: s
     for story in contents.stories:
         shown = [(x(point), point.error) for point in story.curve if point.error > 0]
         axes.plot(*zip(*shown, strict=True) if shown else ([], []), marker=".", label=story.name, linewidth=1.2)
+    axes.set_yscale("log")
+    lowest = axes.get_ylim()[0]
     colour, noise = contents.gauges.mean_colour.error.mean, contents.evaluation.noise_floor
     levels = {"mean colour": colour, "noise of the targets": noise}
     for (name, value), style in zip(levels.items(), ("--", ":"), strict=True):
-        if value > 0:
+        if value > lowest / FAR_BELOW:
             axes.axhline(value, linestyle=style, color="#555555", linewidth=1, label=name)
-    axes.set_yscale("log")
     axes.set_xlabel(label)
-    axes.set_ylabel("held-out squared error")
-    axes.legend(fontsize=7, frameon=False)
+    axes.set_ylabel("held-out squared error, linear")
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 # ------------------------------------------------------------------------------------------------------ over frame time

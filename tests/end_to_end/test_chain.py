@@ -17,10 +17,11 @@ def test_the_whole_farm_renders_trains_and_reports(photonfarm, tmp_path: Path, s
     result = photonfarm(*arguments, timeout=400)
     assert result.returncode == 0, result.stderr
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert report["samples_committed"] == 32
-    assert report["train_steps"] == 40
-    assert report["samples_per_core_second"] > 0
-    assert report["val_error_last"] < report["val_error_first"]
+    assert report["dataset"]["samples_complete"] == 32
+    assert report["dataset"]["core_seconds_per_sample"] > 0
+    (run,) = report["runs"]
+    assert run["steps"] == 40
+    assert run["curve"][-1]["error"] < run["curve"][0]["error"]
     for page in ("out/preview.html", "out/report.html"):
         text = (tmp_path / page).read_text()
         assert text.count("data:image/png;base64,") >= 6

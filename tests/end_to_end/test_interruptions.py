@@ -80,7 +80,7 @@ def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_be
     os.kill(redis, signal.SIGKILL)
     assert farm.wait(300) == 0
     assert markers() == 100
-    assert json.loads((tmp_path / "out/report.json").read_text())["train_steps"] == max(so_far) + 200
+    assert json.loads((tmp_path / "out/report.json").read_text())["runs"][0]["steps"] == max(so_far) + 200
     assert not processes_in(tmp_path)
 
 

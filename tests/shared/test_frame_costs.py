@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.errors import StoreError
-from photonfarm.shared.frame_costs import PARTS, FrameCosts, Surface
+from photonfarm.shared.frame_costs import PARTS, FrameCosts, Seconds, Surface
 
 
 def made() -> FrameCosts:
@@ -15,8 +15,7 @@ def made() -> FrameCosts:
     rng = np.random.default_rng(0)
     surface = rng.integers(0, len(Surface), (2, 3, 4)).astype(np.uint8)
     parts = dict(zip(PARTS, rng.random((len(PARTS), 3)), strict=True))
-    kept, pixels = np.array([1, 4]), np.array([12, 3])
-    return FrameCosts("abc", np.array([7, 3]), surface, **parts, kept=kept, pixels=pixels, render_s=rng.random((2, 3)))
+    return FrameCosts("abc", np.array([7, 3]), surface, **parts, kept=np.array([1, 4]), render_s=rng.random((2, 3)))
 
 
 def test_costs_come_back_as_they_were_written(tmp_path: Path) -> None:
@@ -41,6 +40,16 @@ def test_medians_are_over_the_timed_frames() -> None:
     assert costs.render_medians() == {1: 5, 4: 0.2}
 
 
+def test_the_range_of_a_time_leaves_a_tenth_out_at_either_end() -> None:
+    times = np.append(np.linspace(1, 2, 10), 100)
+    assert Seconds.of(times[::-1]) == Seconds(median=pytest.approx(1 + 5 / 9), low=pytest.approx(1 + 1 / 9), high=2)
+    assert Seconds.of(np.array([3.0])) == Seconds(3, 3, 3)
+    with pytest.raises(ValueError, match="at least one"):
+        Seconds.of(np.zeros(0))
+    costs = replace(made(), edit_s=np.array([1.0, 2.0, 3.0]))
+    assert costs.parts()["edit_s"] == Seconds(2, pytest.approx(1.2), pytest.approx(2.8))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -49,7 +58,7 @@ def test_medians_are_over_the_timed_frames() -> None:
         ({"surface": np.zeros((2, 3, 4), np.int64)}, r"^surface: is int64 \(2, 3, 4\); uint8 \(N, H, W\)"),
         ({"surface": np.zeros((1, 3, 4), np.uint8)}, r"^surface: is uint8 \(1, 3, 4\); .*'N': 2"),
         ({"surface": np.full((2, 3, 4), 5, np.uint8)}, "^surface: holds 5; kinds up to 4 are allowed"),
-        ({"kept": np.array([1])}, r"^pixels: is int64 \(2,\); int64 \(K\) is required, with .*'K': 1"),
+        ({"kept": np.array([1])}, r"^render_s: is float64 \(2, 3\); float64 \(K, T\) is required, with .*'K': 1"),
         ({**dict.fromkeys(PARTS, np.ones(0)), "render_s": np.ones((2, 0))}, "^T is 0; at least 1 of each is required"),
     ],
 )
@@ -68,8 +77,8 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "changed.npz").write_bytes(whole[:number] + b"~" + whole[number + 1 :])
     with np.load(tmp_path / "whole.npz") as stored:
         arrays = dict(stored)
-    np.savez(tmp_path / "lacking.npz", **{name: arrays[name] for name in arrays if name != "pixels"})
-    np.savez(tmp_path / "unfit.npz", **{**arrays, "pixels": np.array([12])})
+    np.savez(tmp_path / "lacking.npz", **{name: arrays[name] for name in arrays if name != "kept"})
+    np.savez(tmp_path / "unfit.npz", **{**arrays, "kept": np.array([12])})
     for name in ("text", "cut", "changed", "lacking", "unfit"):
         wanted = f"{name}.npz: holds no frame costs that `photonfarm measure-frames` wrote$"
         with pytest.raises(StoreError, match=wanted):

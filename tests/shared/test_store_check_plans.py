@@ -122,7 +122,7 @@ def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_a
     assert (found(checked(store)), data(scene)) == ({}, clean)
 
 
-@pytest.mark.parametrize("version", [1, 2, 4, None])
+@pytest.mark.parametrize("version", [1, 2, 3, 5, None])
 def test_a_plan_of_another_version_is_refused_in_a_sentence_by_all_who_load_it(
     store: Store, scene: SceneStore, version: int | None
 ) -> None:

@@ -24,10 +24,26 @@ _ARRAYS = {
     "surface": ("NHW", np.uint8),
     **dict.fromkeys(PARTS, ("T", np.float64)),
     "kept": ("K", np.int64),
-    "pixels": ("K", np.int64),
     "render_s": ("KT", np.float64),
 }
 """Shape and type of each array."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seconds:
+    """Wall time of a piece of work that was timed several times."""
+
+    median: float
+    low: float  # below it are 10 % of the times, as far as so few tell
+    high: float  # above it are 10 %
+
+    @classmethod
+    def of(cls, times: NDArray[np.float64]) -> Self:
+        """Of some times, (T,); raises ValueError where there is none."""
+        if not len(times):
+            raise ValueError("times is empty; a median needs at least one")
+        low, median, high = np.quantile(times, (0.1, 0.5, 0.9)).tolist()
+        return cls(median, low, high)
 
 
 class Surface(IntEnum):
@@ -56,7 +72,6 @@ class FrameCosts:
     photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without, as the next
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees
     kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels
-    pixels: NDArray[np.int64]  # (K,) how many it has
     render_s: NDArray[np.float64]  # (K, T) one half-estimate of it: `half_spp` samples of each of these pixels
 
     def __post_init__(self) -> None:
@@ -72,13 +87,21 @@ class FrameCosts:
         if self.surface.max() > max(Surface):
             raise ValueError(f"surface: holds {self.surface.max()}; kinds up to {max(Surface)} are allowed")
 
+    def parts(self) -> dict[str, Seconds]:
+        """Of each part of a frame by its name in `PARTS`, over the timed frames."""
+        return {name: Seconds.of(getattr(self, name)) for name in PARTS}
+
+    def renders(self) -> dict[int, Seconds]:
+        """Of a half-estimate of 1/k of the pixels by k, over the timed frames."""
+        return {k: Seconds.of(times) for k, times in zip(self.kept.tolist(), self.render_s, strict=True)}
+
     def medians(self) -> dict[str, float]:
-        """Seconds of each part of a frame by its name in `PARTS`: the medians of the timed frames."""
-        return {name: float(np.median(getattr(self, name))) for name in PARTS}
+        """The medians of `parts`."""
+        return {name: part.median for name, part in self.parts().items()}
 
     def render_medians(self) -> dict[int, float]:
-        """Seconds of a half-estimate of 1/k of the pixels by k: the medians of the timed frames."""
-        return dict(zip(self.kept.tolist(), np.median(self.render_s, axis=1).tolist(), strict=True))
+        """The medians of `renders`."""
+        return {k: render.median for k, render in self.renders().items()}
 
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError where the disk refuses."""

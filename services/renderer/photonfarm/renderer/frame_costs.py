@@ -93,7 +93,6 @@ def frame_costs(
         surface,
         **dict(zip(PARTS, parts, strict=True)),
         kept=np.array(kept, np.int64),
-        pixels=np.array([film.pixels for film in films], np.int64),
         render_s=render_s,
     )
 
@@ -131,20 +130,20 @@ def _seconds(
 def _time_frame(
     scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: Frame, seed: int
 ) -> list[float]:
-    edit_s, _ = _timed(partial(_edit, scene, frame.modification))
-    buffers_s, _ = _timed(partial(scene.buffers, frame.view))
-    points_s, _ = _timed(partial(_points_seen, scene, cloud, frame))
+    edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
+    buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
+    points_s, _ = _wall_timed(partial(_points_seen, scene, cloud, frame))
     photons = _time_photons(scene, frame)
-    render_s = [_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
+    render_s = [_wall_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
     return [edit_s, buffers_s, points_s, *photons, *render_s]
 
 
 def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
     """Seconds to trace the configuration's photons, and to find which the view sees; zeros for a scene without."""
-    photons_s, (photons, _) = _timed(partial(photons_of, scene, frame.key))
+    photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
     if photons is None:
         return 0.0, 0.0
-    seen_s, _ = _timed(partial(scene.sees, frame.view, photons.position))
+    seen_s, _ = _wall_timed(partial(scene.sees, frame.view, photons.position))
     return photons_s, seen_s
 
 
@@ -158,7 +157,7 @@ def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> NDA
     return scene.sees(frame.view, position) & present
 
 
-def _timed(work: Callable[[], Result]) -> tuple[float, Result]:
+def _wall_timed(work: Callable[[], Result]) -> tuple[float, Result]:
     begun = time.perf_counter()
     result = work()
     return time.perf_counter() - begun, result

@@ -2,7 +2,8 @@
 
 They stand for pixels of the whole image: as wide a view on a smaller film, with as many light paths as the whole image
 has, since what these splat onto the lens cannot be kept to some of its pixels. The integrator takes 64 light paths per
-eye path at most, so that an image that would need more is charged too little, and none too much.
+eye path at most, so that an image that would need more is charged too little. Sides are rounded to whole pixels, so
+that the image may have a few more or fewer than 1/k.
 """
 
 from __future__ import annotations
@@ -27,7 +28,6 @@ class PartialFilm:
 
     def __init__(self, spec: SceneSpec, k: int) -> None:
         self.spec = part_of(spec, k)
-        self.pixels = self.spec.film.width * self.spec.film.height
         self._sensor = AimedSensor(self.spec)
         self._integrator = integrator_of(self.spec.transport)
 

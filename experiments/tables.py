@@ -3,139 +3,144 @@
 
     python experiments/tables.py [--size small] [--work build/experiments] [--out docs/results]
 
-Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json. What was
-found out beyond the figures stands in experiments/findings.md, which becomes the page's last part. Exit code 0, or 7
-where no report is there.
+Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json. What
+was found out beyond the figures stands in experiments/findings.md, which becomes the page's last part. Exit code 0,
+3 where a report's views are not independent, or 7 where no report is there or one is of an earlier version.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
 from experiment import HERE, Experiment, SizeName, names
-from photonfarm.shared.errors import IncompleteError
+from photonfarm.shared.errors import IncompleteError, PhotonfarmError
 from photonfarm.shared.estimate import Estimate
 from photonfarm.trainer.markdown import markdown_table
-from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Table
+from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
+from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, Table
 from photonfarm.trainer.report.tables import with_interval
+from rooms import Room, estimate
 
 ROOT = HERE.parent
 sys.path.insert(0, str(ROOT / "bench"))
 import results  # noqa: E402
 
-KINDS = {"movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS)}
-KINDS |= {"fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS), "static": ("Static rooms", {})}
+T = TypeVar("T")
+
+KINDS: Mapping[str, tuple[str, Table]] = {
+    "movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS),
+    "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
+    "static-ablation": ("The supplement's static ablation", {}),
+    "static": ("Static rooms", {}),
+}
+"""The page's parts by how the names of their experiments begin; of those that fit, the first."""
+
 ORDER = ("cnn", "feature_projection", "light_transport", "light_transport_photons")
 CLOSE = 0.1  # ≈: a gap of less than this share of the first's error
+ONE_SEED = "of these networks (one seed)"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Room:
-    """An experiment's report."""
+# -------------------------------------------------------------------------------------------------- the paper's table
 
-    name: str  # of the experiment
-    report: dict[str, Any]
-
-    @property
-    def rows(self) -> dict[str, dict[str, Any]]:
-        """Those of its evaluation, by name."""
-        return {row["name"]: row for row in self.report["evaluation"]["rows"]}
-
-    def document(self) -> dict[str, Any]:
-        """What tables.json keeps of it."""
-        evaluation = self.report["evaluation"]
-        kept = {key: evaluation[key] for key in ("samples", "units", "noise_floor", "references", "device", "threads")}
-        runs = {
-            run["name"]: {key: run[key] for key in ("parameters", "steps", "seconds")} for run in self.report["runs"]
-        }
-        rows = {name: _compact(row) for name, row in self.rows.items()}
-        return {"dataset": self.report["dataset"], "evaluation": kept, "runs": runs, "rows": rows}
-
-    def metric(self, architecture: str, metric: str, block: int | None = None) -> Estimate:
-        """Mean and standard error of a metric that each image has."""
-        found = self.rows[architecture]["metric_space"][metric]
-        found = found if block is None else found[block]
-        return Estimate(**found["estimate"])
-
-    def gap(self, first: str, second: str) -> Estimate:
-        """By how much the first's MSE is above the second's, in pairs of views; each view is a configuration."""
-        values = [np.array(self.rows[name]["metric_space"]["mse"]["values"]) for name in (first, second)]
-        return Estimate.of(values[0] - values[1])
+COLUMNS = {
+    "time per frame, ms": False, "network alone, ms (range)": False, "× light_transport": True, "MSE (95 %)": True,
+    "MSSIM (95 %)": True, "FID": True, "KID": False, "Feature L1 (95 %)": True,
+}  # fmt: skip
+"""Heads of the columns, and whether the paper has such a one."""
 
 
-def _compact(row: dict[str, Any]) -> dict[str, Any]:
-    """Time, mean and interval of each metric, and the MSE of each image."""
-    shown, linear = row["metric_space"], row["linear_mse"]
-    metrics = {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
-    metrics |= {f"feature_l1_{block}": of["estimate"] for block, of in enumerate(shown["feature_l1"] or ())}
-    metrics |= {key: shown[key] for key in ("fid", "kid", "inception")}
-    return {
-        "frame_seconds": row["frame_seconds"],
-        "linear_mse": {key: linear[key] for key in ("mean", "standard_error", "count")},
-        "mse_of_images": [round(value, 6) for value in shown["mse"]["values"]],
-        **metrics,
-    }
-
-
-def mean(estimates: Sequence[Estimate]) -> Estimate:
-    """Of several rooms, each alike: the mean of their means, of which each room is known as well as its views tell."""
-    spread = math.sqrt(sum((each.standard_error or 0) ** 2 for each in estimates)) / len(estimates)
-    return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
-
-
-def paper_table(rooms: list[Room], published: Table) -> str:
-    """The paper's columns, each a mean over the rooms; the published figure beside each."""
-    head = (
-        "architecture", "time per frame, ms", "× light transport", "paper", "MSE (95 %)", "paper", "MSSIM (95 %)",
-        "paper", "FID", "paper", "KID", "Feature L1 (95 %)", "paper",
-    )  # fmt: skip
+def paper_table(rooms: Sequence[Room], published: Table) -> str:
+    """The paper's columns, each a mean over the rooms that have the row; the published figure beside each."""
+    head = ["architecture"]
+    for column, is_published in COLUMNS.items():
+        head += [column, "paper"] if published and is_published else [column]
     lines = []
-    for name in rooms[0].rows:
-        if not all(name in room.rows for room in rooms):
-            continue
-        paper = published.get(name)
-        unit = published.get("light_transport")
-        seconds, ratio = _times(rooms, name)
-        sets = [np.mean([room.rows[name]["metric_space"][m][key] for room in rooms]) for m, key in SETS]
-        lines.append([
-            name, seconds, ratio, f"{paper.seconds / unit.seconds:.2f}" if paper and unit else "",
-            with_interval(mean([room.metric(name, "mse") for room in rooms]), 5), f"{paper.mse:.4f}" if paper else "",
-            with_interval(mean([room.metric(name, "mssim") for room in rooms]), 3),
-            f"{paper.mssim:.3f}" if paper else "",
-            f"{sets[0]:.1f}", f"{paper.fid:.1f}" if paper else "", f"{sets[1]:.4f}",
-            with_interval(mean([room.metric(name, "feature_l1", 3) for room in rooms]), 3),
-            f"{paper.feature_l1:.3f}" if paper else "",
-        ])  # fmt: skip
+    for name in _row_names(rooms):
+        ours = _ours([room for room in rooms if name in room.rows], name)
+        theirs = _theirs(published.get(name), published.get("light_transport"))
+        line = [name]
+        for cell, paper, is_published in zip(ours, theirs, COLUMNS.values(), strict=True):
+            line += [cell, paper] if published and is_published else [cell]
+        lines.append(line)
     return markdown_table(head, lines)
 
 
-SETS = (("fid", "value"), ("kid", "mean"))
-"""Metrics of sets of images, and the key of their value."""
+def lacking(rooms: Sequence[Room]) -> str:
+    """Which rows are no mean over all rooms, a sentence; empty where all are."""
+    without = {name: [room.name for room in rooms if name not in room.rows] for name in _row_names(rooms)}
+    said = "; ".join(f"{name} without {', '.join(rooms)}" for name, rooms in without.items() if rooms)
+    return f" Rows that a room lacks are means over the others: {said}." if said else ""
 
 
-def _times(rooms: list[Room], name: str) -> tuple[str, str]:
-    """Milliseconds of a frame, and their ratio to light_transport's, means over rooms."""
-    frames = [(room.rows[name]["frame_seconds"], room.rows["light_transport"]["frame_seconds"]) for room in rooms]
-    if any(own is None for own, _ in frames):
-        return "n/a", "n/a"
-    ratio = np.mean([own["total"] / unit["total"] for own, unit in frames])
-    return f"{1e3 * np.mean([own['total'] for own, _ in frames]):.1f}", f"{ratio:.2f}"
+def _row_names(rooms: Sequence[Room]) -> list[str]:
+    return list(dict.fromkeys(name for room in rooms for name in room.rows))
 
 
-def order_table(rooms: list[Room], published: Table) -> str:
-    """Neighbours in the paper's order: their gaps there, and in each room."""
-    head = ("pair", "paper: gap", *(f"{room.name}: gap (95 %)" for room in rooms))
+def _ours(rooms: Sequence[Room], name: str) -> list[str]:
+    """The cells of a row that all the rooms have."""
+
+    def each(of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
+        found = [value for room in rooms if (value := of(room.rows[name])) is not None]
+        return found if len(found) == len(rooms) else None
+
+    def averaged(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> str:
+        values = each(of)
+        return NOT_AVAILABLE if values is None else f"{np.mean(values):.{digits}f}"
+
+    def interval(metric: str, digits: int, block: int | None = None) -> str:
+        values = each(lambda row: estimate(row, metric, block))
+        return with_interval(None if values is None else mean(values), digits)
+
+    network = averaged(lambda row: 1e3 * row["network_seconds"], 1)
+    low = averaged(lambda row: 1e3 * row["network_seconds_range"][0], 1)
+    high = averaged(lambda row: 1e3 * row["network_seconds_range"][1], 1)
+    ratios = [room.time_ratio(name) for room in rooms]
+    ratio = NOT_AVAILABLE if None in ratios else f"{np.mean([*filter(None, ratios)]):.2f}"
+    total = averaged(lambda row: row["frame_seconds"] and 1e3 * row["frame_seconds"]["total"], 1)
+    return [
+        total, f"{network} ({low} … {high})", ratio, interval("mse", 5), interval("mssim", 3),
+        averaged(lambda row: _of_set(row, "fid", "value"), 1), averaged(lambda row: _of_set(row, "kid", "mean"), 4),
+        interval("feature_l1", 3, HEADLINE_BLOCK),
+    ]  # fmt: skip
+
+
+def _of_set(row: Mapping[str, Any], metric: str, key: str) -> float | None:
+    """A metric of a set of images, by the key of its value; None where it could not be computed."""
+    found = (row["metric_space"] or {}).get(metric)
+    return None if found is None else found[key]
+
+
+def _theirs(paper: Published | None, unit: Published | None) -> list[str]:
+    """The published cells of a row, as many as COLUMNS."""
+    if paper is None or unit is None:
+        return [""] * len(COLUMNS)
+    ratio = f"{paper.seconds / unit.seconds:.2f}"
+    errors = f"{paper.mse:.4f}", f"{paper.mssim:.3f}", f"{paper.fid:.1f}"
+    return ["", "", ratio, *errors, "", f"{paper.feature_l1:.3f}"]
+
+
+def mean(estimates: Sequence[Estimate]) -> Estimate:
+    """Of several rooms, each alike: the mean of their means; each is known as well as its views tell."""
+    errors = [each.standard_error for each in estimates if each.standard_error is not None]
+    spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
+    return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
+
+
+# ---------------------------------------------------------------------------------------------------------- the order
+
+
+def order_table(rooms: Sequence[Room], published: Table) -> str:
+    """Neighbours in the paper's order: their gaps there, and in each room. Raises SpecError as `Room.gap` does."""
+    head = ("pair", "paper: gap", *(f"{room.name}: gap (95 %) {ONE_SEED}" for room in rooms))
     lines = []
     for first, second in pairwise(ORDER):
         theirs = ""
@@ -147,9 +152,11 @@ def order_table(rooms: list[Room], published: Table) -> str:
 
 
 def _gap(room: Room, first: str, second: str) -> str:
-    gap, unit = room.gap(first, second), room.metric(first, "mse").mean
-    interval = confidence_interval(gap)
-    share = gap.mean / unit
+    gap = room.gap(first, second)
+    if gap is None:
+        return NOT_AVAILABLE
+    found, unit = gap
+    interval, share = confidence_interval(found), found.mean / unit
     if interval is None:
         return f"{share:+.0%}"
     known = "" if interval[0] > 0 or interval[1] < 0 else ", not told apart"
@@ -161,48 +168,124 @@ def sign(share: float) -> str:
     return "≈" if abs(share) < CLOSE else ">" if share > 0 else "<"
 
 
-def room_table(rooms: list[Room]) -> str:
-    """What each room's figures were measured on."""
-    head = ("experiment", "images", "spp", "references", "noise floor", "render, core-s", "MB", "credits")
-    lines = []
+# ---------------------------------------------------------------------------------------------------------- the rooms
+
+
+def room_table(rooms: Sequence[Room]) -> str:
+    """What each room's figures were measured on, what that cost, and whether the machine was quiet."""
+    head = (
+        "experiment", "title", "images trained on", "held out", "render of images, core-s", "reference passes",
+        "render of passes, core-s", "spp", "references", "noise floor", "MB in all", "edit, ms", "load average",
+        "credits",
+    )  # fmt: skip
+    return markdown_table(head, [_room_line(room) for room in rooms])
+
+
+def _room_line(room: Room) -> list[str]:
+    card, evaluation = room.report["dataset"], room.report["evaluation"]
+    trained_on = sorted({run["trained_on"] for run in room.report["runs"]})
+    images, passes = room.spent("samples"), room.spent("top-up")
+    references, owed = evaluation["references"], card["credits"]
+    edit, machine = room.report["edit_seconds"], room.report["machine"]
+    return [
+        room.name, room.experiment.title, " or ".join(map(str, trained_on)),
+        " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)), f"{images['core_seconds']:.0f}",
+        f"{passes['rows']}", f"{passes['core_seconds']:.0f}", f"{card['spp_per_sample']}",
+        f"{references['views']} views, {references['spp']} spp" if references else NOT_AVAILABLE,
+        f"{evaluation['noise_floor']:.3g}", f"{card['bytes'] / 1e6:.0f}",
+        NOT_AVAILABLE if edit is None else f"{1e3 * edit:.0f}",
+        NOT_AVAILABLE if machine is None else f"{machine['load_average']:.1f}",
+        "" if owed is None else f"“{owed['title']}” by {owed['author']}, {owed['licence']}",
+    ]  # fmt: skip
+
+
+def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
+    """What holds of the rooms: once where it is the same of all, or else each with the rooms that it is of."""
+    found: dict[str, list[str]] = {}
     for room in rooms:
-        card, evaluation = room.report["dataset"], room.report["evaluation"]
-        owed = card["credits"]
-        references = evaluation["references"]
-        lines.append([
-            room.name, f"{card['samples_complete']}", f"{card['spp_per_sample']}",
-            f"{references['views']} views, {references['spp']} spp", f"{evaluation['noise_floor']:.3g}",
-            f"{card['core_seconds']:.0f}", f"{card['bytes'] / 1e6:.0f}",
-            "" if owed is None else f"“{owed['title']}” by {owed['author']}, {owed['licence']}",
-        ])  # fmt: skip
-    return markdown_table(head, lines)
+        found.setdefault(of(room), []).append(room.name)
+    if len(found) == 1:
+        return next(iter(found))
+    return "; ".join(f"{what} ({', '.join(which)})" for what, which in found.items())
 
 
-def page(found: list[Room], size: SizeName) -> str:
-    """All of it as Markdown."""
-    parts = [f"# The paper's tables over our rooms, `{size}`\n\n{INTRODUCTION}"]
+# ----------------------------------------------------------------------------------------------------------- the page
+
+
+def page(found: Sequence[Room], size: SizeName) -> str:
+    """All of it as Markdown. Raises SpecError as `Room.gap` does."""
+    parts = [f"# The paper's tables over our rooms, `{size}`", introduction(found, size), READING]
     for kind, (title, published) in KINDS.items():
-        if rooms := [room for room in found if room.name.startswith(kind)]:
+        if rooms := [room for room in found if kind_of(room.name) == kind]:
             named = ", ".join(room.name for room in rooms)
-            parts.append(f"## {title}\n\nMeans over: {named}.\n\n{paper_table(rooms, published)}")
-            parts.append(f"### Neighbours in the paper's order, by MSE\n\n{order_table(rooms, published)}")
+            parts.append(f"## {title}\n\nMeans over: {named}.{lacking(rooms)}\n\n{paper_table(rooms, published)}")
+            order = f"### Neighbours in the paper's order, by MSE {ONE_SEED}"
+            parts.append(f"{order}\n\n{order_table(rooms, published)}")
             parts.append(f"### The rooms\n\n{room_table(rooms)}")
     findings = HERE / "findings.md"
     if findings.is_file():
-        parts.append(findings.read_text().strip())
-    parts.append(f"Made by `make experiments-{size}` and `python experiments/tables.py --size {size}`; "
-                 f"{results.footer('tables').removeprefix('Made by `make bench-tables` ')}")  # fmt: skip
+        parts.append(findings.read_text(encoding="utf-8").strip())
+    parts.append(
+        f"Timed on {said(found, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
+        f"`{command(size)}`, run at commit {results.commit()}."
+    )
     return "\n\n".join(parts)
 
 
-INTRODUCTION = """\
-Each row of a room is one network (or denoiser), trained from one seed on that room's images alone, at the size that
-experiments/sizes.toml states; denoisers see 1/k of the pixels of one noisy half-estimate. Errors are against references
-in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken out of MSE and is in all other
-metrics. Intervals are over held-out configurations (95 %, Student's t): they hold for these networks, another seed's
-may lie outside. FID is of as few images as there are references, so it can be compared within this page only. Time is
-from the scene to the image on one core. “paper” are the published figures, of four other rooms' average at 256²: orders
-and ratios can be compared, values cannot."""
+def kind_of(name: str) -> str:
+    """Which part of the page an experiment is in."""
+    return next(kind for kind in KINDS if name.startswith(kind))
+
+
+def command(size: SizeName) -> str:
+    """What makes the page of the reports."""
+    return f"python experiments/tables.py --size {size}"
+
+
+def introduction(found: Sequence[Room], size: SizeName) -> str:
+    """What was run, as the sizes and the reports tell."""
+    kinds: dict[str, Callable[[Room], str]] = {
+        "networks": lambda room: room.steps(denoisers=False), "denoisers": lambda room: room.steps(denoisers=True)
+    }  # fmt: skip
+    trained = [
+        f"{kind} for {said(having, steps)}"
+        for kind, steps in kinds.items()
+        if (having := [room for room in found if steps(room)])
+    ]
+    return (
+        f"The size `{size}`: {said(found, lambda room: room.experiment.size.about)}. {_resolution(found)} Each row "
+        "of a room is one network (or denoiser), trained from one seed on that room's images alone: "
+        f"{', '.join(trained)}. Denoisers see 1/k of the pixels of one noisy half-estimate."
+    )
+
+
+def _resolution(found: Sequence[Room]) -> str:
+    """Whether a GPU took part, and what is at the paper's resolution."""
+    films = said(found, lambda room: f"{room.film[0]} × {room.film[1]}")
+    at_paper = [room.name for room in found if room.film == room.paper_film]
+    if len(at_paper) == len(found):
+        reached = "everything"
+    else:
+        reached = f"of the rooms only {', '.join(at_paper)}" if at_paper else "nothing here"
+    size = f"{reached} is at the paper's resolution; images are {films}."
+    if any(room.device.startswith("cuda") for room in found):
+        return f"A GPU took part: networks ran on {said(found, lambda room: room.device)}; {size}"
+    return f"No GPU was at hand: {size}"
+
+
+READING = f"""\
+Errors are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
+out of MSE and is in all other metrics. Intervals are over held-out configurations (95 %, Student's t). They are
+{ONE_SEED}: another seed's may lie outside, and no order here is shown to be the
+architectures'. In the tables of neighbours ≈ is a gap of less than {CLOSE:.0%} of the first's error; < and > say whose
+error is larger. FID is of as few images as there are references, so it can be compared within this page only. n/a:
+not measured, or a row that a room lacks.
+
+Time is from the scene to the image on one core, without editing the scene, which all need: each room's table has it
+as “edit”. “paper” are the published figures, of four other rooms' average at 256² on the authors' machine. No value
+can be compared with ours; of the times only the ratios between networks can. Denoisers' cannot: they depend on the
+samples per pixel that are rendered for them, here those of one half, and of small images launching the renderer
+costs most."""
 
 
 def options() -> argparse.ArgumentParser:
@@ -217,14 +300,21 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Write the page; returns the exit code."""
     told = options().parse_args()
-    files = {name: told.work / told.size / name / "report/report.json" for name in names()}
-    found = [Room(name, json.loads(file.read_text())) for name, file in files.items() if file.is_file()]
-    if not found:
-        print(f"{told.work / told.size}: holds no report; `make experiments-{told.size}` makes them", file=sys.stderr)
-        return IncompleteError.exit_code
-    about = {name: Experiment.load(name, told.size).about.strip() for name in (room.name for room in found)}
-    rooms = {room.name: {"about": about[room.name], **room.document()} for room in found}
-    results.write("tables", page(found, told.size), {"size": told.size, "rooms": rooms}, told.out)
+    try:
+        files = {name: told.work / told.size / name / "report/report.json" for name in names()}
+        found = [Room.read(Experiment.load(name, told.size), file) for name, file in files.items() if file.is_file()]
+        if not found:
+            raise IncompleteError(
+                f"{told.work / told.size}: holds no report; `make experiments-{told.size}` makes them"
+            )
+        text = page(found, told.size)
+    except PhotonfarmError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    rooms = {room.name: room.document() for room in found}
+    machines = {room.name: room.report["machine"] for room in found}  # each report's, and not where this runs
+    told_of = {"command": command(told.size), "machine": machines, "size": told.size, "rooms": rooms}
+    results.write("tables", text, told_of, told.out)
     return 0
 
 

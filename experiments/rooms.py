@@ -1,0 +1,145 @@
+"""An experiment's report as the tables read it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from experiment import Experiment
+from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.estimate import Estimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Room:
+    """An experiment and its report.json."""
+
+    experiment: Experiment
+    report: dict[str, Any]
+
+    @classmethod
+    def read(cls, experiment: Experiment, file: Path) -> Self:
+        """The report in a file; raises IncompleteError for one of an earlier version."""
+        report = json.loads(file.read_text(encoding="utf-8"))
+        if "machine" not in report:
+            raise IncompleteError(
+                f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
+                f"`python experiments/run.py {experiment.name}` makes it anew"
+            )
+        return cls(experiment, report)
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+        return self.experiment.name
+
+    @property
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """Those of its evaluation, by name."""
+        return {row["name"]: row for row in self.report["evaluation"]["rows"]}
+
+    @property
+    def film(self) -> tuple[int, int]:
+        """Width and height of its images."""
+        card = self.report["dataset"]
+        return card["width"], card["height"]
+
+    @property
+    def paper_film(self) -> tuple[int, int]:
+        """Width and height of the paper's images of such a scene."""
+        film = Experiment.load(self.name, "paper").size.changes["film"]
+        return film["width"], film["height"]
+
+    @property
+    def device(self) -> str:
+        """What its networks ran on, as torch names it."""
+        return str(self.report["evaluation"]["device"])
+
+    def machine(self) -> str:
+        """What it was timed on."""
+        found = self.report["machine"]
+        return "nothing" if found is None else f"{found['cpu']}, {found['cores']} cores, {found['architecture']}"
+
+    def spent(self, kind: str) -> dict[str, Any]:
+        """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""
+        found: dict[str, Any] = self.report["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
+        return found
+
+    def steps(self, *, denoisers: bool) -> str:
+        """How long its networks were trained, or its denoisers, by their settings; empty where it has none."""
+        told = [
+            f"{run['settings']['max_steps']} steps of {run['settings']['batch']}"
+            for run in self.report["runs"]
+            if run["architecture"].startswith("denoise") == denoisers
+        ]
+        return " or ".join(dict.fromkeys(told))
+
+    def time_ratio(self, name: str) -> float | None:
+        """Seconds of a row's frame over those of light_transport's; None where either was not timed."""
+        unit = self.rows.get("light_transport")
+        own, of_unit = self.rows[name]["frame_seconds"], unit and unit["frame_seconds"]
+        return own["total"] / of_unit["total"] if own and of_unit else None
+
+    def gap(self, first: str, second: str) -> tuple[Estimate, float] | None:
+        """By how much the first's MSE is above the second's, in pairs of views, and the first's MSE.
+
+        None where either has none. Raises SpecError where a configuration has several views, which are not
+        independent.
+        """
+        pair = [self.rows.get(name) for name in (first, second)]
+        found = [row["metric_space"]["mse"] for row in pair if row is not None and row["metric_space"] is not None]
+        if len(found) < len(pair):
+            return None
+        count, views = found[0]["estimate"]["count"], len(found[0]["values"])
+        if count != views:
+            raise SpecError(
+                f"{self.name}: its {views} views are of {count} configurations; gaps are taken in pairs of views, "
+                "which are independent only where each configuration has one: set views = 1"
+            )
+        values = [np.array(mse["values"]) for mse in found]
+        return Estimate.of(values[0] - values[1]), found[0]["estimate"]["mean"]
+
+    def document(self) -> dict[str, Any]:
+        """What tables.json keeps of it."""
+        evaluation = self.report["evaluation"]
+        of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
+        of_run = ("parameters", "steps", "trained_on", "seconds")
+        return {
+            "title": self.experiment.title,
+            "about": self.experiment.about.strip(),
+            "dataset": self.report["dataset"],
+            "evaluation": {key: evaluation[key] for key in of_all},
+            "edit_seconds": self.report["edit_seconds"],
+            "runs": {run["name"]: {key: run[key] for key in of_run} for run in self.report["runs"]},
+            "rows": {name: _compact(row) for name, row in self.rows.items()},
+        }
+
+
+def estimate(row: Mapping[str, Any], metric: str, block: int | None = None) -> Estimate | None:
+    """Mean and standard error of a metric that each image has; None where it could not be computed."""
+    found = (row["metric_space"] or {}).get(metric)
+    if found is None:
+        return None
+    return Estimate(**(found if block is None else found[block])["estimate"])
+
+
+def _compact(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Times, mean and interval of each metric, and the MSE of each image."""
+    linear, shown = row["linear_mse"], row["metric_space"]
+    told = {
+        "frame_seconds": row["frame_seconds"],
+        "network_seconds": row["network_seconds"],
+        "network_seconds_range": row["network_seconds_range"],
+        "linear_mse": {key: linear[key] for key in ("mean", "standard_error", "count")},
+    }
+    if shown is None:
+        return told
+    metrics = {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
+    metrics |= {f"feature_l1_{block}": of["estimate"] for block, of in enumerate(shown["feature_l1"] or ())}
+    metrics |= {key: shown[key] for key in ("fid", "kid", "inception")}
+    return {**told, "mse_of_images": [round(value, 6) for value in shown["mse"]["values"]], **metrics}

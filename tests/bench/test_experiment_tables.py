@@ -1,0 +1,193 @@
+"""The page over the experiments' reports: what it says of them, and what it says where something is missing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import tables
+from experiment import Experiment
+from photonfarm.shared.errors import IncompleteError, SpecError
+from rooms import Room
+
+NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")
+MACHINE = {"cpu": "Some CPU", "cores": 2, "architecture": "x86_64", "load_average": 0.4}
+
+
+def of_images(values: list[float]) -> dict[str, Any]:
+    mean = sum(values) / len(values)
+    return {"estimate": {"mean": mean, "standard_error": mean / 10, "count": len(values)}, "values": values}
+
+
+def row(name: str, place: int, mse: float) -> dict[str, Any]:
+    """A row of a report's evaluation, of four views, each a configuration."""
+    return {
+        "name": name,
+        "network_seconds": 0.02,
+        "network_seconds_range": [0.019, 0.023],
+        "frame_seconds": {"total": 0.1 * (place + 1)},
+        "linear_mse": {"mean": 1.0, "standard_error": 0.1, "count": 4},
+        "metric_space": {
+            "mse": of_images([mse, 1.1 * mse, 0.9 * mse, mse]),
+            "mssim": of_images([0.7] * 4),
+            "flip": of_images([0.2] * 4),
+            "feature_l1": [of_images([0.1 * (block + 1)] * 4) for block in range(4)],
+            "fid": {"value": 120.0},
+            "kid": {"mean": 0.05},
+            "inception": {"source": "somewhere"},
+        },
+    }  # fmt: skip
+
+
+def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 64) -> dict[str, Any]:
+    """A report.json: 896 images, 769 of them trained on, and 4032 reference passes."""
+    return {
+        "machine": MACHINE,
+        "edit_seconds": 0.1486,
+        "dataset": {
+            "width": film, "height": film, "spp_per_sample": 8, "credits": None, "bytes": 694e6,
+            "spent": {
+                "samples": {"rows": 896, "core_seconds": 527.2}, "top-up": {"rows": 4032, "core_seconds": 725.4},
+            },
+        },
+        "runs": [
+            {
+                "name": name, "architecture": name, "trained_on": 769, "parameters": 1000, "steps": steps,
+                "seconds": {}, "settings": {"max_steps": steps, "batch": 2, "seed": 0},
+            }
+            for name in rows
+        ],
+        "evaluation": {
+            "samples": 112, "units": 112, "noise_floor": 0.07, "device": "cpu", "threads": 1,
+            "references": {"views": 4, "spp": 512},
+            "rows": [row(name, place, 0.01 * (place + 1)) for place, name in enumerate(rows)],
+        },
+    }  # fmt: skip
+
+
+def room(name: str, document: dict[str, Any] | None = None) -> Room:
+    return Room(Experiment.load(name, "small"), document or report())
+
+
+def cells(page: str, first: str) -> list[str]:
+    """The cells of the table's line that begins so; the head stands above it."""
+    line = next(line for line in page.splitlines() if line.startswith(f"| {first} |"))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
+    page = tables.room_table([room("movable-living-room-2")])
+    told = dict(zip(cells(page, "experiment"), cells(page, "movable-living-room-2"), strict=True))
+    assert told["title"] == "Movable objects and lights: The White Room"
+    assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
+    assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
+    assert told["edit, ms"] == "149"
+    assert told["load average"] == "0.4"
+
+
+def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
+    rooms = [room("movable-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
+    assert tables.lacking(rooms) == (
+        " Rows that a room lacks are means over the others: denoise_4 without movable-living-room."
+    )
+    page = tables.paper_table(rooms, tables.MOVABLE_LIGHTS)
+    assert cells(page, "denoise_4")[1] == "500.0"
+    assert cells(page, "cnn")[:6] == ["cnn", "400.0", "20.0 (19.0 … 23.0)", "2.00", "0.78", cells(page, "cnn")[5]]
+
+
+def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
+    own = (*NETWORKS, "light_transport_without_descriptor")
+    found = [room("static-ablation", report(own, steps=1200, film=128)), room("static-kitchen")]
+    page = tables.page(found, "small")
+    ablation, static = page.split("## The supplement's static ablation")[1].split("## Static rooms")
+    assert "| light_transport_without_descriptor |" in ablation
+    assert "Means over: static-ablation.\n" in ablation
+    assert "Means over: static-kitchen.\n" in static
+    assert "without_descriptor" not in static
+    assert "paper |" not in static.split("### Neighbours")[0]  # it published no table of these
+
+
+def test_the_page_says_how_long_was_trained_and_whether_a_gpu_took_part() -> None:
+    rooms = {"fixed-living-room": report((*NETWORKS, "denoise_4")), "fixed-dining-room": report(steps=1200)}
+    page = tables.page([room(name, document) for name, document in rooms.items()], "small")
+    assert "No GPU was at hand: nothing here is at the paper's resolution; images are 64 × 64." in page
+    networks = "networks for 3000 steps of 2 (fixed-living-room); 1200 steps of 2 (fixed-dining-room)"
+    assert f"{networks}, denoisers for 3000 steps of 2. " in page
+    assert "Timed on Some CPU, 2 cores, x86_64. " in page
+    assert "one seed" in page
+    assert "python experiments/tables.py --size small" in page
+
+
+def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
+    large = report(film=256)
+    large["evaluation"]["device"] = "cuda"
+    page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small")
+    assert (
+        "A GPU took part: networks ran on cuda (fixed-living-room); cpu (fixed-dining-room); of the rooms only" in page
+    )
+    assert "images are 256 × 256 (fixed-living-room); 64 × 64 (fixed-dining-room)." in page
+
+
+def test_rooms_of_several_machines_are_named_with_theirs() -> None:
+    other = {**report(), "machine": {**MACHINE, "cpu": "Another"}}
+    found = [room("fixed-living-room"), room("fixed-dining-room", other)]
+    assert tables.said(found, Room.machine) == (
+        "Some CPU, 2 cores, x86_64 (fixed-living-room); Another, 2 cores, x86_64 (fixed-dining-room)"
+    )
+
+
+def test_what_could_not_be_measured_is_not_available() -> None:
+    """Without Inception, with one reference, without times, and without the row that times are ratios of."""
+    bare = report(("cnn", "feature_projection"))
+    for of_row in bare["evaluation"]["rows"]:
+        of_row["metric_space"] |= {"feature_l1": None, "fid": None, "kid": None, "inception": None}
+        of_row["metric_space"]["mse"] = {
+            "estimate": {"mean": 0.01, "standard_error": None, "count": 1}, "values": [0.01],
+        }  # fmt: skip
+    bare["evaluation"]["rows"][1]["frame_seconds"] = None
+    bare |= {"machine": None, "edit_seconds": None}
+    found = room("movable-living-room", bare)
+    page = tables.page([found], "small")
+    assert cells(page, "cnn")[1:] == [
+        "100.0", "20.0 (19.0 … 23.0)", "n/a", "0.78", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827",
+        "n/a", "33.7", "n/a", "n/a", "0.199",
+    ]  # fmt: skip
+    assert cells(page, "feature_projection")[1] == "n/a"
+    assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
+    json.dumps(found.document())
+
+
+def test_gaps_of_views_that_share_a_configuration_are_refused() -> None:
+    shared = report()
+    for of_row in shared["evaluation"]["rows"]:
+        of_row["metric_space"]["mse"]["estimate"]["count"] = 2
+    with pytest.raises(SpecError, match=r"its 4 views are of 2 configurations; .* set views = 1"):
+        room("movable-living-room", shared).gap("cnn", "feature_projection")
+
+
+def test_an_earlier_version_s_report_is_refused_with_what_makes_it_anew(tmp_path: Path) -> None:
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps({key: value for key, value in report().items() if key != "machine"}))
+    with pytest.raises(IncompleteError, match=r"experiments/run\.py movable-living-room` makes it anew"):
+        Room.read(Experiment.load("movable-living-room", "small"), file)
+
+
+def test_tables_are_written_with_the_command_and_each_report_s_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "work" / "small" / "movable-living-room" / "report" / "report.json"
+    file.parent.mkdir(parents=True)
+    arguments = ["--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
+    assert tables.main() == IncompleteError.exit_code
+    file.write_text(json.dumps(report()))
+    assert tables.main() == 0
+    document = json.loads((tmp_path / "out" / "tables.json").read_text())
+    assert document["command"] == "python experiments/tables.py --size small"
+    assert document["machine"] == {"movable-living-room": MACHINE}
+    assert document["rooms"]["movable-living-room"]["runs"]["cnn"]["trained_on"] == 769
+    assert str(tmp_path) not in (tmp_path / "out" / "tables.md").read_text()

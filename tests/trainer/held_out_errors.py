@@ -23,9 +23,9 @@ class Errors:
 def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
     """Of a run; `make` gives its source anew, as each is read once."""
     run = TrainedRun.load(folder)
-    gauges = Gauges.of(make(), run, MOST_HELD_OUT)
     with Feed(make(), run.settings.model_copy(update={"device": "cpu"}), needs=run.needs) as feed:
         rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]
+        gauges = Gauges.of(make(), run, rows)
         network = run.network(feed.spec, (feed.geometry, feed.cloud))
         last = measure(network_predictor(network), batches(feed, rows, run.settings.batch)).error
     return Errors(gauges.untrained.error.mean, last.mean, gauges.mean_colour.error.mean, last.count)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from photonfarm.shared.errors import SpecError
-from photonfarm.trainer.metrics import confidence_interval, flip, metric_space, mse, mssim
+from photonfarm.trainer.metrics import confidence_interval, flip, image_metrics, metric_space, mse, mssim
+from photonfarm.trainer.metrics.image_metrics import CHUNK
 from photonfarm.trainer.metrics.intervals import PerImage, t_975
 
 
@@ -72,6 +73,23 @@ def test_a_prediction_is_compared_with_one_reference_of_its_size(metric) -> None
 def test_mse_is_the_mean_squared_difference_of_each_image() -> None:
     black, greys = torch.zeros(3, 4, 5, 3), torch.tensor([0.0, 0.1, 0.5])
     assert mse(greys[:, None, None, None].expand(3, 4, 5, 3), black) == pytest.approx([0, 0.01, 0.25])
+
+
+def test_of_what_was_made_from_half_a_the_noise_is_taken_out_as_well() -> None:
+    """f = A as it is: (f − A)(f − B) is 0 whatever the noise, and f² − 2fB + AB averages to A's variance."""
+    rng = np.random.default_rng(0)
+    a, b = (torch.from_numpy(0.5 + 0.1 * rng.standard_normal((50, 16, 16, 3))).float() for _ in "ab")
+    assert mse(a, a, b) == pytest.approx(0)
+    found = mse(a, a, b, having_seen_a=True)
+    assert found.mean() == pytest.approx(0.01, abs=4 * found.std() / 50**0.5)
+
+
+def test_images_are_taken_a_few_at_a_time_and_all_of_them() -> None:
+    images, wanted, a, b = (_pictures(2 * CHUNK + 3, (16, 16), seed) for seed in range(4))
+    found = image_metrics(images, wanted, None, None, (a, b), having_seen_a=True)
+    expected = mse(metric_space(images), metric_space(a), metric_space(b), having_seen_a=True)
+    assert found.mse.values == pytest.approx(expected.tolist())
+    assert len(found.mssim.values) == len(found.flip.values) == 2 * CHUNK + 3
 
 
 # --------------------------------------------------------------------------------------------------------- intervals

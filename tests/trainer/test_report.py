@@ -1,7 +1,9 @@
 """A run on a real store, filled while it trains, and its report."""
 
 import json
+import os
 import re
+import shutil
 import threading
 import time
 from dataclasses import asdict, replace
@@ -12,17 +14,19 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.frame_costs import PARTS, FrameCosts
+from photonfarm.shared.frame_costs import PARTS, FrameCosts, Seconds
 from photonfarm.shared.plan import Request
 from photonfarm.shared.store import Store, store_status
 from photonfarm.shared.store.find import Query
 from photonfarm.shared.store.merge import merge_views
+from photonfarm.shared.top_up import TopUp
+from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.loop import SETTINGS, train
+from photonfarm.trainer.loop import CHECKPOINT, SETTINGS, train
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.frame_times import frame_time
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
-from photonfarm.trainer.report.trained_runs import short_names
+from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 from photonfarm.trainer.untrained import Untrained
@@ -63,6 +67,8 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     assert of_run["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
     assert of_run["bottleneck"] == bottleneck(of_run["waits"])
     assert of_run["samples_per_used"] == 1.0
+    assert of_run["trained_on"] == 40 - figures["evaluation"]["samples"]
+    assert of_run["curve"][-1]["used"] == of_run["trained_on"], "120 draws of fewer than 40 samples"
     assert dataset["core_seconds_per_sample"] == pytest.approx(5 * 0.5 / 40)
     (row,) = figures["evaluation"]["rows"]
     assert row["linear_mse"]["mean"] < figures["untrained"]
@@ -118,7 +124,7 @@ def test_a_report_without_held_out_samples_says_so(scene, commit, make_source, t
     train(source, tiny(max_steps=1), run)
     scene.plan(Request(modifications=1), shard_rows=8)
     commit(scene, 0)
-    with pytest.raises(IncompleteError, match="samples are complete; a report needs both"):
+    with pytest.raises(IncompleteError, match="none of the 1 complete samples is held out"):
         write_report(scene.folder.parent.parent, run, tmp_path / "out")
 
 
@@ -169,7 +175,9 @@ def test_several_runs_and_denoisers_stand_beside_the_published_figures(measured,
     assert scene.spec.lights, "of movable lights, so that the paper's second table is the one beside ours"
     assert figures["published_table"].startswith("Table 2")
     assert rows["light_transport"]["published"] == asdict(MOVABLE_LIGHTS["light_transport"])
-    assert rows["fill-in 1/4"]["published"] is None
+    assert rows["fill-in 1/4"]["published"] is rows["fill-in 1/4"]["architecture"] is None
+    assert figures["machine"]["cores"] == os.cpu_count()
+    assert len(figures["machine"]["load_average"]) == 3
     text = (tmp_path / "out/report.md").read_text()
     lines = [line for line in text.splitlines() if line.startswith("| light_transport |")]
     mse = rows["light_transport"]["metric_space"]["mse"]["estimate"]["mean"]
@@ -192,6 +200,54 @@ def test_the_dataset_s_card_says_whom_it_is_owed_to_and_how_it_was_made(measured
     assert "“A closed form” by Lambert &amp; Sons, CC0-1.0" in page, "what a spec says is text and no markup"
 
 
+def test_the_paper_s_rows_go_by_architecture_also_where_runs_are_called_by_their_folders(measured, tmp_path) -> None:
+    store, runs, references = measured
+    again = tmp_path / "again"
+    shutil.copytree(runs[0], again)
+    figures = write_report(store, [runs[0], again], tmp_path / "out", references=references)
+    rows = figures["evaluation"]["rows"]
+    assert [row["name"] for row in rows] == ["light_transport", "again"]
+    assert rows[1]["published"] == rows[0]["published"] == asdict(MOVABLE_LIGHTS["light_transport"])
+
+
+def test_passes_for_references_count_neither_as_samples_nor_as_their_cost(measured, scene, commit, tmp_path) -> None:
+    """Of 32 samples in 4 jobs, then further passes; each job of these tests takes half a second."""
+    store, runs, _ = measured
+    before = write_report(store, runs[:1], tmp_path / "before")
+    scene.plan(TopUp.of("+64", ["held-out=0.4"]))
+    for job in range(4, scene.jobs()):
+        commit(scene, job)
+    settings = TrainedRun.load(runs[0]).settings
+    train(StoreSource(store, scene.scene_id), settings.model_copy(update={"max_steps": 8}), runs[0])
+    after = write_report(store, runs[:1], tmp_path / "after")
+    spent, further = after["dataset"]["spent"], after["dataset"]["samples_complete"] - 32
+    assert further > 0
+    assert spent["samples"] == before["dataset"]["spent"]["samples"] == {"planned": 32, "rows": 32, "core_seconds": 2.0}
+    assert spent["top-up"]["rows"] == spent["top-up"]["planned"] == further
+    assert spent["top-up"]["core_seconds"] == 0.5 * (scene.jobs() - 4)
+    assert after["dataset"]["core_seconds_per_sample"] == 2.0 / 32
+    (run,) = after["runs"]
+    assert run["trained_on"] == before["runs"][0]["trained_on"], "what was added is held out"
+    assert run["curve"][-1]["samples"] == 32 + further
+    assert run["curve"][-1]["used"] == min(run["draws"], run["trained_on"])
+    page = (tmp_path / "after/report.html").read_text()
+    assert "32 of 32 planned, " in page
+    assert f", in two independent halves; and {further} further passes" in page
+
+
+def test_a_run_s_versions_are_those_it_was_trained_with_and_threads_count_as_cores(measured, tmp_path) -> None:
+    story = RunStory.of("one", TrainedRun.load(measured[1][0]))
+    state = checkpoint.load(measured[1][0] / CHECKPOINT)
+    checkpoint.save(measured[1][0] / CHECKPOINT, {**state, "versions": {"torch": "0.1"}})
+    assert RunStory.of("one", TrainedRun.load(measured[1][0])).document()["versions"] == {"torch": "0.1"}
+    point = story.curve[-1]
+    run = replace(story.run, settings=story.run.settings.model_copy(update={"threads": 2, "device": "cpu"}))
+    assert replace(story, run=run).step_core_s(point) == 2 * point.train_s
+    run = replace(run, settings=run.settings.model_copy(update={"device": "cuda"}))
+    assert replace(story, run=run).step_core_s(point) == point.train_s
+    assert replace(story, run=run).on_gpu
+
+
 def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measured, tmp_path) -> None:
     """The renderer does not know the analytic scene, and ends with an error."""
     store, runs, _ = measured
@@ -205,20 +261,21 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
     parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 0.2, 0.4, 0.8), strict=True)}
     surface = np.zeros((1, 8, 8), np.uint8)
     kept = np.array([1, 4])
-    costs = FrameCosts(
-        "0" * 32, np.array([3]), surface, **parts, kept=kept, pixels=64 // kept, render_s=np.array([[5.0], [2.0]])
-    )
-    assert frame_time(TrainedRun.load(transport), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
-    assert frame_time(TrainedRun.load(denoiser), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 2.0)
+    costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, kept=kept, render_s=np.array([[5.0], [2.0]]))
+    network = Seconds(1.0, 0.9, 1.1)
+    assert frame_time(TrainedRun.load(transport), network, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
+    of_denoiser = frame_time(TrainedRun.load(denoiser), network, costs)
+    assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
+    assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
     settings = TrainedRun.load(transport).settings
-    assert frame_time(Untrained("none", 1, settings), 1.0, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
+    assert frame_time(Untrained("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(
             update={"network": settings.network.model_copy(update={"architecture": "light_transport_photons"})}
         ),
     )
-    assert frame_time(with_photons, 1.0, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
+    assert frame_time(with_photons, network, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
 
 
 def test_runs_are_called_by_what_tells_them_apart(measured) -> None:

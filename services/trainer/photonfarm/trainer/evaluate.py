@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from photonfarm.shared.errors import SpecError
+from photonfarm.shared.errors import IncompleteError, SpecError
 from photonfarm.shared.estimate import Estimate, group_means
+from photonfarm.shared.frame_costs import Seconds
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.shared.store import store_errors
-from photonfarm.shared.store.merge import Merged
 from photonfarm.trainer.animation import write_png
 from photonfarm.trainer.comparison import COMPARISON, comparison
 from photonfarm.trainer.dataset import Batch, kept_count
 from photonfarm.trainer.device import described, usable_device
-from photonfarm.trainer.evaluation import HeldOut, Predictor, batches, measure
-from photonfarm.trainer.evaluation_samples import References, Samples, Target, read_references
+from photonfarm.trainer.evaluation import NONE_COMPLETE, DevicePredictor, HeldOut, Predictor, batches, by_turns, measure
+from photonfarm.trainer.evaluation_samples import Reference, References, Samples, Target, read_references
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.metrics import (
     Features,
@@ -37,6 +37,7 @@ from photonfarm.trainer.metrics import (
     load_inception,
     reference_features,
 )
+from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
@@ -44,7 +45,7 @@ from photonfarm.trainer.untrained import Untrained
 
 EVALUATION = "evaluation.json"
 
-Choose = Callable[[Mapping[int, F32], Mapping[int, Merged]], Sequence[int]]
+Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
 """Rows to show beside the first ones: of the first predictor's images (H, W, 3), and of the references that some have.
 """
 
@@ -59,7 +60,7 @@ class Row:
     name: str
     kept: int | None  # it is given one of so many pixels of half A; None: no colour
     held_out: HeldOut  # linear radiance × exposure, noise removed
-    seconds: float  # of its network alone, for one image
+    seconds: Seconds  # of its network alone, for one image
     metrics: ImageMetrics | None  # of what a display shows; None where no view has a reference
     shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
 
@@ -75,7 +76,8 @@ class Row:
         error, behind = self.held_out.error, self.behind(first)
         return {
             "predictor": self.name,
-            "network_seconds": self.seconds,
+            "network_seconds": self.seconds.median,
+            "network_seconds_range": [self.seconds.low, self.seconds.high],
             "linear_mse": {
                 "mean": error.mean,
                 "standard_error": error.standard_error,
@@ -95,12 +97,17 @@ class Evaluation:
     scene: str
     scene_id: str
     unit: str  # what is independent: "configuration" or, of a static scene, "view"
-    samples: int  # of which those that are complete no longer are left out
+    measured: tuple[int, ...]  # rows of the store, of which those that are complete no longer are left out
     device: str  # of the networks
     threads: int  # of torch on the CPU
     references: References | None
     rows: tuple[Row, ...]
     shown: tuple[Target, ...]
+
+    @property
+    def samples(self) -> int:
+        """How many samples all were measured on."""
+        return len(self.measured)
 
     @property
     def noise_floor(self) -> float:
@@ -158,17 +165,17 @@ def compare(
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found else None
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
-    leading = test.measured(first)
+    untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    leading, *others = test.timed([*runs, *untrained])
+    first_of_all = test.measured(leading)
     if choose:
-        shown += [row for row in choose(leading.images, found) if row not in shown]
-    others: list[TrainedRun | Untrained] = list(runs[1:])
-    others += [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
-    rows = [leading.row(shown), *(test.measured(other).row(shown) for other in others)]
+        shown += [row for row in dict.fromkeys(choose(first_of_all.images, found)) if row not in shown]
+    rows = [first_of_all.row(shown), *(test.measured(other).row(shown) for other in others)]
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
         unit="configuration" if spec.groups else "view",
-        samples=len(samples.rows),
+        measured=tuple(samples.rows),
         device=described(place),
         threads=first.settings.threads,
         references=References.of(found, spec.transport.half_spp),
@@ -222,20 +229,28 @@ class _Watched:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Timed:
+    """A predictor that is ready, and how long one image takes it."""
+
+    predictor: TrainedRun | Untrained
+    predict: DevicePredictor
+    seconds: Seconds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Measured:
     """A predictor that was put to the test, with its images of all rows that may be shown."""
 
-    predictor: TrainedRun | Untrained
+    timed: _Timed
     held_out: HeldOut
-    seconds: float
     metrics: ImageMetrics | None
     images: dict[int, F32]
 
     def row(self, shown: Sequence[int]) -> Row:
         """Its row, with the images of some rows of the store."""
         images = {row: self.images[row] for row in shown if row in self.images}
-        predictor = self.predictor
-        return Row(predictor.name, predictor.needs.kept, self.held_out, self.seconds, self.metrics, images)
+        predictor, seconds = self.timed.predictor, self.timed.seconds
+        return Row(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,41 +259,55 @@ class _Test:
 
     store: str | Path
     samples: Samples
-    references: Mapping[int, Merged]  # by row
+    references: Mapping[int, Reference]  # by row
     shown: list[int]  # rows
     inception: Inception | None
     device: str
     tell: Tell
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def measured(self, predictor: TrainedRun | Untrained) -> _Measured:
-        settings = predictor.settings.model_copy(update={"device": self.device})
-        rows, total = self.samples.rows, len(self.samples.rows)
-        with Feed(StoreSource(self.store, self._scene_id), settings, needs=predictor.needs) as feed:
+    def timed(self, predictors: Sequence[TrainedRun | Untrained]) -> list[_Timed]:
+        """All of them, timed by turns on the first sample."""
+        calls = [self._call(predictor) for predictor in predictors]
+        ready = zip(predictors, calls, by_turns(calls), strict=True)
+        return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
+
+    def _call(self, predictor: TrainedRun | Untrained) -> tuple[DevicePredictor, Inputs]:
+        with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
+            for batch in batches(feed, self.samples.rows, 1):
+                return predict, predict.of_its_own(batch.inputs)
+        raise IncompleteError(NONE_COMPLETE)
+
+    def measured(self, timed: _Timed) -> _Measured:
+        """On all samples."""
+        predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
+        with self._feed(predictor, batch=size) as feed:
             watched = _Watched(
-                predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, total)
+                timed.predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, len(rows))
             )
-            held_out = measure(watched, batches(feed, rows, settings.batch))
-            seconds = predict.seconds(next(batches(feed, rows, 1)).inputs)
-        return _Measured(predictor, held_out, seconds, self._metrics(watched), watched.images)
+            held_out = measure(watched, batches(feed, rows, size))
+        metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
+        return _Measured(timed, held_out, metrics, watched.images)
 
-    @property
-    def _scene_id(self) -> str:
-        return self.samples.source.spec.scene_id
+    def _feed(self, predictor: TrainedRun | Untrained, *, batch: int) -> Feed:
+        settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
+        source = StoreSource(self.store, self.samples.source.spec.scene_id)
+        return Feed(source, settings, needs=predictor.needs)
 
-    def _metrics(self, watched: _Watched) -> ImageMetrics | None:
+    def _metrics(self, watched: _Watched, *, having_seen_a: bool) -> ImageMetrics | None:
         rows = [row for row in watched.images if row in self.references]
         if not rows:
             return None
-        exposure = np.float32(self.samples.source.spec.exposure)
-        mean, a, b = (
-            np.stack([exposure * getattr(self.references[row], image).astype(np.float32) for row in rows])
-            for image in ("mean", "half_a", "half_b")
+        mean, *halves = (
+            np.stack([getattr(self.references[row], image) for row in rows]) for image in ("mean", "half_a", "half_b")
         )
         images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
         known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
-        return image_metrics(images, mean, self.inception, units, halves=(a, b), wanted_features=known)
+        return image_metrics(
+            images, mean, self.inception, units, (halves[0], halves[1]), having_seen_a=having_seen_a,
+            wanted_features=known,
+        )  # fmt: skip
 
     def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
         """Those of the references of some rows, which are the same for nearly all predictors."""

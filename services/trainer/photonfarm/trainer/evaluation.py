@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from statistics import median
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.estimate import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
+from photonfarm.shared.frame_costs import Seconds
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.trainer.dataset import Batch
@@ -39,7 +39,10 @@ class HeldOut:
     units: tuple[Key, ...]  # (n,) what each is held out by: equal for those of one configuration
 
 
-WARM_CALLS, TIMED_CALLS = 2, 9
+NONE_COMPLETE = "none of the samples to measure on is complete at present; wait for the workers"
+
+WARM_ROUNDS, TIMED_ROUNDS = 2, 15
+"""Calls of each predictor, all by turns: what else the machine does then is the same for all of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,19 +58,16 @@ class DevicePredictor:
         images: F32 = self.images(self._there(batch.inputs)).cpu().numpy()
         return images
 
-    @torch.no_grad()
-    def seconds(self, inputs: Inputs) -> float:
-        """Wall time of the images of these inputs alone: they lie on the device, and results are left there.
-
-        The median of `TIMED_CALLS` calls, after `WARM_CALLS` that do not count.
-        """
-        there = self._there(inputs)
-        return median([self._timed(there) for _ in range(WARM_CALLS + TIMED_CALLS)][WARM_CALLS:])
+    def of_its_own(self, inputs: Inputs) -> Inputs:
+        """A copy of these inputs on its device, which outlives their batch."""
+        return map_tensors(lambda tensor: tensor.to(self.device, copy=True), inputs)
 
     def _there(self, inputs: Inputs) -> Inputs:
         return map_tensors(lambda tensor: tensor.to(self.device), inputs)
 
-    def _timed(self, inputs: Inputs) -> float:
+    @torch.no_grad()
+    def wall_s(self, inputs: Inputs) -> float:
+        """Seconds that the images of these inputs take; they lie on the device, and results are left there."""
         self._wait()
         began = time.perf_counter()
         self.images(inputs)
@@ -77,6 +77,12 @@ class DevicePredictor:
     def _wait(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
+
+
+def by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
+    """What each predictor's images of its inputs take, over `TIMED_ROUNDS` rounds of all; inputs are `of_its_own`."""
+    rounds = [[predict.wall_s(inputs) for predict, inputs in calls] for _ in range(WARM_ROUNDS + TIMED_ROUNDS)]
+    return [Seconds.of(times) for times in np.array(rounds[WARM_ROUNDS:]).T]
 
 
 def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
@@ -125,7 +131,7 @@ def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
             errors.append(error(image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
     if not errors:
-        raise IncompleteError("none of the samples to measure on is complete at present; wait for the workers")
+        raise IncompleteError(NONE_COMPLETE)
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
     return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, tuple(units))

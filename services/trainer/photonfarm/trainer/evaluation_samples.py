@@ -19,6 +19,27 @@ from photonfarm.trainer.store_source import StoreSource
 SHOWN = 4  # samples shown as pictures
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """A view's merged passes, exposed: linear radiance × exposure, 2 × (H, W, 3)."""
+
+    count: int  # independent estimates, of `half_spp` samples per pixel each
+    half_a: F32
+    half_b: F32  # independent of `half_a`
+
+    @classmethod
+    def of(cls, merged: Merged, exposure: float) -> Self:
+        """The halves of a merged view, as float32: their noise is far above its steps, and there may be hundreds."""
+        a, b = (np.float32(exposure) * half.astype(np.float32) for half in (merged.half_a, merged.half_b))
+        return cls(merged.count, a, b)
+
+    @property
+    def mean(self) -> F32:
+        """Of both halves, (H, W, 3)."""
+        mean: F32 = np.float32(0.5) * (self.half_a + self.half_b)
+        return mean
+
+
 @dataclass(frozen=True, slots=True)
 class References:
     """What the columns of the metric space were measured against."""
@@ -28,7 +49,7 @@ class References:
     half_a_share: float  # of that reference's samples: those of one half A, if all passes of the view were merged
 
     @classmethod
-    def of(cls, found: Mapping[int, Merged], half_spp: int) -> Self | None:
+    def of(cls, found: Mapping[int, Reference], half_spp: int) -> Self | None:
         """Those that were found; None where there are none."""
         if not found:
             return None
@@ -65,32 +86,32 @@ class Samples:
             )
         return cls(source, held_out[:most], source.view_keys(held_out[:most]))
 
-    def to_show(self, references: Mapping[int, Merged]) -> list[int]:
+    def to_show(self, references: Mapping[int, Reference]) -> list[int]:
         """The first sample of each of the first configurations: of those that have a reference, where there are any."""
         rows = list(references) or self.rows
         first = dict(zip(reversed(units_of(self.source, rows)), reversed(rows), strict=True))
         return sorted(first.values())[:SHOWN]
 
-    def target(self, row: int, reference: Merged | None) -> Target:
+    def target(self, row: int, reference: Reference | None) -> Target:
         """A sample's reference, or the mean of its halves; StoreError for one that has been taken back."""
         spec = self.source.spec
         half_spp = spec.transport.half_spp
         if reference is not None:
-            exposed = (spec.exposure * reference.mean).astype(np.float32)
-            return Target(row, exposed, reference.count * half_spp, is_reference=True)
+            return Target(row, reference.mean, reference.count * half_spp, is_reference=True)
         (sample,) = self.source.read_batch([row])
         mean = sample.radiance.astype(np.float32).mean(axis=0)
         return Target(row, np.float32(spec.exposure * sample.scale) * mean, 2 * half_spp, is_reference=False)
 
 
-def read_references(folder: Path, samples: Samples) -> dict[int, Merged]:
+def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
     """The references there are, by the first row that shows their view; raises SpecError for one of another size."""
-    film = samples.source.spec.film
-    found: dict[int, Merged] = {}
+    spec = samples.source.spec
+    film = spec.film
+    found: dict[int, Reference] = {}
     for key, row in dict(zip(reversed(samples.view_keys), reversed(samples.rows), strict=True)).items():
         if (file := folder / f"{key.hex()}.npz").is_file():
-            found[row] = Merged.read(file)
-            if (shape := found[row].mean.shape) != (film.height, film.width, 3):
+            found[row] = Reference.of(Merged.read(file), spec.exposure)
+            if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:
         raise SpecError(

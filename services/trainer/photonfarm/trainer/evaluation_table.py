@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from photonfarm.shared.estimate import Estimate
 from photonfarm.trainer.evaluate import Evaluation, Row
-from photonfarm.trainer.evaluation import TIMED_CALLS
+from photonfarm.trainer.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.evaluation_samples import References
 from photonfarm.trainer.markdown import markdown_table
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
@@ -16,26 +16,40 @@ CONVERGED_SPP = 4096
 
 def told(evaluation: Evaluation) -> str:
     """The head, the rows as a Markdown table, and the foot."""
-    foot = "\n".join(f"- {sentence}" for sentence in notes(evaluation))
+    of_time = _of_time(evaluation)
+    foot = "\n".join(f"- {sentence}" for sentence in (of_time, *notes(evaluation)))
     return f"{_head(evaluation)}\n\n{_table(evaluation)}\n\n{foot}"
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """What is to be known of the columns, a sentence each."""
+    """What is to be known of the errors, a sentence each."""
     denoisers = any(row.kept is not None for row in evaluation.rows)
-    threads = f", {counted(evaluation.threads, 'thread')}" if evaluation.device == "cpu" else ""
-    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
-    making = "reading, or rendering buffers and photons, is not in it"
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over the "
-        f"{counted(evaluation.units, evaluation.unit)}",
-        f"network: one image, the median of {TIMED_CALLS} warm calls on {evaluation.device}{threads}; {making}"
-        f"{rendering if denoisers else ''}",
+        f"{counted(evaluation.units, evaluation.unit)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
         return [*found, "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)"]
     return [*found, *_of_references(evaluation.references, denoisers=denoisers), *_of_inception(metrics)]
+
+
+def place_of_networks(evaluation: Evaluation) -> str:
+    """Where the networks ran, in words: a device, and on a CPU how many threads."""
+    return (
+        f"{evaluation.device}, {counted(evaluation.threads, 'thread')}"
+        if evaluation.device == "cpu"
+        else evaluation.device
+    )
+
+
+def _of_time(evaluation: Evaluation) -> str:
+    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
+    return (
+        f"network: one image, the median of {TIMED_ROUNDS} calls, taken by turns with the other predictors', on "
+        f"{place_of_networks(evaluation)}; reading, or rendering buffers and photons, is not in it"
+        f"{rendering if any(row.kept is not None for row in evaluation.rows) else ''}"
+    )
 
 
 def _of_references(references: References, *, denoisers: bool) -> list[str]:
@@ -50,7 +64,7 @@ def _of_references(references: References, *, denoisers: bool) -> list[str]:
     if denoisers:
         found.append(
             f"denoisers: up to {references.half_a_share:.1%} of a reference is the half A that they were given, "
-            "which flatters them in the columns from MSE on, and not in linear MSE"
+            "which flatters them in the columns from MSSIM on; out of both MSE it is taken"
         )
     return found
 
@@ -92,7 +106,7 @@ def _cells(row: Row, first: Row, columns: list[str]) -> list[str]:
     metrics = {} if row.metrics is None else row.metrics.columns()
     return [
         row.name,
-        f"{1e3 * row.seconds:.1f}",
+        f"{1e3 * row.seconds.median:.1f}",
         f"{row.held_out.error.mean:.5f}",
         _interval(row.held_out.error),
         "" if behind is None else f"{behind.mean:.5f} ({_interval(behind)})",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,31 +61,35 @@ def image_metrics(
     inception: Inception | None,
     groups: Sequence[Hashable] | None = None,
     halves: tuple[F32, F32] | None = None,
+    *,
+    having_seen_a: bool = False,
     wanted_features: Features | None = None,
 ) -> ImageMetrics:
     """All metrics of exposed linear images, 2 × (N, H, W, 3), N ≥ 1; reference i is the converged view of prediction i.
 
-    With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE; it is in all
-    other metrics, which have no such estimate. Intervals are over images, or over `groups` of them such as
-    configurations, where one is named per image. `wanted_features` are those of the references, where they are known
-    (`reference_features`). Raises ValueError for shapes that do not fit, SpecError for values that are not numbers.
+    With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE, also of
+    predictions that have seen a part of the first; it is in all other metrics, which have no such estimate. Intervals
+    are over images, or over `groups` of them such as configurations, where one is named per image. `wanted_features`
+    are those of the references, where they are known (`reference_features`). Raises ValueError for shapes that do not
+    fit, SpecError for values that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)
     check_pairs(shown, wanted)
     a, b = (metric_space(half) for half in halves) if halves else (wanted, wanted)
-    errors = PerImage.of(mse(shown, a, b), groups)
 
-    def each(metric: Callable[[Tensor, Tensor], NDArray[np.float64]]) -> PerImage:
+    def each(metric: Callable[..., NDArray[np.float64]], *against: Tensor) -> PerImage:
         chunks = (slice(start, start + CHUNK) for start in range(0, len(shown), CHUNK))
-        return PerImage.of(np.concatenate([metric(shown[chunk], wanted[chunk]) for chunk in chunks]), groups)
+        values = [metric(shown[chunk], *(images[chunk] for images in against)) for chunk in chunks]
+        return PerImage.of(np.concatenate(values), groups)
 
+    of_images = each(partial(mse, having_seen_a=having_seen_a), a, b), each(mssim, wanted), each(flip, wanted)
     if inception is None:
-        return ImageMetrics(len(shown), errors, each(mssim), each(flip), None, None, None, None)
+        return ImageMetrics(len(shown), *of_images, None, None, None, None)
     of_shown = inception.features(shown, CHUNK)
     of_wanted = inception.features(wanted, CHUNK) if wanted_features is None else wanted_features
     blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
     sets = _set_metrics(of_shown, of_wanted)
-    return ImageMetrics(len(shown), errors, each(mssim), each(flip), blocks, *sets, inception.weights)
+    return ImageMetrics(len(shown), *of_images, blocks, *sets, inception.weights)
 
 
 def reference_features(references: F32 | Tensor, inception: Inception) -> Features:

@@ -12,15 +12,20 @@ from torch import Tensor
 from photonfarm.trainer.metrics.metric_space import check_pairs
 
 
-def mse(predictions: Tensor, references: Tensor, other_halves: Tensor | None = None) -> NDArray[np.float64]:
+def mse(
+    predictions: Tensor, references: Tensor, other_halves: Tensor | None = None, *, having_seen_a: bool = False
+) -> NDArray[np.float64]:
     """Mean squared difference of each pair of display images, 2 × (N, H, W, 3) → (N,) [supplement 4].
 
     With references in two independent halves it is mean (f − A)(f − B), whose noise averages to nothing; what stays is
-    the shift that the display's curve makes of their noise, of second order. It may be negative below the noise.
+    the shift that the display's curve makes of their noise, of second order. It may be negative below the noise. Of
+    predictions that were made from a part of A it is mean f² − 2fB + AB, as in `clean_error_having_seen_a`. Raises
+    ValueError for shapes that do not fit.
     """
     halves = references, references if other_halves is None else other_halves
     for half in halves:
         check_pairs(predictions, half)
     f, a, b = (images.double() for images in (predictions, *halves))
-    errors: NDArray[np.float64] = ((f - a) * (f - b)).mean((1, 2, 3)).cpu().numpy()
+    product = f * (f - 2 * b) + a * b if having_seen_a else (f - a) * (f - b)
+    errors: NDArray[np.float64] = product.mean((1, 2, 3)).cpu().numpy()
     return errors

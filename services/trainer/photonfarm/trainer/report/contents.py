@@ -11,12 +11,13 @@ import numpy as np
 
 from photonfarm.shared.frame_costs import FrameCosts
 from photonfarm.shared.records import F32, ViewBuffers, arrays_of
-from photonfarm.shared.store.merge import Merged
 from photonfarm.trainer import evaluate
 from photonfarm.trainer.evaluate import Evaluation, Row, Tell
+from photonfarm.trainer.evaluation_samples import Reference
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs
 from photonfarm.trainer.report.gauges import Gauges
+from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.report.worst_cases import View, WorstCase, worst_cases
@@ -31,6 +32,7 @@ class Entry:
     """A row of the report's tables."""
 
     name: str
+    architecture: str | None  # of a network; None for a denoiser that nobody trained
     row: Row
     time: FrameTime | None  # None where the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
@@ -47,20 +49,21 @@ class Contents:
     entries: tuple[Entry, ...]
     costs: FrameCosts | None
     untimed: str  # why there are no costs
+    machine: Machine  # that times were taken on
     worst: tuple[WorstCase, ...]
     published: str | None  # which of the paper's tables stands beside ours
 
     @property
     def measure(self) -> Entry:
         """The entry that times are ratios of: light_transport, or else the first."""
-        return next((entry for entry in self.entries if entry.name == "light_transport"), self.entries[0])
+        return next((entry for entry in self.entries if entry.architecture == "light_transport"), self.entries[0])
 
     def document(self) -> dict[str, Any]:
         """The figures of report.json."""
         rows = self.evaluation.document()
         for row, entry in zip(rows["rows"], self.entries, strict=True):
-            row["name"] = entry.name
-            row["frame_seconds"] = None if entry.time is None else {**asdict(entry.time), "total": entry.time.total}
+            row["name"], row["architecture"] = entry.name, entry.architecture
+            row["frame_seconds"] = None if entry.time is None else entry.time.document()
             row["published"] = None if entry.published is None else asdict(entry.published)
         return {
             "dataset": self.card.document(),
@@ -68,6 +71,7 @@ class Contents:
             "mean_colour": self.gauges.mean_colour.error.mean,
             "untrained": self.gauges.untrained.error.mean,
             "evaluation": rows,
+            "machine": asdict(self.machine),
             "edit_seconds": None if self.costs is None else self.costs.medians()["edit_s"],
             "published_table": self.published,
             "worst_cases": [asdict(case) for case in self.worst],
@@ -89,7 +93,6 @@ def gathered(
     """Measure everything, without the times of frames where they are not wanted. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
-    gauges = Gauges.of(StoreSource(store, first.scene_id), first)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     close_look = _CloseLook(store, first.scene_id, kept, timed=timed)
     evaluation = evaluate.compare(
@@ -102,11 +105,12 @@ def gathered(
     return Contents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        gauges=gauges,
+        gauges=Gauges.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
         untimed=close_look.untimed,
+        machine=close_look.machine,
         worst=tuple(close_look.worst),
         published=found[0] if found else None,
     )
@@ -124,16 +128,18 @@ def _entries(
     predictors: list[TrainedRun | Untrained] = [*runs, *untrained]
     entries = []
     for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
-        name = names[place] if place < len(names) else row.name
+        name, architecture = row.name, None
+        if isinstance(predictor, TrainedRun):
+            name, architecture = names[place], predictor.settings.network.architecture
         time = None if costs is None else frame_time(predictor, row.seconds, costs)
-        entries.append(Entry(name, row, time, table.get(name)))
+        entries.append(Entry(name, architecture, row, time, table.get(architecture or "")))
     return entries
 
 
 class _CloseLook:
     """What is measured of single frames once the first network has made its images: their costs, and the worst cases.
 
-    Called as `evaluate.Choose`, it names the worst cases' rows.
+    Called as `evaluate.Choose`, right after networks have been timed, it names the worst cases' rows.
     """
 
     def __init__(self, store: str | Path, scene_id: str, kept: Sequence[int], *, timed: bool) -> None:
@@ -141,25 +147,25 @@ class _CloseLook:
         self.costs: FrameCosts | None = None
         self.untimed = "it was not asked for"
         self.worst: list[WorstCase] = []
+        self.machine = Machine.here()
 
-    def __call__(self, images: Mapping[int, F32], references: Mapping[int, Merged]) -> list[int]:
+    def __call__(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
         if self._timed:
             found = measured_costs(self._store, self._scene_id, list(references or images), self._kept)
             self.costs, self.untimed = (None, found) if isinstance(found, str) else (found, "")
+        self.machine = Machine.here()
         self.worst = worst_cases(self._views(images, references))
         return [case.row for case in self.worst]
 
-    def _views(self, images: Mapping[int, F32], references: Mapping[int, Merged]) -> list[View]:
+    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[View]:
         """The views that have references, with the images that the first network made of them."""
         source = StoreSource(self._store, self._scene_id)
         source.refresh()
-        exposure = np.float32(source.spec.exposure)
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []
         for row in references.keys() & images.keys():
             (sample,) = source.read_batch([row])
             read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
-            halves = (references[row].half_a, references[row].half_b)
-            a, b = (exposure * half.astype(np.float32) for half in halves)
+            a, b = references[row].half_a, references[row].half_b
             views.append(View(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
         return sorted(views, key=lambda view: view.row)

@@ -7,8 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.shared.errors import StoreError
+from photonfarm.shared.plan import UNUSED
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import SceneStatus, Store, store_status
+from photonfarm.shared.store import SceneStatus, SceneStore, Store, store_status
+
+SAMPLES = "samples"
+"""The kind of plans whose rows are of new views; others add passes to these, which take no photons and no buffers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What plans of one kind of request came to."""
+
+    planned: int  # rows
+    rows: int  # of committed jobs
+    core_s: float  # processor time of these jobs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +33,7 @@ class DatasetCard:
     requests: tuple[dict[str, Any], ...]  # of each plan: all that its rows follow from
     versions: dict[str, list[str]]  # of the packages that rendered, each with all that took part
     workers: int  # how many took part
+    spent: dict[str, Spent]  # by the kind of request that the plans are of; those without a committed job left out
 
     @classmethod
     def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
@@ -31,19 +45,32 @@ class DatasetCard:
         scene = opened.scene(scene_id)
         versions: dict[str, set[str]] = {}
         workers = set()
+        core_s: dict[int, float] = {}
         for job in scene.committed_jobs():
             figures = scene.marker(job)["figures"]
+            core_s[job] = figures["core_s"]
             workers.add(figures["worker"])
             for package, version in figures["versions"].items():
                 versions.setdefault(package, set()).add(version)
         requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
         known = {package: sorted(found) for package, found in sorted(versions.items())}
-        return cls(scene.spec, status, requests, known, len(workers))
+        return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
+
+    @property
+    def samples(self) -> Spent:
+        """Rows of new views: what networks are trained on, but for those that are held out."""
+        return self.spent.get(SAMPLES, Spent(0, 0, 0.0))
+
+    @property
+    def further_passes(self) -> Spent:
+        """Rows that add passes to views, such as for references."""
+        others = [spent for kind, spent in self.spent.items() if kind != SAMPLES]
+        return Spent(*(sum(getattr(spent, name) for spent in others) for name in Spent.__slots__))
 
     @property
     def core_s_per_sample(self) -> float:
-        """Processor time of a complete sample, buffers and photons included; 0 without one."""
-        return self.status.core_s / self.status.samples_complete if self.status.samples_complete else 0.0
+        """Processor time of a sample of a new view, buffers and photons included; 0 without one."""
+        return self.samples.core_s / self.samples.rows if self.samples.rows else 0.0
 
     def document(self) -> dict[str, Any]:
         """What report.json says of it."""
@@ -66,11 +93,30 @@ class DatasetCard:
             "requests": list(self.requests),
             "bytes": status.size_bytes,
             "core_seconds": status.core_s,
+            "spent": {
+                kind: {"planned": spent.planned, "rows": spent.rows, "core_seconds": spent.core_s}
+                for kind, spent in self.spent.items()
+            },
             "core_seconds_per_sample": self.core_s_per_sample,
             "redrawn": status.redrawn,
             "workers": self.workers,
             "versions": self.versions,
         }
+
+
+def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, Spent]:
+    """By kind of request, from the seconds of the committed jobs."""
+    found: dict[str, Spent] = {}
+    for plan in scene.plans():
+        used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
+        done = [job for job in range(plan.first_job, plan.end_job) if job in core_s]
+        before = found.get(plan.request.kind, Spent(0, 0, 0.0))
+        found[plan.request.kind] = Spent(
+            before.planned + plan.samples,
+            before.rows + sum(int(used[job - plan.first_job]) for job in done),
+            before.core_s + sum(core_s[job] for job in done),
+        )
+    return {kind: spent for kind, spent in found.items() if spent.rows}
 
 
 def kind(spec: SceneSpec) -> str:

@@ -8,34 +8,47 @@ from __future__ import annotations
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
-from photonfarm.shared.frame_costs import FrameCosts
+from photonfarm.shared.frame_costs import FrameCosts, Seconds
 from photonfarm.shared.verbs import command, is_installed
 from photonfarm.trainer.trained import TrainedRun
 from photonfarm.trainer.untrained import Untrained
 
 VERB = "measure-frames"  # of the renderer
+TIMED = 15  # frames
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """Wall seconds of one frame, by parts, each the median over frames; what a predictor does not need is 0.
+    """Wall seconds of one frame, by parts; None for what a predictor does not need.
 
     Editing the scene is not in it, which all do alike.
     """
 
-    render: float  # of half A, at 1/k of the pixels
-    buffers: float  # depth, albedo, normal
-    points: float  # which points of the cloud the view sees
-    photons: float  # tracing them, and which the view sees
-    network: float
+    render: Seconds | None  # of half A, at 1/k of the pixels
+    buffers: Seconds  # depth, albedo, normal
+    points: Seconds | None  # which points of the cloud the view sees
+    photons: Seconds | None  # tracing them, and which the view sees
+    network: Seconds
+
+    @property
+    def parts(self) -> dict[str, Seconds | None]:
+        """By their names, in the order in which they are made."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def total(self) -> float:
-        """Of the whole frame."""
-        return self.render + self.buffers + self.points + self.photons + self.network
+        """Of the whole frame: the medians together."""
+        return sum(part.median for part in self.parts.values() if part)
+
+    def document(self) -> dict[str, Any]:
+        """What report.json says: medians, 0 for what is not needed, and the range of each part that is."""
+        medians = {name: part.median if part else 0.0 for name, part in self.parts.items()}
+        ranges = {name: [part.low, part.high] for name, part in self.parts.items() if part}
+        return {**medians, "total": self.total, "ranges": ranges}
 
 
 def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int]) -> FrameCosts | str:
@@ -45,6 +58,7 @@ def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: 
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
+        asked += ["--timed", str(TIMED)]
         asked += [argument for row in rows for argument in ("--rows", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
         if code := subprocess.run(command(VERB, *asked), stdout=subprocess.DEVNULL, check=False).returncode:
@@ -52,14 +66,14 @@ def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: 
         return FrameCosts.read(file)
 
 
-def frame_time(predictor: TrainedRun | Untrained, network: float, costs: FrameCosts) -> FrameTime:
+def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
-    needs, parts = predictor.needs, costs.medians()
+    needs, parts = predictor.needs, costs.parts()
     exact = isinstance(predictor, TrainedRun) and predictor.settings.network.occlusion == "exact"
     return FrameTime(
-        render=costs.render_medians()[needs.kept] if needs.kept else 0.0,
+        render=costs.renders()[needs.kept] if needs.kept else None,
         buffers=parts["buffers_s"],
-        points=parts["points_s"] if needs.points and exact else 0.0,
-        photons=parts["photons_s"] + parts["photons_seen_s"] if needs.photons else 0.0,
+        points=parts["points_s"] if needs.points and exact else None,
+        photons=Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
         network=network,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from photonfarm.shared.errors import IncompleteError
@@ -19,7 +20,6 @@ from photonfarm.trainer.loop import INITIAL
 from photonfarm.trainer.trained import TrainedRun
 
 MOST_TRAINING = 1024  # samples to take the mean colour of
-MOST_HELD_OUT = 64  # samples that both are measured on: enough, as both are far off
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,20 +30,17 @@ class Gauges:
     untrained: HeldOut  # the first run's network before its first step
 
     @classmethod
-    def of(cls, source: SampleSource, run: TrainedRun, most: int = MOST_HELD_OUT) -> Gauges:
-        """On the first held-out samples of a run. Raises IncompleteError without samples of both kinds."""
+    def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Gauges:
+        """On some held-out samples of a run; raises IncompleteError without samples to take the colour of."""
         settings = run.settings.model_copy(update={"device": "cpu"})
         with Feed(source, settings, needs=run.needs) as feed:
             arrived, _ = feed.arrivals()
-            held_out = [row for row, held in arrived if held][:most]
             training = [row for row, held in arrived if not held]
-            if not held_out or not training:
-                raise IncompleteError(
-                    f"{len(training)} training and {len(held_out)} held-out samples are complete; a report needs both"
-                )
+            if not training:
+                raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
             colour = mean_colour(batches(feed, training[:: -(-len(training) // MOST_TRAINING)], settings.batch))
             network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
             return cls(
-                measure(constant_predictor(colour), batches(feed, held_out, settings.batch)),
-                measure(network_predictor(network), batches(feed, held_out, settings.batch)),
+                measure(constant_predictor(colour), batches(feed, rows, settings.batch)),
+                measure(network_predictor(network), batches(feed, rows, settings.batch)),
             )

@@ -67,13 +67,13 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
 
 def _headline(contents: Contents) -> str:
     card, evaluation = contents.card, contents.evaluation
-    status, colour = card.status, contents.gauges.mean_colour.error.mean
+    samples, colour = card.samples, contents.gauges.mean_colour.error.mean
     best = min(contents.entries[: len(contents.stories)], key=lambda entry: entry.row.held_out.error.mean)
     error = best.row.held_out.error
     spread = "–" if error.standard_error is None else f"{error.standard_error:.2g}"
     rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
     cells = [
-        (f"{status.samples_complete}", f"samples of {status.samples_planned} planned"),
+        (f"{samples.rows}", f"samples of {samples.planned} planned"),
         ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
         (f"{error.mean:.4g}", f"held-out error (± {spread}), {best.name}"),
         (f"{colour:.4g}", f"mean colour: {colour / error.mean:.1f} ×" if error.mean > 0 else "mean colour"),
@@ -120,8 +120,9 @@ def _pictures(found: list[Case], contents: Contents) -> str:
         blocks.append(f'<h3>{escape(case.caption)}</h3><div class="case">{"".join(figures)}</div>')
     legend = (
         f"<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>; below each image its difference to the target, from "
-        f"black (0) to pale yellow ({LARGEST:g} and more). The first are the first samples of the first "
-        f"configurations, the others the worst cases of {escape(contents.entries[0].name)}, found automatically.</p>"
+        f"black (0) to pale yellow ({LARGEST:g} and more), and its MSE against the target as shown, whose noise is in "
+        "it. The first are the first samples of the first configurations, the others the worst cases of "
+        f"{escape(contents.entries[0].name)}, found automatically.</p>"
     )
     return f"<h2>Held-out views</h2>\n{legend}\n{''.join(blocks)}"
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from photonfarm.trainer.report.contents import Contents, Entry
-from photonfarm.trainer.report.trained_runs import Point
+from photonfarm.trainer.report.trained_runs import Point, RunStory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,19 +62,23 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
 
 def _curves(contents: Contents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
-    axes: tuple[tuple[str, str, Callable[[Point], float]], ...] = (
-        ("samples", "samples drawn", lambda point: point.draws),
-        ("rendering", "core-seconds of rendering what was used", lambda point: point.core_s(per_sample)),
-        ("all", "core-seconds of rendering and of training steps", lambda p: p.core_s(per_sample) + p.train_s),
-    )
+    on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
+    axes: tuple[tuple[str, str, Callable[[RunStory, Point], float]], ...] = (
+        ("samples", "samples drawn", lambda _, point: point.draws),
+        ("rendering", "core-seconds of rendering the samples used", lambda _, point: point.core_s(per_sample)),
+        (
+            "all", f"core-seconds of that and of training steps{on_gpu}",
+            lambda story, point: point.core_s(per_sample) + story.step_core_s(point),
+        ),
+    )  # fmt: skip
     for name, label, x in axes:
         about = f"Held-out error over {label}"
         yield _drawn(f"curve-{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
-def _curve(axes: Axes, contents: Contents, x: Callable[[Point], float], label: str) -> None:
+def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float], label: str) -> None:
     for story in contents.stories:
-        shown = [(x(point), point.error) for point in story.curve if point.error > 0]
+        shown = [(x(story, point), point.error) for point in story.curve if point.error > 0]
         axes.plot(*zip(*shown, strict=True) if shown else ([], []), marker=".", label=story.name, linewidth=1.2)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
@@ -148,7 +152,7 @@ def _group(entry: Entry) -> str:
     networks, trained, untrained = GROUPS
     if not entry.row.kept:
         return networks
-    return trained if entry.name.startswith("denoise") else untrained
+    return untrained if entry.architecture is None else trained
 
 
 def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, float]]) -> None:

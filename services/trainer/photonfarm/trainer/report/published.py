@@ -1,7 +1,7 @@
 """The published tables, to stand beside ours [supplement 4, Tables 1 and 2].
 
-They are of four rooms at 256², on the authors' GPU; so ratios of time can be compared, and orders of errors, but no
-value with ours.
+They are of four rooms at 256², on the authors' GPU: no value can be compared with ours, but orders of errors can, and
+ratios of networks' times. Denoisers' times are mostly rendering, of as many samples per pixel as the authors chose.
 """
 
 from __future__ import annotations

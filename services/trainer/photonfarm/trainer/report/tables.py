@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from photonfarm.shared.estimate import Estimate
-from photonfarm.trainer.evaluation_table import counted, notes
+from photonfarm.shared.frame_costs import Seconds
+from photonfarm.trainer.evaluation import TIMED_ROUNDS
+from photonfarm.trainer.evaluation_table import counted, notes, place_of_networks
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Contents, Entry
@@ -40,18 +41,45 @@ def facts(contents: Contents) -> list[tuple[str, str]]:
         ("published at", NOT_AVAILABLE if owed is None or not owed.source else owed.source),
         ("kind", about["kind"]),
         ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
-        ("samples", f"{status.samples_complete} of {status.samples_planned} planned, {2 * t.half_spp} samples per "
-                    "pixel each, in two independent halves"),
+        ("samples", f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
+                    f"in two independent halves{_further_passes(contents)}"),
         ("noise floor", f"{contents.evaluation.noise_floor:.4g}, of a target, squared exposed radiance"),
         ("transport", f"bdpt: paths of up to {t.max_depth} edges, {t.connections} connections, light ratio "
                       f"{t.light_ratio:g}"),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
-        ("cost", f"{status.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample; "
-                 f"{status.redrawn} renders drawn again, as they were not finite"),
+        ("cost", _cost(contents)),
         ("size", f"{status.size_bytes / 1e6:.1f} MB"),
         ("rendered by", f"{counted(card.workers, 'worker')} with " + _versions(card.versions)),
+        ("times taken on", contents.machine.stated),
+        ("GPU", _gpu(contents)),
     ]  # fmt: skip
+
+
+def _further_passes(contents: Contents) -> str:
+    further = contents.card.further_passes
+    return f"; and {further.rows} further passes of their views, as references need" if further.rows else ""
+
+
+def _cost(contents: Contents) -> str:
+    card, further = contents.card, contents.card.further_passes
+    spent = f"{card.samples.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample"
+    if further.rows:
+        spent += f"; {further.core_s:.0f} more of further passes, {1e3 * further.core_s / further.rows:.0f} ms each"
+    return f"{spent}; {card.status.redrawn} renders drawn again, as they were not finite"
+
+
+def _gpu(contents: Contents) -> str:
+    """What a GPU took part in."""
+    trained = [story.name for story in contents.stories if story.on_gpu]
+    found = [f"trained {', '.join(trained)}"] if trained else []
+    if contents.evaluation.device != "cpu":
+        found.append(f"networks were measured on {contents.evaluation.device}")
+    return (
+        "; ".join(found)
+        if found
+        else "none took part: images were rendered, and networks trained and measured, on CPUs"
+    )
 
 
 def _seeds(contents: Contents) -> str:
@@ -94,23 +122,32 @@ def _paper(contents: Contents) -> Table:
             head.append("paper")
     rows = tuple(_paper_row(contents, entry, beside=beside) for entry in contents.entries)
     named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
-    said = [_of_time(contents), *notes(contents.evaluation)]
-    if beside:
-        said.append(
-            "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on "
-            "another machine: orders and ratios can be compared, values cannot"
-        )
+    said = [_of_time(contents), *notes(contents.evaluation), *([_of_paper(contents)] if beside else [])]
     return Table(named, tuple(head), rows, tuple(said))
 
 
 def _of_time(contents: Contents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
-    frames = contents.costs.render_s.shape[1]
+    frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
+    on_cpu = ", untrained denoisers on the CPU" if any(entry.architecture is None for entry in contents.entries) else ""
     return (
-        "time per frame: rendering, buffers, points, photons and network, each on one core of this machine, medians "
-        f"of {frames} frames in one run; editing the scene ({1e3 * contents.costs.medians()['edit_s']:.0f} ms), which "
-        "all need, is not in it"
+        f"time per frame: medians of {frames} frames for rendering, buffers, points and photons, on one core by LLVM's "
+        f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {place_of_networks(contents.evaluation)}"
+        f"{on_cpu if contents.evaluation.device != 'cpu' else ''}; editing the scene, {_ms(edit)} ms, which all need, "
+        "is not in it"
+    )
+
+
+def _of_paper(contents: Contents) -> str:
+    film, unit = contents.card.spec.film, contents.measure.published
+    return (
+        "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on another "
+        "machine: orders of errors can be compared, values cannot. Of time, the networks' ratios can"
+        f"{'' if unit is None else f' ({contents.measure.architecture} took {unit.seconds:g} s there)'}. The "
+        "denoisers' cannot: their time is mostly rendering, here of "
+        f"{contents.card.spec.transport.half_spp} samples per pixel at {film.width} × {film.height}, where starting "
+        "takes much of it, and of another number in the paper"
     )
 
 
@@ -157,7 +194,7 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 
 def _further(contents: Contents) -> Table:
     """What the paper does not have, and its Fig. 5 in numbers."""
-    shown = [m for m in measures() if m.name.startswith(("feature", "kid", "flip"))]
+    shown = [m for m in measures() if m.name.startswith(("feature", "flip"))]
     first = contents.evaluation.rows[0]
     rows = []
     for entry in contents.entries:
@@ -165,14 +202,16 @@ def _further(contents: Contents) -> Table:
         linear = with_interval(entry.row.held_out.error, 5)
         values = (m.of(entry) for m in shown)
         cells = [NOT_AVAILABLE if value is None else f"{value:.4f}" for value in values]
-        rows.append((entry.name, linear, "" if behind is None else with_interval(behind, 5), *cells))
-    head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *(m.title for m in shown))
+        kid = with_interval(None if entry.row.metrics is None else entry.row.metrics.kid, 4)
+        rows.append((entry.name, linear, "" if behind is None else with_interval(behind, 5), *cells, kid))
+    titles = (*(m.title for m in shown), "KID (95 %)")
+    head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
     said = []
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
         said.append(
             f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
             f"{weights.source}, sha256 {weights.sha256}; images are resized to 299 × 299 bilinearly without aligned "
-            "corners"
+            "corners. KID's interval is the jackknife's over views; FID has none"
         )
     return Table("Further metrics", head, tuple(rows), tuple(said))
 
@@ -181,21 +220,32 @@ def _frame_parts(contents: Contents) -> list[Table]:
     if contents.costs is None:
         return []
     rows = tuple(
-        (entry.name, *(f"{1e3 * part:.1f}" if part else "" for part in _parts(entry)), f"{1e3 * entry.time.total:.1f}")
+        (
+            entry.name,
+            *(_ms(part) if part else "" for part in entry.time.parts.values()),
+            f"{1e3 * entry.time.total:.1f}",
+        )
         for entry in contents.entries
         if entry.time
     )
     head = ("architecture", "render 1/k", "buffers", "points seen", "photons", "network", "all")
-    said = (
-        "milliseconds. Denoisers are given one half-estimate of 1/k of the pixels; as splats of light paths do not "
-        "stop at these, their light paths are as many as for the whole image (up to 64 × as many per pixel)"
-    )
-    return [Table("Where the time of a frame goes", head, rows, (said,))]
+    said = [
+        "milliseconds: the median, and the middle 80 % of the times. Denoisers are given one half-estimate of 1/k of "
+        "the pixels; as splats of light paths do not stop at these, their light paths are as many as for the whole "
+        "image (up to 64 × as many per pixel)"
+    ]
+    networks = {story.name: story.run.settings.network for story in contents.stories}
+    transport = {name: of for name, of in networks.items() if of.architecture.startswith("light_transport")}
+    if relative := [name for name, of in transport.items() if of.maxima == "relative"]:
+        said.append(
+            f"{', '.join(relative)}: maxima are relative, for which the network runs over the base cloud anew in each "
+            "frame, though what that gives is the same each time: a renderer would keep it"
+        )
+    return [Table("Where the time of a frame goes", head, rows, tuple(said))]
 
 
-def _parts(entry: Entry) -> Sequence[float]:
-    time = entry.time
-    return () if time is None else (time.render, time.buffers, time.points, time.photons, time.network)
+def _ms(time: Seconds) -> str:
+    return f"{1e3 * time.median:.1f} ({1e3 * time.low:.1f} … {1e3 * time.high:.1f})"
 
 
 # ---------------------------------------------------------------------------------------------------------- runs, cases
@@ -221,7 +271,8 @@ def _worst(contents: Contents) -> list[Table]:
     rows = tuple((c.kind, f"{c.row}", f"{c.pixels:.1%}", f"{c.mse:.4f}") for c in contents.worst)
     said = (
         f"of all views with references, those in which pixels of one kind cost {contents.entries[0].name} most: the "
-        "sum of their squared error in the metric space, the references' noise taken out. Close: nearer than 5 % of "
-        "what is seen. Fine shadows: light steps where surface, normal and colour do not"
+        "sum of their squared error in the metric space, the references' noise taken out; one view may be the worst of "
+        "several kinds. Close: nearer than 5 % of what is seen. Fine shadows: in both halves of the reference light "
+        "steps where surface, normal and colour do not"
     )
     return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (said,))]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from photonfarm.trainer import checkpoint, metrics_log
+from photonfarm.trainer.device import AUTO, usable_device
 from photonfarm.trainer.loop import CHECKPOINT, METRICS
 from photonfarm.trainer.trained import TrainedRun
 from photonfarm.trainer.waits import bottleneck, samples_per_used, waits
@@ -17,13 +20,14 @@ class Point:
 
     step: int
     draws: int  # samples drawn by then
-    samples: int  # that had arrived
+    samples: int  # that had arrived, held-out ones among them
+    used: int  # that had been drawn at least once
     train_s: float  # wall seconds of steps
     error: float  # on held-out samples, noise removed
 
     def core_s(self, per_sample: float) -> float:
         """Of rendering the samples that had been used by then, where each took `per_sample`."""
-        return min(self.draws, self.samples) * per_sample
+        return self.used * per_sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,25 +36,45 @@ class RunStory:
 
     name: str
     run: TrainedRun
-    state: dict[str, Any]  # of the checkpoint: step, following and seconds
+    state: dict[str, Any]  # of the checkpoint: what is no weight
     curve: tuple[Point, ...]
 
     @classmethod
     def of(cls, name: str, run: TrainedRun) -> RunStory:
         """Of a run; raises StoreError for a log that cannot be read."""
         records = metrics_log.read(run.folder / METRICS)
+        state = checkpoint.load(run.folder / CHECKPOINT)
+        arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
+        training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived
         points = (
-            Point(r["step"], r["draws"], r["samples"], r["seconds"]["train"], r["error"])
+            Point(
+                r["step"], r["draws"], r["samples"], min(r["draws"], int(training[min(r["samples"], len(arrived))])),
+                r["seconds"]["train"], r["error"],
+            )
             for r in records
             if r["kind"] == "validation"
-        )
-        state = checkpoint.load(run.folder / CHECKPOINT)
-        return cls(name, run, {key: state[key] for key in ("step", "following", "seconds")}, tuple(points))
+        )  # fmt: skip
+        kept = {key: state[key] for key in ("step", "following", "seconds", "versions")}
+        return cls(name, run, kept, tuple(points))
+
+    @property
+    def trained_on(self) -> int:
+        """How many samples it draws from: those that have arrived and are not held out."""
+        return len(self.state["following"]["sampler"]["rows"])
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether its steps were a GPU's: by its settings and, where these say auto, by what that is here."""
+        device = self.run.settings.device
+        return (str(usable_device(device)) if device == AUTO else device).startswith("cuda")
+
+    def step_core_s(self, point: Point) -> float:
+        """Core-seconds of the steps up to a point; on a GPU their wall seconds."""
+        return point.train_s * (1 if self.on_gpu else self.run.settings.threads)
 
     def document(self) -> dict[str, Any]:
         """What report.json says of it."""
         state, settings = self.state, self.run.settings
-        arrived = len(state["following"]["arrived"])
         draws = state["step"] * settings.batch
         shares = waits(state["seconds"])
         return {
@@ -60,17 +84,16 @@ class RunStory:
             "parameters": sum(weight.numel() for weight in self.run.weights.values()),
             "steps": state["step"],
             "draws": draws,
-            "draws_per_sample": draws / max(len(state["following"]["sampler"]["rows"]), 1),
-            "samples_per_used": samples_per_used(arrived, draws),
+            "trained_on": self.trained_on,
+            "draws_per_sample": draws / max(self.trained_on, 1),
+            "samples_per_used": samples_per_used(self.trained_on, draws),
             "seconds": state["seconds"],
             "waits": shares,
             "bottleneck": bottleneck(shares),
-            "curve": [
-                {"step": p.step, "draws": p.draws, "samples": p.samples, "train_s": p.train_s, "error": p.error}
-                for p in self.curve
-            ],
+            "curve": [asdict(point) for point in self.curve],
+            "on_gpu": self.on_gpu,
             "settings": settings.model_dump(mode="json"),
-            "versions": checkpoint.versions(),
+            "versions": state["versions"],
         }
 
 

@@ -49,7 +49,7 @@ class WorstCase:
 
 
 def worst_cases(views: list[View]) -> list[WorstCase]:
-    """For each kind of pixels the view that it costs most, in the order of `KINDS`; a view is named once.
+    """For each kind of pixels the view that it costs most, in the order of `KINDS`; one view may be that of several.
 
     What counts is the sum of the error over the pixels: of two views with one wrong mirror the larger mirror.
     """
@@ -64,13 +64,7 @@ def worst_cases(views: list[View]) -> list[WorstCase]:
             if (share := float(mask.mean())) >= LEAST:
                 case = WorstCase(kind, view.row, share, float(error[mask].mean()))
                 scored.setdefault(kind, []).append((share * case.mse, case))
-    found: dict[int, WorstCase] = {}
-    for kind in KINDS:
-        for _, case in sorted(scored.get(kind, []), key=lambda each: -each[0]):
-            if case.row not in found:
-                found[case.row] = case
-                break
-    return list(found.values())
+    return [max(scored[kind], key=lambda each: each[0])[1] for kind in KINDS if kind in scored]
 
 
 def squared_error(view: View) -> NDArray[np.float64]:
@@ -91,14 +85,17 @@ def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
 
 
 def shadow_edges(view: View) -> Mask:
-    """Where the irradiance of the reference steps between neighbours that are alike in all else, (H, W)."""
-    clean = (view.half_a + view.half_b) / 2
-    irradiance = np.log(clean.mean(axis=-1) + 1e-3) - np.log(view.buffers.albedo.mean(axis=-1) + 1e-2)
-    edges = np.zeros(irradiance.shape, np.bool_)
+    """Where the irradiance steps between neighbours that are alike in all else, (H, W).
+
+    It must step the same way in both halves of the reference: their noise is independent, and steps alike by chance.
+    """
+    albedo = np.log(view.buffers.albedo.mean(axis=-1) + 1e-2)
+    irradiance = np.stack([np.log(half.mean(axis=-1) + 1e-3) - albedo for half in (view.half_a, view.half_b)])
+    edges = np.zeros(albedo.shape, np.bool_)
     for axis in (0, 1):
-        first, second = _neighbours(len(edges) if axis == 0 else edges.shape[1], axis)
-        steps = np.abs(irradiance[second] - irradiance[first]) > STEP
-        edges[first] |= steps & _alike(view.buffers, first, second)
+        first, second = _neighbours(edges.shape[axis], axis)
+        steps = irradiance[:, *second] - irradiance[:, *first]
+        edges[first] |= ((steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)) & _alike(view.buffers, first, second)
     return edges
 
 

@@ -1,7 +1,7 @@
 """How a budget of core-seconds is shared out between configurations, views, passes and samples per pixel.
 
 Everything is rendered in passes of 2 samples per pixel, of which samples of more are put together; each is charged what
-it costs rendered at once.
+it would cost rendered at once.
 """
 
 from __future__ import annotations
@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import ViewBuffers, arrays_of
 from photonfarm.shared.store.reader import SceneReader
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.store_source import StoredSample, StoreSource
-from room_study import HELD_OUT
+from photonfarm.trainer.store_source import StoredSample
+from room_study import HELD_OUT, ChosenSamples
 
 HALF_SPP = 1  # of what is rendered
 PASS_SPP = 2 * HALF_SPP
@@ -48,7 +46,7 @@ SHARES = (
 )  # fmt: skip
 
 
-class Arm(StoreSource):
+class Arm(ChosenSamples):
     """So many configurations of a store, each with what a share gives it, as samples to train on.
 
     A sample's halves are means of the halves of `spp` / 2 passes of its view. An arm of a slice holds every `slices`-th
@@ -60,12 +58,10 @@ class Arm(StoreSource):
         self, root: Path, scene_id: str, share: Share, configurations: int, slice_: tuple[int, int] = (0, 1)
     ) -> None:
         """Of a slice, its number and how many there are; raises ValueError where the store has too few."""
-        super().__init__(root, scene_id)
+        super().__init__(root, scene_id, HELD_OUT)
         reader = SceneReader(root, scene_id)
-        complete = super().refresh().tolist()
         reader.refresh()
-        held_out = dict(zip(complete, rows_held_out(self, complete, HELD_OUT), strict=True))
-        enough = _enough(reader, [row for row in complete if not held_out[row]], share)
+        enough = _enough(reader, self.trainable, share)
         number, slices = slice_
         chosen = enough[number::slices][:configurations]
         if len(chosen) < configurations:
@@ -81,32 +77,16 @@ class Arm(StoreSource):
             for start in range(0, share.rendered, together)
         }
         self.rows = list(self._passes)
-        first = next(row for row in complete if held_out[row])  # a trainer wants one to look at
-        self._passes[first] = [first] * together
-        self._new = list(self._passes)
-
-    def refresh(self) -> NDArray[np.int64]:
-        """The chosen samples, at the first call."""
-        new, self._new = self._new, []
-        return np.array(new, np.int64)
-
-    def taken_back(self) -> NDArray[np.int64]:
-        """None is."""
-        return np.empty(0, np.int64)
 
     def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
-        """The chosen samples of these rows."""
+        """The chosen samples of these rows, and the one that is held out as it is."""
         return [self._mean(row) for row in rows]
 
     def _mean(self, row: int) -> StoredSample:
-        read = super().read_batch(self._passes[row])
+        read = super().read_batch(self._passes.get(row, [row]))
         halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
         buffers: dict[str, Any] = {name: values.copy() for name, values in arrays_of(read[0].buffers).items()}
         return replace(read[0], radiance=halves, scale=1.0, buffers=ViewBuffers(**buffers))
-
-    def planned(self) -> int:
-        """As many as were chosen."""
-        return len(self._passes)
 
 
 def _enough(reader: SceneReader, rows: Sequence[int], share: Share) -> list[list[list[int]]]:

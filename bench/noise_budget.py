@@ -2,14 +2,14 @@
 """What a budget of core-seconds is best spent on: samples per pixel, views of a configuration, or configurations.
 
     python bench/noise_budget.py [--rooms movable-living-room-2 movable-dining-room] [--budget 200] [--steps 2000]
-                                 [--seeds 0 1] [--plan-seed 1] [--out docs/results]
+                                 [--seeds 0 1] [--plan-seed 1] [--processes 2] [--out docs/results]
 
 A room is a built-in spec, or an experiment of experiments/ in its small size. Costs and noise are measured as by
-`photonfarm scene cost`; each arm of `budget_arms.SHARES` gets as many configurations as the budget pays for, is trained
-on from each seed, on other configurations each time, and measured on the same held-out views. The constants of
-`photonfarm.shared.allocation` are fitted to all arms of all rooms. What is rendered and trained stays in
-build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene files.
-Exit code 0, whatever comes out.
+`photonfarm scene cost`, best on a quiet machine; each arm of `budget_arms.SHARES` gets as many configurations as the
+budget pays for, is trained on from each seed, on other configurations each time, and measured on the same held-out
+views. The constants of `photonfarm.shared.allocation` are fitted to all arms of all rooms. What is rendered and trained
+stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene
+files. Exit code 0, whatever comes out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,17 +29,22 @@ import results
 import room_study
 from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
 from budget_fit import Fit, Point, fit
+from network_errors import Errors, each_seed, of_intervals, stated
+from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared import allocation
 from photonfarm.shared.allocation import Allocation
 from photonfarm.shared.errors import SpecError
+from photonfarm.shared.plan import Request
 from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store import Store
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer.store_source import StoreSource
-from room_study import HELD_OUT, Errors, References, each_seed, settings_of, stated
+from room_study import HELD_OUT, References, Run, in_processes, settings_of
 
 ROOMS = ["movable-living-room-2", "movable-dining-room"]
 HELD_OUT_VIEWS = 48
+TIMED_VIEWS = 16
 ARCHITECTURE = "light_transport"
 
 
@@ -83,48 +88,77 @@ def spec_of(room: str) -> SceneSpec:
     return room_study.in_passes(room_study.named_room(room), HALF_SPP)
 
 
-def measured_room(name: str, told: argparse.Namespace) -> Room:
-    """Costs, samples, networks and errors of one room."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned:
+    """A room, and what is going to be bought of it."""
+
+    name: str
+    spec: SceneSpec
+    folder: Path
+    store: Store
+    costs: SampleCosts
+    counts: dict[Share, int]  # configurations
+
+
+def planned(name: str, told: argparse.Namespace) -> Planned:
+    """Costs are as they were measured first. Raises SpecError, and ValueError where a share buys nothing."""
+    spec = spec_of(name)
+    folder, store = room_study.opened(told, f"{name}-{spec.scene_id[:8]}-{told.budget:g}-{len(told.seeds)}")
+    file = folder / "costs.json"
+    if not file.is_file():
+        (costs,) = in_processes(measured_costs, [(room_study.named_room(name),)], 1, f"{name}: measured costs")
+        write_whole(file, costs.json())
+    costs = SampleCosts.read(file.read_text())
+    return Planned(name, spec, folder, store, costs, {share: paid(costs, share, told.budget) for share in SHARES})
+
+
+def measured_costs(room: SceneSpec) -> SampleCosts:
+    """Times at the samples per pixel that the room has, and the noise of the passes that samples are made of."""
     from photonfarm.renderer.sample_costs import measured_costs
 
-    folder, store = room_study.opened(told, f"{name}-{told.budget:g}-{len(told.seeds)}")
-    spec = spec_of(name)
-    costs = kept(folder / "costs.json", lambda: measured_costs(room_study.named_room(name)))
-    counts = {share: paid(costs, share, told.budget) for share in SHARES}
-    held_out = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
-    room_study.render(spec, store, [*requests(counts, len(told.seeds), told.plan_seed), held_out])
-    references = References.of(store, spec, told.reference_spp)
-    arms = tuple(measure(share, counts[share], (folder, spec), references, told) for share in SHARES)
-    return Room(name, spec, costs, references, arms)
-
-
-def kept(file: Path, make: Any) -> SampleCosts:
-    """Costs as they were measured first: what is planned follows from them."""
-    if not file.is_file():
-        file.write_text(make().json())
-    return SampleCosts.read(file.read_text())
+    passes = measured_costs(room_study.in_passes(room, HALF_SPP), frames=TIMED_VIEWS)
+    return replace(measured_costs(room, frames=TIMED_VIEWS), relative_noise=passes.relative_noise)
 
 
 def paid(costs: SampleCosts, share: Share, budget: float) -> int:
-    """How many configurations the budget pays for."""
-    return int(budget / allocation.seconds(costs, Allocation(1, share.views, share.passes, share.spp)))
+    """How many configurations the budget pays for; raises ValueError where that is none."""
+    one = allocation.seconds(costs, Allocation(1, share.views, share.passes, share.spp))
+    if one > budget:
+        raise ValueError(f"--budget {budget:g}: a configuration of {share} costs {one:.2f} core-seconds; give more")
+    return int(budget / one)
 
 
-def measure(
-    share: Share, configurations: int, where: tuple[Path, SceneSpec], references: References, told: Any
-) -> Measured:
-    """Train on one share of the budget from each seed, and look at the held-out views."""
-    (folder, spec), made = where, []
+def measured_room(plan: Planned, told: argparse.Namespace) -> Room:
+    """Samples, networks and errors of one room."""
+    held_out = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
+    asked: list[Request | TopUp] = [*requests(plan.counts, len(told.seeds), told.plan_seed), held_out]
+    room_study.render(plan.spec, plan.store, asked, told.processes)
+    references = References.of(plan.store, plan.spec, told.reference_spp)
+    networks = {share: runs(share, plan, told) for share in SHARES}
+    room_study.train_all([run for of_share in networks.values() for run in of_share], told.processes)
+    arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
+    return Room(plan.name, plan.spec, plan.costs, references, arms)
+
+
+def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
+    """Of one share of the budget, one from each seed."""
+    found = []
     for number, seed in enumerate(told.seeds):
         slice_ = number, len(told.seeds)
-        arm = partial(Arm, folder / "store", spec.scene_id, share, configurations, slice_)
+        source = partial(Arm, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
         name = f"{share}-{number}-of-{len(told.seeds)}"
-        run, _ = room_study.trained(arm, settings_of(ARCHITECTURE, seed, told), folder, name)
-        made.append(room_study.images(run, StoreSource(folder / "store", spec.scene_id), references.rows))
+        found.append(Run(source, settings_of(ARCHITECTURE, seed, told), plan.folder, name))
+    return found
+
+
+def measure(share: Share, plan: Planned, networks: Sequence[Run], references: References) -> Measured:
+    """Look at the held-out views with networks that are trained on one share of the budget."""
+    source = StoreSource(plan.folder / "store", plan.spec.scene_id)
+    made = [room_study.images(run.trained(), source, references.rows) for run in networks]
     shown = Errors(np.stack([references.shown_errors(images) for images in made]), references.units)
     linear = Errors(np.stack([references.linear_errors(images) for images in made]), references.units)
     room_study.tell(f"{share}: {each_seed(shown)}")
-    return Measured(share, configurations, shown, linear)
+    return Measured(share, plan.counts[share], shown, linear)
 
 
 # --------------------------------------------------------------------------------------------------------------- page
@@ -196,15 +230,17 @@ def page(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
     (low, high), (low_rho, high_rho) = found.kappa_range, found.rho_range
     return f"""# What a budget of core-seconds is best spent on
 
-Every arm is rendered for {told.budget:g} core-seconds: configurations, views of each, passes of each view, samples per
-pixel (spp) of a pass. `{ARCHITECTURE}`, preset `small`, {told.steps} steps of {settings.batch} samples for each arm
-alike; {room_study.described(settings)}.
+Every arm is charged {told.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
+samples per pixel (spp) of a pass. `{ARCHITECTURE}`, preset `small`, for each arm alike {told.steps} steps of
+{settings.batch} samples; {room_study.described(settings)}.
 {room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples, each with other configurations.
 
-**A sample of s spp** is an image of which each half has s/2; it is put together of passes with {2 * HALF_SPP} spp, and
-charged what it costs rendered at once. Passes of a view are samples of their own. **MSE** is in the metric space, the
+**A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
+{2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
+charged what it would cost rendered at once, by a line through the times of two numbers of spp; the noise given below
+is that of the passes. Passes of a view are samples of their own. **MSE** is in the metric space, the
 references' noise taken out; **linear MSE** in exposed linear radiance.
-{room_study.of_intervals(len(told.seeds))}
+{of_intervals(len(told.seeds))}
 
 **The model** is that of `photonfarm.shared.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b of
 each room and κ and ρ of all: κ = {found.kappa:.3g} ({low:.3g} … {high:.3g}), ρ = {found.rho:.3g} ({low_rho:.3g} …
@@ -217,21 +253,21 @@ each room and κ and ρ of all: κ = {found.kappa:.3g} ({low:.3g} … {high:.3g}
 
 def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
     """The figures of noise_budget.json."""
+    settings = settings_of(ARCHITECTURE, told.seeds[0], told)
     of_rooms = {
-        room.name: {
-            "costs": room.costs.json(),
-            "reference_spp": room.references.spp,
+        room.name: room_study.document(settings, told, room.references)
+        | {
+            "costs": asdict(room.costs),
             "arms": [
-                {"share": str(arm.share), "configurations": arm.configurations}
+                {**asdict(arm.share), "configurations": arm.configurations}
                 | {"mse": np.round(arm.shown.values, 6).tolist(), "linear_mse": np.round(arm.linear.values, 6).tolist()}
                 for arm in room.arms
             ],
         }
         for room in rooms
     }
-    settings = settings_of(ARCHITECTURE, told.seeds[0], told).model_dump(mode="json")
     model = {"kappa": found.kappa, "rho": found.rho, "kappa_range": found.kappa_range, "rho_range": found.rho_range}
-    return {"budget_core_s": told.budget, "settings": settings, "model": model, "rooms": of_rooms}
+    return {"budget_core_s": told.budget, "model": model, "rooms": of_rooms}
 
 
 def main() -> int:
@@ -245,9 +281,10 @@ def main() -> int:
     told = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        rooms = [measured_room(name, told) for name in told.rooms]
-    except SpecError as error:
+        plans = [planned(name, told) for name in told.rooms]
+    except (SpecError, ValueError) as error:
         parser.error(str(error))
+    rooms = [measured_room(plan, told) for plan in plans]
     found = fit([point for room in rooms for point in room.points()])
     results.write("noise_budget", page(told, rooms, found), document(told, rooms, found), told.out)
     return 0

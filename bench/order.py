@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 
 import results
 import room_study
+from mosaic import mosaic
+from network_errors import Errors, each_seed, of_intervals, stated
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec, load_spec
@@ -33,7 +35,7 @@ from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer.metrics import flip, metric_space, mssim
 from photonfarm.trainer.settings import preset
 from photonfarm.trainer.store_source import StoreSource
-from room_study import HELD_OUT, Errors, References, each_seed, settings_of, stated
+from room_study import HELD_OUT, References, Run, settings_of
 
 ARCHITECTURES = ("cnn", "feature_projection", "light_transport", "light_transport_photons")
 PUBLISHED = (0.0100, 0.0098, 0.0029, 0.0014)
@@ -65,15 +67,20 @@ def render(spec: SceneSpec, store: Store, told: argparse.Namespace) -> None:
     """One view of each configuration, and further passes of those that are held out."""
     samples = Request(modifications=told.configurations, seed=told.plan_seed)
     further = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}"])
-    room_study.render(spec, store, [samples, further])
+    room_study.render(spec, store, [samples, further], told.processes)
+
+
+def runs(architecture: str, where: tuple[Path, SceneSpec], told: Any) -> list[Run]:
+    """Of one architecture, one from each seed; `where` is the folder and the scene."""
+    folder, spec = where
+    source = partial(StoreSource, folder / "store", spec.scene_id)
+    return [Run(source, settings_of(architecture, seed, told), folder, architecture) for seed in told.seeds]
 
 
 def measure(architecture: str, where: tuple[Path, SceneSpec], references: References, told: Any) -> Measured:
-    """Train from each seed, and look at the held-out views."""
-    folder, spec = where
-    source = partial(StoreSource, folder / "store", spec.scene_id)
-    runs = [room_study.trained(source, settings_of(architecture, seed, told), folder) for seed in told.seeds]
-    made = [room_study.images(run, source(), references.rows) for run, _ in runs]
+    """Look at the held-out views with networks that are trained, one from each seed."""
+    ours = runs(architecture, where, told)
+    made = [room_study.images(run.trained(), run.source(), references.rows) for run in ours]
     wanted = metric_space(references.mean)
 
     def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
@@ -83,8 +90,8 @@ def measure(architecture: str, where: tuple[Path, SceneSpec], references: Refere
     room_study.tell(f"{architecture}: {each_seed(shown)}")
     return Measured(
         architecture,
-        parameters=sum(weight.numel() for weight in runs[0][0].weights.values()),
-        train_s=sum(seconds for _, seconds in runs) / len(runs),
+        parameters=sum(weight.numel() for weight in ours[0].trained().weights.values()),
+        train_s=sum(run.seconds() for run in ours) / len(ours),
         shown=shown,
         coarse=each(partial(references.shown_errors, block=BLOCK)),
         linear=each(references.linear_errors),
@@ -96,10 +103,8 @@ def measure(architecture: str, where: tuple[Path, SceneSpec], references: Refere
 
 def photon_map(where: tuple[Path, SceneSpec], references: References, told: Any) -> tuple[Errors, Errors]:
     """Squared errors in the metric space, and of means of blocks, of what the last architecture adds its output to."""
-    folder, spec = where
-    source = partial(StoreSource, folder / "store", spec.scene_id)
-    run, _ = room_study.trained(source, settings_of(ARCHITECTURES[-1], told.seeds[0], told), folder)
-    unlearned = room_study.photon_maps(run, source(), references.rows)
+    run = runs(ARCHITECTURES[-1], where, told)[0]
+    unlearned = room_study.photon_maps(run.trained(), run.source(), references.rows)
     errors = references.shown_errors(unlearned), references.shown_errors(unlearned, BLOCK)
     return Errors(errors[0][None], references.units), Errors(errors[1][None], references.units)
 
@@ -230,7 +235,7 @@ which tells of light rather than of texture and edges.
 **Linear MSE** is in exposed radiance, noise taken out in the same way. **MSSIM** and **FLIP** are
 in the metric space against the mean of both halves, with its noise: a standard deviation of
 {references.noise(references.spp):.3f} in exposed radiance, root mean square over pixels.
-{room_study.of_intervals(len(told.seeds))}
+{of_intervals(len(told.seeds))}
 
 {errors_table(measured)}
 
@@ -265,7 +270,7 @@ def picture(references: References, measured: list[Measured]) -> Any:
     """One image (PIL): a line per view, the reference and each architecture's image with its error below."""
     views = shown_views(measured)
     columns = [(m.architecture, m.images[views], m.shown.values[0][views]) for m in measured]
-    return room_study.mosaic([("reference", references.mean[views], None), *columns])
+    return mosaic([("reference", references.mean[views], None), *columns])
 
 
 def document(
@@ -296,9 +301,11 @@ def main() -> int:
     """Run the benchmark; returns the exit code."""
     told = options().parse_args()
     torch.set_num_threads(1)
+    spec = load_spec("room")
     folder, store = room_study.opened(told, str(told.configurations))
-    render(spec := load_spec("room"), store, told)
+    render(spec, store, told)
     references = References.of(store, spec, told.reference_spp)
+    room_study.train_all([run for name in ARCHITECTURES for run in runs(name, (folder, spec), told)], told.processes)
     measured = [measure(name, (folder, spec), references, told) for name in ARCHITECTURES]
     unlearned = photon_map((folder, spec), references, told)
     told.out.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,6 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +28,7 @@ import path_data_page
 import path_scene
 import results
 import room_study
+from network_errors import Errors, each_seed
 from path_data_study import BLOCK, Arm, Measured, Study, Targets
 from path_scene import Rendered
 from photonfarm.shared.errors import SpecError
@@ -36,11 +36,9 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.settings import TrainSettings
 from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
-from room_study import Errors, References
+from room_study import ChosenSamples, References, Run
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
 ARCHITECTURE = "light_transport"
@@ -48,32 +46,15 @@ HELD_OUT = 1 / 8  # of configurations: with a sixteenth as elsewhere few would b
 PICTURE = "path_data.png"
 
 
-class FirstSamples(StoreSource):
+class FirstSamples(ChosenSamples):
     """The first so many samples of a store that are not held out: those of fewer are among those of more."""
 
     def __init__(self, root: Path, scene_id: str, samples: int) -> None:
         """Raises ValueError where the store has too few."""
-        super().__init__(root, scene_id)
-        complete = super().refresh().tolist()
-        held_out = rows_held_out(self, complete, HELD_OUT)
-        trained_on = [row for row, held in zip(complete, held_out, strict=True) if not held]
-        self.rows = trained_on[:samples]
-        self._new = [*self.rows, *[row for row, held in zip(complete, held_out, strict=True) if held][:1]]
+        super().__init__(root, scene_id, HELD_OUT)
+        self.rows = self.trainable[:samples]
         if len(self.rows) < samples:
-            raise ValueError(f"{root} has {len(trained_on)} samples to train on, and {samples} are needed")
-
-    def refresh(self) -> NDArray[np.int64]:
-        """The chosen samples at the first call, and one that is held out, as a trainer wants one to look at."""
-        new, self._new = self._new, []
-        return np.array(new, np.int64)
-
-    def taken_back(self) -> NDArray[np.int64]:
-        """None is."""
-        return np.empty(0, np.int64)
-
-    def planned(self) -> int:
-        """As many as were chosen."""
-        return len(self.rows) + 1
+            raise ValueError(f"{root} has {len(self.trainable)} samples to train on, and {samples} are needed")
 
 
 def spec_of(told: argparse.Namespace) -> SceneSpec:
@@ -114,40 +95,30 @@ def settings_of(seed: int, told: argparse.Namespace) -> TrainSettings:
     return room_study.settings_of(ARCHITECTURE, seed, told, HELD_OUT)
 
 
-def trained(
-    arm: Arm, seed: int, made: Rendered, where: tuple[Path, str], told: argparse.Namespace
-) -> tuple[TrainedRun, float]:
-    """A network of one arm and one seed, and its steps' seconds; `where` is the folder and the scene's id."""
-    torch.set_num_threads(1)
+def runs(arm: Arm, made: Rendered, where: tuple[Path, str], told: argparse.Namespace) -> list[Run]:
+    """Of one arm, one from each seed; `where` is the folder and the scene's id."""
     folder, scene_id = where
     source = partial(FirstSamples, made.root, scene_id, arm.samples)
     name = f"{arm.kind}-{made.half_spp}-spp-{arm.samples}"
-    return room_study.trained(source, settings_of(seed, told), folder, name)
+    return [Run(source, settings_of(seed, told), folder, name) for seed in told.seeds]
 
 
-def train_one(*arguments: Any) -> None:
-    """Train in a process of its own: what it leaves in the run's folder is all that is wanted."""
-    trained(*arguments)
-
-
-def measure(
-    arm: Arm, networks: Sequence[tuple[TrainedRun, float]], where: tuple[Path, str], references: References
-) -> Measured:
+def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: References) -> Measured:
     """Look at held-out views with an arm's networks, one from each seed; `where` is bdpt's store and the scene."""
-    made = [room_study.images(run, StoreSource(*where), references.rows) for run, _ in networks]
+    made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
 
     def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
         return Errors(np.stack([error(images) for images in made]), references.units)
 
     found = Measured(
         arm,
-        train_s=sum(seconds for _, seconds in networks) / len(networks),
+        train_s=sum(run.seconds() for run in networks) / len(networks),
         shown=each(references.shown_errors),
         coarse=each(partial(references.shown_errors, block=BLOCK)),
         linear=each(references.linear_errors),
         images=made[0],
     )
-    room_study.tell(f"{arm.kind} × {arm.share:g}: {room_study.each_seed(found.shown)}")
+    room_study.tell(f"{arm.kind} × {arm.share:g}: {each_seed(found.shown)}")
     return found
 
 
@@ -185,7 +156,6 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--experiment", default="fixed-veach-ajar", help="whose room it is (%(default)s)")
     parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
     parser.add_argument("--samples", type=int, default=400, help="of bdpt, trained on at budget 1 (%(default)s)")
-    parser.add_argument("--processes", type=int, default=2, help="that render or train at a time (%(default)s)")
     room_study.add_options(parser, "path_data")
     parser.set_defaults(steps=2000, decay=0.86, loss="paired", demodulation=0.2)
     results.add_options(parser)
@@ -203,20 +173,14 @@ def main() -> int:
     if not spec.groups:
         parser.error(f"--experiment {told.experiment}: nothing moves in it; intervals need several configurations")
     torch.set_num_threads(1)
-    folder, store = room_study.opened(told, f"{told.experiment}-{told.size}-{told.samples}")
+    folder, store = room_study.opened(told, f"{told.experiment}-{spec.scene_id[:8]}-{told.samples}")
     costs = path_scene.costs_of(spec, folder)
     made = path_scene.render(spec, (folder, store), requests(told), costs, told.processes)
     references = References.of(store, spec, told.reference_spp, HELD_OUT)
-    runs = [
-        (arm, seed, made[arm.kind], (folder, spec.scene_id), told)
-        for seed in told.seeds
-        for arm in reversed(arms(told))
-    ]
-    path_scene.in_processes(train_one, runs, told.processes, "trained")
-    measured = []
-    for arm in arms(told):
-        networks = [trained(*run) for run in runs if run[0] == arm]
-        measured.append(measure(arm, networks, (made["bdpt"].root, spec.scene_id), references))
+    networks = {arm: runs(arm, made[arm.kind], (folder, spec.scene_id), told) for arm in arms(told)}
+    room_study.train_all([run for arm in reversed(networks) for run in networks[arm]], told.processes)
+    seen_in = made["bdpt"].root, spec.scene_id
+    measured = [measure(arm, of_arm, seen_in, references) for arm, of_arm in networks.items()]
     study = Study(told, spec, settings_of(told.seeds[0], told), costs, made, references, measured)
     looked_at = targets(made, spec, references)
     told.out.mkdir(parents=True, exist_ok=True)

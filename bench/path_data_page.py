@@ -12,10 +12,11 @@ import numpy as np
 import path_statistics
 import results
 import room_study
+from mosaic import Column, mosaic
+from network_errors import each_seed, of_intervals, stated
 from path_data_study import BLOCK, METRICS, Study, Targets
 from path_statistics import Bias, Found
 from photonfarm.trainer.losses import RELATIVE_EPSILON
-from room_study import each_seed, stated
 
 SHOWN = (0.3, 0.6, 0.8, 0.95)  # quantiles of the error of bdpt at budget 1: these views are shown
 
@@ -133,11 +134,12 @@ def page(study: Study, targets: Targets, picture: str) -> str:
 
 The room of the experiment `{told.experiment}` at {spec.film.width}², connections {spec.transport.connections}, light
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
-`rr_depth` {spec.transport.rr_depth}, the box filter and independent samples, one render for each half. Its samples
-per pixel are such that a sample costs as much, by times that were taken before; budgets below are of the core-seconds
-in the markers of the stores, medians over jobs, with editing, buffers, photons and visibility. Both stores are of one
-spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s bit by bit, and
-its first {study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has beyond, at
+`rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
+each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid, such that a sample costs about as
+much, by times that were taken before; budgets below are of the core-seconds in the markers of the stores, medians over
+jobs, with editing, buffers, photons and visibility. Both stores are of one spec: the views, point clouds, photons and
+held-out configurations of `path`'s are those of `bdpt`'s bit by bit, and its first
+{study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has beyond, at
 budgets above 1, are further configurations.
 
 `{settings.network.architecture}`, preset `small`: width {settings.network.width}, {settings.network.points} points;
@@ -150,14 +152,16 @@ All arms are measured after the last step, on {room_study.counted(len(references
 **MSE** is in the metric space, clip(I, 0, 1)^(1/2.2), against references of {references.spp} spp by `bdpt` whose
 noise is taken out by their halves, but for what that curve makes of it; **of {BLOCK} × {BLOCK} means**, the same of
 blocks of pixels. **Linear MSE** is in exposed linear radiance, in the same way.
-{room_study.of_intervals(len(told.seeds))}
+{of_intervals(len(told.seeds))}
 
 ## What a sample costs, and its noise
 
 {costs_table(study, targets)}
 
 Core-seconds of both halves are means over views, of the times taken before; {study.costs.path_fixed_s:.3f} of those
-of `path` are its calls', whatever the samples. **Noise of a target**: standard deviation of (A + B)/2, from the
+of `path` are its calls', whatever the samples. Launches of `bdpt` are recorded and replayed; those of `path` are not,
+as replayed they take longer. Were its calls for nothing, all factors would be {study.without_calls:.3f} times what
+they are. **Noise of a target**: standard deviation of (A + B)/2, from the
 difference of A and B, root mean square over pixels of the held-out views, exposed linear radiance; **relative**, over
 √(I² + {RELATIVE_EPSILON:g}) of the references' brightness I, much as the loss weighs pixels. Renders that were not
 finite, and drawn again: {redrawn}.
@@ -201,14 +205,14 @@ def picture(study: Study, targets: Targets) -> Any:
     ranked = np.argsort(ours.shown.values[0])
     views = [int(ranked[round(q * (len(ranked) - 1))]) for q in SHOWN]
     held_out = [targets.held_out[view] for view in views]
-    columns: list[room_study.Column] = [("reference", study.references.mean[views], None)]
+    columns: list[Column] = [("reference", study.references.mean[views], None)]
     for kind, halves in (("bdpt", targets.bdpt), ("path", targets.path)):
         columns.append((f"target, {kind}", halves[held_out].mean(axis=1), None))
     predicted = (ours, *(one for one in study.of("path") if one.arm.share >= ours.arm.share))
     columns += [
         (f"{m.arm.kind}, {m.arm.samples} samples", m.images[views], m.shown.values[0][views]) for m in predicted
     ]
-    return room_study.mosaic(columns)
+    return mosaic(columns)
 
 
 def document(study: Study, targets: Targets) -> dict[str, Any]:
@@ -222,7 +226,8 @@ def document(study: Study, targets: Targets) -> dict[str, Any]:
     all_light, alike = path_statistics.bias(targets.bdpt, targets.path)
     return room_study.document(study.settings, study.told, study.references) | {
         "experiment": study.told.experiment,
-        "costs": asdict(study.costs) | {"path_spp": study.costs.path_spp},
+        "costs": asdict(study.costs) | {"path_spp": study.costs.path_spp, "sampler": "multijitter"},
+        "factors_without_calls": study.without_calls,
         "rendered": {
             kind: {"half_spp": made.half_spp, "core_s": made.core_s, "redrawn": made.redrawn}
             for kind, made in study.made.items()

@@ -6,13 +6,14 @@ import argparse
 from dataclasses import dataclass
 
 import path_statistics
+from network_errors import Errors
 from path_scene import Costs, Rendered
 from path_statistics import Found
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.trainer.settings import TrainSettings
-from room_study import Errors, References
+from room_study import References
 
 BLOCK = 8  # px
 METRICS = {"MSE": "shown", f"MSE of {BLOCK} × {BLOCK} means": "coarse", "linear MSE": "linear"}
@@ -84,6 +85,11 @@ class Study:
         wanted, found = getattr(self.of("bdpt")[-1], metric), [getattr(one, metric) for one in self.of("path")]
         by_seed = path_statistics.factors_of_seeds(wanted, found, self.budgets)
         return path_statistics.factor(wanted, found, self.budgets), by_seed
+
+    @property
+    def without_calls(self) -> float:
+        """What factors are to be multiplied by where the fixed cost of `path`'s calls is not counted."""
+        return 1 - self.costs.path_fixed_s / self.made["path"].core_s
 
     def noise(self, targets: Targets, *, relative: bool) -> tuple[float, float, Found]:
         """Variances of targets of `bdpt` and of `path` on held-out views, and their ratio at equal core-seconds."""

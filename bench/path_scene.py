@@ -2,19 +2,18 @@
 
 Both stores are of one spec, and so of one scene id: configurations, views, point clouds, photons and what is held out
 are the same bit by bit. Only the half-estimates differ; those of `path` have another number of samples per pixel than
-the spec says, which is chosen so that a sample takes as long.
+the spec says, which is chosen so that a sample takes about as long.
+
+`path` is called as it is. Recorded and replayed as `bdpt` is, it gives the same images and takes 1.1 to 1.6 times as
+long (Mitsuba 3.9, in two rooms): its launches are put together in C++, not in Python.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
-import multiprocessing
-import signal
-import sys
+import math
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -23,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-import room_study
 from photonfarm.renderer import backend
 from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.modification import sample_modification
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
@@ -34,31 +33,57 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.top_up import TopUp
 from photonfarm.shared.view import View, sample_view
+from room_study import in_processes, render_job
 
 SHARD_ROWS = 16  # small jobs: those of both kinds take turns, so that both are timed on the same machine
 TIMED_SEED = 1 << 40  # of configurations that are only timed; no plan has it by chance
-BDPT, FEW, MANY = 0, 8, 32  # samples per pixel that `path` is timed at; 0 stands for `bdpt`, with the spec's
+BDPT, FEW, MANY = 0, 9, 36  # samples per pixel that `path` is timed at; 0 stands for `bdpt`, with the spec's
 WARM_UP = 3  # views: kernels are compiled and launches recorded
 
 
 class PathScene(LoadedScene):
     """A scene whose half-estimates are those of Mitsuba's `path`, with the spec's path lengths.
 
-    Seeds, sensor and box filter are as with `bdpt`, one render for each half. `spp` are its samples per pixel; the
-    spec's `half_spp` is not looked at.
+    Seeds, camera and box filter are as with `bdpt`, one render for each half. Samples are Mitsuba's `multijitter`, as
+    `bdpt` has stratified ones too; `spp` are those of a pixel, and fill a grid. The spec's `half_spp` is not looked at.
     """
 
     def __init__(self, spec: SceneSpec, scene: Any) -> None:
         import mitsuba as mi
 
         super().__init__(spec, scene)
+        self._sensor = _stratified(spec)
         lengths = {"max_depth": spec.transport.max_depth, "rr_depth": spec.transport.rr_depth}
         self._path = mi.load_dict({"type": "path", **lengths})
         self.spp = spec.transport.half_spp
 
-    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
-        """Half-estimates of linear radiance for each seed, (K, H, W, 3)."""
-        return np.stack([self.render(view, seed, self._path, self.spp) for seed in seeds])
+    def render_halves(self, view: View, seeds: Sequence[int], half_spp: int | None = None) -> F32:
+        """Half-estimates of linear radiance for each seed, (K, H, W, 3); of `spp` unless another number is given."""
+        return np.stack([self.render(view, seed, self._path, half_spp or self.spp) for seed in seeds])
+
+
+def _stratified(spec: SceneSpec) -> Any:
+    """The spec's sensor with a stratified sampler: `bdpt`, which has points of its own, does not ask it."""
+    import mitsuba as mi
+
+    from photonfarm.renderer.sensor import AimedSensor, describe
+
+    class Stratified(AimedSensor):
+        def __init__(self) -> None:
+            self._spec = spec
+            self.sensor = mi.load_dict(describe(spec) | {"sampler": {"type": "multijitter"}})
+            self._parameters = mi.traverse(self.sensor)
+
+    return Stratified()
+
+
+def filling_a_grid(spp: float) -> int:
+    """The nearest number of samples per pixel that `multijitter` takes as it is, 1 at least: n² or n (n + 1).
+
+    Others it rounds up.
+    """
+    n = max(1, math.isqrt(int(spp)))
+    return min((n * n, n * (n + 1), (n + 1) ** 2), key=lambda count: abs(count - spp))
 
 
 def load_path(spec: SceneSpec, spp: int) -> PathScene:
@@ -82,8 +107,8 @@ class Costs:
 
     @property
     def path_spp(self) -> int:
-        """Samples per pixel of a half by `path` that cost what a half by `bdpt` does, 1 at least."""
-        return max(1, round((self.bdpt_s - self.path_fixed_s) / self.path_spp_s))
+        """Samples per pixel of a half by `path` that cost about what a half by `bdpt` does."""
+        return filling_a_grid((self.bdpt_s - self.path_fixed_s) / self.path_spp_s)
 
 
 def measured_costs(spec: SceneSpec, views: int) -> Costs:
@@ -110,7 +135,7 @@ def costs_of(spec: SceneSpec, folder: Path, views: int = 24) -> Costs:
     file = folder / "costs.json"
     if not file.is_file():
         (costs,) = in_processes(measured_costs, [(spec, views)], 1, "timed both integrators")
-        file.write_text(json.dumps(asdict(costs)) + "\n", encoding="utf-8")
+        write_whole(file, json.dumps(asdict(costs)) + "\n")
     return Costs(**json.loads(file.read_text(encoding="utf-8")))
 
 
@@ -142,19 +167,20 @@ def render(
         missing = scene.missing_jobs()
         told = str(opened.root), spec.scene_id, BDPT if kind == "bdpt" else costs.path_spp
         jobs += [(place / len(missing), (*told, job)) for place, job in enumerate(missing)]
-    in_processes(render_job, [job for _, job in sorted(jobs)], processes, "rendered")
+    in_processes(render_any, [job for _, job in sorted(jobs)], processes, "rendered")
     return {kind: rendered(opened, spec, half_spp[kind]) for kind, opened in stores.items()}
 
 
-def render_job(root: str, scene_id: str, path_spp: int, job: int) -> None:
+def render_any(root: str, scene_id: str, path_spp: int, job: int) -> None:
     """One job, by `path` with so many samples per pixel in a half, or by `bdpt`."""
-    _renderer(root, path_spp).render(scene_id, job)
+    if path_spp == BDPT:
+        render_job(root, scene_id, job)
+    else:
+        _path_renderer(root, path_spp).render(scene_id, job)
 
 
 @cache
-def _renderer(root: str, path_spp: int) -> ShardRenderer:
-    if path_spp == BDPT:
-        return ShardRenderer(Store(root), worker="bench")
+def _path_renderer(root: str, path_spp: int) -> ShardRenderer:
     return ShardRenderer(Store(root), worker=f"bench, path {path_spp} spp", load=partial(load_path, spp=path_spp))
 
 
@@ -166,28 +192,3 @@ def rendered(store: Store, spec: SceneSpec, half_spp: int) -> Rendered:
     figures = [scene.marker(job)["figures"] for job in jobs]
     each = [found["core_s"] / len(scene.job_rows(job).samples) for job, found in zip(jobs, figures, strict=True)]
     return Rendered(Path(store.root), half_spp, median(each), sum(found["redrawn"] for found in figures))
-
-
-# ---------------------------------------------------------------------------------------------------------- processes
-
-
-def in_processes(task: Callable[..., Any], items: Sequence[tuple[Any, ...]], processes: int, what: str) -> list[Any]:
-    """The task's result for each item, from so many processes at a time, which end with this one; tells how far."""
-    if not items:
-        return []
-    context = multiprocessing.get_context("spawn")  # Dr.Jit does not outlive a fork
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=_end_with_parent) as pool:
-        started = [pool.submit(task, *item) for item in items]
-        try:
-            for count, done in enumerate(as_completed(started), 1):
-                done.result()
-                room_study.tell(f"{what} {count} of {len(started)}")
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        return [done.result() for done in started]
-
-
-def _end_with_parent() -> None:
-    if sys.platform == "linux":  # an executor's processes wait for ever for one that was killed
-        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG

@@ -2,7 +2,7 @@
 
 Nothing here renders or trains.
 
-Shape letters: A arms, U configurations, N views, R replicates of a bootstrap, H W image.
+Shape letters: A arms, N views, H W image.
 """
 
 from __future__ import annotations
@@ -12,17 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.shared.estimate import group_means
+from network_errors import F64, Errors, replicates
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.trainer.losses import RELATIVE_EPSILON
-from room_study import Errors
 
-F64 = NDArray[np.float64]
-
-REPLICATES = 4000
 LEVELS = (0.025, 0.975)
 
 
@@ -47,29 +42,6 @@ def crossing(budgets: Sequence[float], errors: Sequence[float] | F64, wanted: fl
             share = (errors[place - 1] - wanted) / (errors[place - 1] - errors[place])
             return float(budgets[place - 1] * (budgets[place] / budgets[place - 1]) ** share)
     return math.inf
-
-
-def seed_spread(arms: Sequence[Errors]) -> float:
-    """Standard deviation of a seed's mean error as a share of its arm's, pooled over arms; 0 from one seed."""
-    seeds = len(arms[0].values)
-    if seeds == 1:
-        return 0.0
-    apart = [(means := arm.of_seeds()) / means.mean() - 1 for arm in arms]
-    return math.sqrt(sum(float(np.sum(one**2)) for one in apart) / (len(arms) * (seeds - 1)))
-
-
-def replicates(arms: Sequence[Errors], count: int = REPLICATES) -> F64:
-    """Mean errors of each arm as other configurations and seeds might have given them, (R, A).
-
-    Configurations are drawn with replacement, the same for all arms. Two seeds are too few to draw from: each arm's
-    mean is moved by a normal deviate instead, of `seed_spread` / √S.
-    """
-    rng = np.random.default_rng(0)
-    of_units = np.stack([group_means(arm.of_views(), arm.units) for arm in arms])
-    units = of_units.shape[1]
-    means = rng.multinomial(units, np.full(units, 1 / units), size=count) @ of_units.T / units
-    moved: F64 = means * (1 + seed_spread(arms) / math.sqrt(len(arms[0].values)) * rng.normal(size=means.shape))
-    return moved
 
 
 def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> Found:

@@ -1,6 +1,7 @@
-"""`room` rendered, networks trained on it, and their images of views that none was trained on.
+"""A room rendered, networks trained on it, and their images of views that none was trained on.
 
-Everything lies in one folder and is gone on with where it ended: jobs that are committed, runs that are trained.
+Everything lies in one folder and is gone on with where it ended: jobs that are committed, runs that are trained. Both
+are dealt out to processes of one thread each.
 
 Shape letters: N views, H W image.
 """
@@ -8,12 +9,16 @@ Shape letters: N views, H W image.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import hashlib
 import math
+import multiprocessing
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -24,7 +29,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from photonfarm.shared.estimate import Estimate, clean_error, group_means
+from photonfarm.shared.estimate import clean_error
 from photonfarm.shared.keys import Key
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
@@ -34,20 +39,18 @@ from photonfarm.shared.store.merge import merge_view
 from photonfarm.shared.store.reader import SceneReader
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.animation import enlarged
-from photonfarm.trainer.dataset import SampleSource
+from photonfarm.trainer.dataset import SampleSource, rows_held_out
 from photonfarm.trainer.evaluation import batches
 from photonfarm.trainer.evaluation_samples import Samples
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import CHECKPOINT, train
 from photonfarm.trainer.metrics import metric_space
-from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.settings import Loss, TrainSettings, preset
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 
 if TYPE_CHECKING:
-    from PIL import Image
+    from photonfarm.renderer.jobs import ShardRenderer
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
@@ -80,24 +83,91 @@ def in_passes(spec: SceneSpec, half_spp: int) -> SceneSpec:
     return spec.model_copy(update={"transport": spec.transport.model_copy(update={"half_spp": half_spp})})
 
 
-def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp]) -> None:
-    """Plan what is not planned yet of the requests, and render all that is missing, in this process."""
-    from photonfarm.renderer.jobs import ShardRenderer
-
+def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], processes: int) -> None:
+    """Plan what is not planned yet of the requests, and render all that is missing."""
     scene = store.add(spec)
     for request in requests:
         scene.plan(request, shard_rows=SHARD_ROWS)
-    renderer = ShardRenderer(store, worker="bench")
-    for job in (missing := scene.missing_jobs()):
-        renderer.render(spec.scene_id, job)
-        tell(f"rendered job {job} of {missing[-1]}")
+    jobs = [(str(store.root), spec.scene_id, job) for job in scene.missing_jobs()]
+    in_processes(render_job, jobs, processes, "rendered")
+
+
+def render_job(root: str, scene_id: str, job: int) -> None:
+    """One job of the store in a folder, by the renderer that this process keeps for it."""
+    _renderer(root).render(scene_id, job)
+
+
+@cache
+def _renderer(root: str) -> ShardRenderer:
+    from photonfarm.renderer.jobs import ShardRenderer
+
+    return ShardRenderer(Store(root), worker="bench")
+
+
+# ---------------------------------------------------------------------------------------------------------- processes
+
+
+def in_processes(task: Callable[..., Any], items: Sequence[tuple[Any, ...]], processes: int, what: str) -> list[Any]:
+    """The task's result for each item, from so many processes at a time, which end with this one; tells how far."""
+    if not items:
+        return []
+    context = multiprocessing.get_context("spawn")  # Dr.Jit does not outlive a fork
+    with ProcessPoolExecutor(processes, mp_context=context, initializer=_end_with_parent) as pool:
+        started = [pool.submit(task, *item) for item in items]
+        try:
+            for count, done in enumerate(as_completed(started), 1):
+                done.result()
+                tell(f"{what} {count} of {len(started)}")
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        return [done.result() for done in started]
+
+
+def _end_with_parent() -> None:
+    if sys.platform == "linux":  # an executor's processes wait for ever for one that was killed
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 # ----------------------------------------------------------------------------------------------------------- training
 
 
+class ChosenSamples(StoreSource):
+    """Samples of a store that are chosen once, to be trained on, and one that is held out.
+
+    A trainer wants one to look at. Whoever derives from it sets `rows`.
+    """
+
+    def __init__(self, root: str | Path, scene_id: str, share: float) -> None:
+        """Look at what is there now; `share` of all is held out. Raises ValueError where none is."""
+        super().__init__(root, scene_id)
+        complete = super().refresh().tolist()
+        held_out = rows_held_out(self, complete, share)
+        self.trainable = [row for row, held in zip(complete, held_out, strict=True) if not held]
+        self.rows: list[int] = []
+        self._looked_at = [row for row, held in zip(complete, held_out, strict=True) if held][:1]
+        self._told = False
+        if not self._looked_at:
+            raise ValueError(f"{root}: none of {len(complete)} samples is held out")
+
+    def refresh(self) -> NDArray[np.int64]:
+        """The chosen samples at the first call, and the one that is held out; none after it."""
+        new = [] if self._told else [*self.rows, *self._looked_at]
+        self._told = True
+        return np.array(new, np.int64)
+
+    def taken_back(self) -> NDArray[np.int64]:
+        """None is."""
+        return np.empty(0, np.int64)
+
+    def planned(self) -> int:
+        """As many as were chosen."""
+        return len(self.rows) + 1
+
+
 def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     """What is equal for all runs of a study, and where it works; `parser.set_defaults` may change the defaults."""
+    parser.add_argument("--processes", type=int, default=2, help="that render or train at a time (%(default)s)")
     parser.add_argument("--steps", type=int, default=1500, help="of each run (%(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="of the networks (%(default)s)")
     parser.add_argument("--plan-seed", type=int, default=1, help="of configurations and views (%(default)s)")
@@ -168,19 +238,46 @@ def code() -> str:
     return " ".join([*(tree[:12] for tree in trees), *mark])
 
 
-def trained(
-    source: Callable[[], SampleSource], settings: TrainSettings, folder: Path, name: str = ""
-) -> tuple[TrainedRun, float]:
-    """A run trained to its end, in a folder named by `name`, all its settings and `code`; and its steps' seconds.
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A network to be trained, in a folder named by `name`, all settings and `code`."""
 
-    One that was cut goes on from its last checkpoint, and one at its end is as it is.
+    source: Callable[[], SampleSource]  # another process can be given it
+    settings: TrainSettings
+    within: Path
+    name: str
+
+    @property
+    def folder(self) -> Path:
+        """Where it is trained."""
+        digest = hashlib.sha256(f"{self.settings.model_dump_json()} {code()}".encode()).hexdigest()[:8]
+        return self.within / f"{self.name}-{self.settings.seed}-{digest}"
+
+    def is_at_its_end(self) -> bool:
+        """Whether all its steps are done."""
+        last = self.folder / CHECKPOINT
+        return last.is_file() and checkpoint.load(last)["step"] >= self.settings.max_steps
+
+    def trained(self) -> TrainedRun:
+        """What was trained."""
+        return TrainedRun.load(self.folder)
+
+    def seconds(self) -> float:
+        """Wall time of its steps."""
+        return float(checkpoint.load(self.folder / CHECKPOINT)["seconds"]["train"])
+
+
+def train_all(runs: Sequence[Run], processes: int) -> None:
+    """Train each run to its end; one that was cut goes on from its last checkpoint.
+
+    Folders are named here: what another process found as `code` might be newer.
     """
-    digest = hashlib.sha256(f"{settings.model_dump_json()} {code()}".encode()).hexdigest()[:8]
-    run = folder / f"{name or settings.network.architecture}-{settings.seed}-{digest}"
-    last = run / CHECKPOINT
-    if not last.is_file() or checkpoint.load(last)["step"] < settings.max_steps:
-        train(source(), settings, run)
-    return TrainedRun.load(run), float(checkpoint.load(last)["seconds"]["train"])
+    left = [(run.source, run.settings, run.folder) for run in runs if not run.is_at_its_end()]
+    in_processes(_train, left, processes, "trained")
+
+
+def _train(source: Callable[[], SampleSource], settings: TrainSettings, folder: Path) -> None:
+    train(source(), settings, folder)
 
 
 # --------------------------------------------------------------------------------------------------------- evaluation
@@ -256,80 +353,9 @@ def photon_maps(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F
         return np.concatenate(made)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Errors:
-    """Errors of images that networks of one kind made, one from each seed, and what is concluded from them; S seeds."""
-
-    values: NDArray[np.float64]  # (S, N)
-    units: tuple[Key, ...]  # what each view's configuration is: views of one are not independent
-
-    def less(self, other: Errors) -> Errors:
-        """Differences from the same seeds on the same views."""
-        return Errors(self.values - other.values, self.units)
-
-    def of_views(self) -> NDArray[np.float64]:
-        """Means over seeds, (N,)."""
-        means: NDArray[np.float64] = self.values.mean(axis=0)
-        return means
-
-    def of_seeds(self) -> NDArray[np.float64]:
-        """Means over configurations, (S,)."""
-        return np.array([group_means(values, self.units).mean() for values in self.values])
-
-    def estimate(self) -> Estimate:
-        """Mean and standard error, se² = se²(configurations) + var(seeds) / S.
-
-        The first is of means over seeds. From one seed there is no second: it is of this network then.
-        """
-        over_units, over_seeds = self._parts()
-        if over_units.standard_error is None or over_seeds.standard_error is None:
-            return over_units
-        error = math.hypot(over_units.standard_error, over_seeds.standard_error)
-        return Estimate(over_units.mean, error, over_units.count)
-
-    def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the mean; raises ValueError where one configuration is all there is.
-
-        By Student's t with Satterthwaite's degrees of freedom, se⁴ / Σ seᵢ⁴ / νᵢ [Satterthwaite 1946], rounded down:
-        where the seeds' variance leads, little is known of it.
-        """
-        found = self.estimate()
-        if found.standard_error is None:
-            raise ValueError("an interval needs two configurations at least")
-        known = [(part.standard_error, part.count - 1) for part in self._parts() if part.standard_error]
-        apart = sum(error**4 / freedom for error, freedom in known)
-        reach = t_975(int(found.standard_error**4 / apart + 1e-9)) * found.standard_error if apart else 0.0
-        return found.mean - reach, found.mean + reach
-
-    def _parts(self) -> tuple[Estimate, Estimate]:
-        """Over configurations, and over seeds."""
-        return Estimate.of(group_means(self.of_views(), self.units)), Estimate.of(self.of_seeds())
-
-
-def stated(errors: Errors, digits: int = 5) -> str:
-    """Mean and 95 % interval."""
-    low, high = errors.interval()
-    return f"{errors.estimate().mean:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})"
-
-
-def each_seed(errors: Errors, form: str = ".5f") -> str:
-    """The mean of each seed."""
-    return " · ".join(f"{mean:{form}}" for mean in errors.of_seeds())
-
-
 def counted(count: int, what: str) -> str:
     """A number of things, in words."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-def of_intervals(seeds: int) -> str:
-    """What a page says of its intervals."""
-    if seeds == 1:
-        return "Intervals are over configurations, for these networks: those of another seed may lie outside."
-    return (
-        f"Intervals are for networks of any seed: se² = se²(configurations) + var(seeds) / {seeds}, the first after "
-        "the mean over seeds; Student's t with Satterthwaite's degrees of freedom."
-    )
 
 
 def document(settings: TrainSettings, told: argparse.Namespace, references: References) -> dict[str, Any]:
@@ -343,32 +369,3 @@ def document(settings: TrainSettings, told: argparse.Namespace, references: Refe
         "reference_noise": references.noise(references.spp),
         "units": [unit.hex() for unit in references.units],
     }
-
-
-# ----------------------------------------------------------------------------------------------------------- pictures
-
-GAP = 4
-LINE = 16  # height of a caption
-
-Column = tuple[str, F32, NDArray[np.float64] | None]
-"""A caption, images (N, H, W, 3) linear radiance × exposure, and a number for each or none."""
-
-
-def mosaic(columns: Sequence[Column]) -> Image.Image:
-    """Images side by side, N lines of them, the column's caption above and each image's number below it."""
-    from PIL import Image, ImageDraw
-
-    count = len(columns[0][1])
-    height, width = enlarged(columns[0][1][0]).shape[:2]
-    across, down = width + GAP, height + LINE
-    whole = Image.new("RGB", (GAP + across * len(columns), LINE + GAP + down * count), "white")
-    draw = ImageDraw.Draw(whole)
-    for place, (caption, images, numbers) in enumerate(columns):
-        x = GAP + across * place
-        draw.text((x, 2), caption, fill="black")
-        for line, image in enumerate(images):
-            y = LINE + GAP + down * line
-            whole.paste(Image.fromarray(enlarged(image)), (x, y))
-            if numbers is not None:
-                draw.text((x, y + height + 1), f"{numbers[line]:.4f}", fill="black")
-    return whole

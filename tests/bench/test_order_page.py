@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import order
+from network_errors import Errors
 from order import ARCHITECTURES, METRICS, Measured
 from photonfarm.shared.scene import load_spec
-from room_study import Errors, References
+from room_study import References
 
 VIEWS, SIZE = 12, 16
 UNITS = tuple(bytes([unit]) * 16 for unit in range(VIEWS))

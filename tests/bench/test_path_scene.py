@@ -17,6 +17,7 @@ from photonfarm.shared.records import F32, arrays_of
 from photonfarm.shared.scene import SceneSpec, load_spec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.reader import Sample
+from photonfarm.shared.view import sample_view
 
 SIZE, SPP = 16, 64
 
@@ -71,18 +72,21 @@ def test_all_but_the_noise_is_the_same(samples: dict[str, list[Sample]]) -> None
         assert all(np.any(images[i] != images[j]) for i in range(4) for j in range(i))
 
 
-def test_a_sample_of_path_costs_what_one_of_bdpt_does() -> None:
+def test_samples_of_path_are_stratified_and_as_many_as_asked_for() -> None:
+    scene, spec = path_scene.load_path(tiny_room(), 20), tiny_room()
+    view = sample_view(spec, bytes(16), 0, 0)
+    sampler = scene._sensor.aim(view).sampler()
+    assert scene.render_halves(view, (1, 2)).shape == (2, SIZE, SIZE, 3)
+    assert (sampler.class_name(), sampler.sample_count()) == ("MultijitterSampler", 20)
+
+
+def test_a_sample_of_path_costs_about_what_one_of_bdpt_does_and_fills_a_grid() -> None:
     costs = Costs(bdpt_s=0.5, path_fixed_s=0.04, path_spp_s=0.02)
-    assert costs.path_spp == 23
+    assert costs.path_spp == 25  # of 23
+    assert [path_scene.filling_a_grid(spp) for spp in (0.1, 2, 3.2, 8, 17, 34)] == [1, 2, 4, 9, 16, 36]
     assert Costs(bdpt_s=0.05, path_fixed_s=0.04, path_spp_s=0.2).path_spp == 1
 
 
 def test_costs_are_measured_once(tmp_path: Path) -> None:
     (tmp_path / "costs.json").write_text('{"bdpt_s": 0.5, "path_fixed_s": 0.1, "path_spp_s": 0.1}')
     assert path_scene.costs_of(tiny_room(), tmp_path) == Costs(0.5, 0.1, 0.1)
-
-
-def test_what_fails_in_a_process_is_raised_here() -> None:
-    assert path_scene.in_processes(math.hypot, [(3.0, 4.0), (5.0, 12.0)], 1, "measured") == [5, 13]
-    with pytest.raises(ValueError, match="math domain error"):
-        path_scene.in_processes(math.sqrt, [(-1.0,)], 1, "measured")

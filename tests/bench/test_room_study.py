@@ -11,14 +11,16 @@ import pytest
 from analytic_scene import small_spec
 from numpy.typing import NDArray
 
+import room_study
 from budget_arms import HALF_SPP, Arm, Share, requests
+from network_errors import Errors
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.store import Store
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.store_source import StoreSource
-from room_study import HELD_OUT, Errors, References
+from room_study import HELD_OUT, References
 from store_contents import Pool, commit
 
 SIZE, SLOTS = 8, 8
@@ -114,6 +116,15 @@ def test_what_is_rendered_is_enough_for_every_share_and_slice() -> None:
     asked = requests(shares, slices=2, seed=1)
     assert [(r.views_per_modification, r.passes) for r in asked] == [(4, 4), (1, 4), (1, 1)]
     assert all(r.modifications > 2 * count for r, count in zip(asked, (5, 10, 40), strict=True))
+
+
+# ---------------------------------------------------------------------------------------------------------- processes
+
+
+def test_what_fails_in_a_process_is_raised_here() -> None:
+    assert room_study.in_processes(math.hypot, [(3.0, 4.0), (5.0, 12.0)], 1, "measured") == [5, 13]
+    with pytest.raises(ValueError, match="math domain error"):
+        room_study.in_processes(math.sqrt, [(-1.0,)], 1, "measured")
 
 
 # ------------------------------------------------------------------------------------------------------------- errors

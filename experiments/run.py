@@ -3,9 +3,9 @@
 
     python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments]
 
-Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered and
-trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 3 for a file that is wrong, 7 where
-a stage ended with an error: the others are run all the same.
+Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
+and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 2 for wrong usage, 3 for a
+file that is wrong, 7 where an experiment did not come to its end: the others are run all the same.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import get_args
 
 from experiment import Experiment, SizeName, names
-from photonfarm.shared.errors import IncompleteError, SpecError
-from stages import StageError, Stages, tell
+from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError
+from stages import Stages, tell
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,9 +27,16 @@ def options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
-    parser.add_argument("--workers", type=int, default=2, help="processes at a time, a core each (2)")
+    parser.add_argument("--workers", type=_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
     return parser
+
+
+def _count(text: str) -> int:
+    """A whole number of at least 1; raises ArgumentTypeError."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of processes; at least 1 is needed")
+    return int(text)
 
 
 def main() -> int:
@@ -44,11 +51,10 @@ def main() -> int:
         return SpecError.exit_code
     failed = False
     for experiment in experiments:
+        stages = Stages(experiment, told.work / told.size / experiment.name, told.workers)
         try:
-            tell(
-                f"{experiment.name}: {Stages(experiment, told.work / told.size / experiment.name, told.workers).run()}"
-            )
-        except StageError as error:
+            tell(f"{experiment.name}: {stages.run()}")
+        except PhotonfarmError as error:
             failed = True
             tell(f"error: {error}")
     return IncompleteError.exit_code if failed else 0

@@ -1,27 +1,35 @@
 """The stages of an experiment, each by a verb of photonfarm and each going on where it ended.
 
-Everything lies in one folder: spec.json, store/, references/, runs/NAME/ and report/.
+Everything lies in one folder: spec.json, store/, references/, runs/NAME/ and report/; what the verbs said, in logs/.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from experiment import Experiment, Run
+from photonfarm.shared.errors import IncompleteError
+from photonfarm.shared.hold_out import are_held_out
 from photonfarm.shared.processes import tied
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.markers import COMMITTED
 from photonfarm.shared.verbs import command
 
+REFERENCE = re.compile(r"([0-9a-f]{32})(\.partial)?\.npz")
+"""A file that `store merge` leaves, by the key of its view."""
 
-class StageError(RuntimeError):
-    """A verb that ended with another exit code than 0; says which, and where its output is."""
+
+class StageError(IncompleteError):
+    """A stage that did not come to its end; says which, and what to do or where its output is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +41,7 @@ class Stages:
     workers: int
 
     def run(self) -> Path:
-        """All stages; the folder of the report."""
+        """All stages; the folder of the report. Raises StageError, and StoreError where store or runs are damaged."""
         self.write_spec()
         self.render()
         self.train()
@@ -45,6 +53,8 @@ class Stages:
         spec = self.experiment.spec().model_dump(mode="json")
         (self.folder / "spec.json").write_text(json.dumps(spec, indent=2) + "\n")
 
+    # ----------------------------------------------------------------------------------------------------- rendering
+
     def render(self) -> None:
         """The samples, further passes of some that are held out, and references of these."""
         size, spec = self.experiment.size, str(self.folder / "spec.json")
@@ -55,43 +65,126 @@ class Stages:
         self._verb("plan", ["top-up", spec, *store, "--spp", size.references.spp, *where, "--no-queue"])
         farm = ["--workers", self.workers, "--train-steps", 0, "--run", self.folder / "farm", "--out", self.folder]
         self._verb("render", ["up", spec, *store, *samples, *farm])
-        passes = -(-size.references.spp // (2 * self.experiment.spec().transport.half_spp))
-        merge = ["store", "merge", *store, "--least", passes, "--out", self.folder / "references"]
-        self._verb("references", merge)
+        self._merge()
+
+    def _merge(self) -> None:
+        """A reference of each view that is asked for, merged anew where anything was rendered since; and no other."""
+        scene_id, out = self._scene_id, self.folder / "references"
+        committed = Store(self.folder / "store").scene(scene_id).folder / COMMITTED  # renewed by every commit
+        passes = -(-self.experiment.size.references.spp // (2 * self.experiment.spec().transport.half_spp))
+        merge = ["store", "merge", "--store", self.folder / "store", "--scene", scene_id, "--least", passes]
+        wanted = self._references()
+        self._verb("references", [*merge, "--out", out], made=wanted, of=[committed])
+        for file in out.iterdir():
+            if REFERENCE.fullmatch(file.name) and file not in wanted:
+                file.unlink()  # of an earlier spec, or of more views than are asked for now
+
+    def _references(self) -> list[Path]:
+        """Where they lie: of the first held-out views, in the order of the store, as `views=first:N` counts them."""
+        size = self.experiment.size
+        reader = SceneReader(self.folder / "store", self._scene_id)
+        rows = {reader.view_row(row): row for row in reversed(reader.refresh().tolist())}
+        shown = [row for _, row in sorted(rows.items())]
+        keys = reader.view_keys(shown)
+        held_out = are_held_out(reader.modification_keys(shown) if reader.spec.groups else keys, size.hold_out)
+        wanted = [key.hex() for key, held in zip(keys, held_out, strict=True) if held][: size.references.views]
+        return [self.folder / "references" / f"{key}.npz" for key in wanted]
+
+    @property
+    def _scene_id(self) -> str:
+        return self.experiment.spec().scene_id
+
+    # ------------------------------------------------------------------------------------------------------ training
 
     def train(self) -> None:
-        """Every network, some at a time; one that is trained is left as it is."""
+        """Every network, some at a time; one that is trained is left as it is.
+
+        Raises StageError for a run of another scene or of other settings than are asked for, before anything is done.
+        """
+        missing = [run for run in self.experiment.trained() if not self._is_trained(run)]
         with ThreadPoolExecutor(self.workers) as pool:
-            for _ in pool.map(self._train, self.experiment.trained()):
+            for _ in pool.map(self._train, missing):
                 pass
 
-    def report(self) -> Path:
-        """The report of all networks and of the denoisers that nobody trained."""
-        size, out = self.experiment.size, self.folder / "report"
-        arguments: list[Any] = ["report", "--store", self.folder / "store", "--out", out]
-        for run in self.experiment.trained():
-            arguments += ["--run", self._folder(run)]
-        arguments += ["--references", self.folder / "references"]
-        arguments += [argument for name in size.untrained for argument in ("--denoiser", name)]
-        arguments += [argument for kept in size.kept for argument in ("--kept", kept)]
-        held_out = size.modifications * size.views * size.hold_out
-        arguments += ["--samples", round(held_out)]  # further passes of the same views come after these
-        self._verb("report", arguments)
-        return out
+    def _is_trained(self, run: Run) -> bool:
+        """Whether the last checkpoint of a run is its end. Raises StageError where it is not of what is asked for."""
+        from photonfarm.trainer import checkpoint  # here, as it brings torch
+
+        if not self._checkpoint(run).is_file():
+            return False
+        state = checkpoint.load(self._checkpoint(run))
+        found = {"scene_id": state["scene_id"], **state["settings"], **state["settings"]["network"]}
+        differing = [
+            f"{key} = {found.get(key)!r}, and {value!r} is asked for now"
+            for key, value in {"scene_id": self._scene_id, **self._asked(run)}.items()
+            if found.get(key) != value
+        ]
+        if differing:
+            raise StageError(
+                f"{self.experiment.name}: {self._folder(run)} was trained with {'; '.join(differing)}: move that "
+                "folder away, and it is trained anew"
+            )
+        return bool(state["step"] >= found["max_steps"])
+
+    def _asked(self, run: Run) -> dict[str, Any]:
+        """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
+        from photonfarm.trainer.settings import PRESETS
+
+        preset = PRESETS[run.train["preset"]]().model_dump(mode="json", exclude_unset=True)
+        return {**preset.pop("network"), **preset, **self._settings(run)}
+
+    def _settings(self, run: Run) -> dict[str, Any]:
+        """What is set on top of its preset."""
+        own = {key: value for key, value in run.train.items() if key != "preset"}
+        return {**own, "hold_out": self.experiment.size.hold_out}
+
+    def _train(self, run: Run) -> None:
+        pairs = [part for key, value in self._settings(run).items() for part in ("--set", f"{key}={_text(value)}")]
+        place = ["--store", self.folder / "store", "--run", self._folder(run), "--preset", run.train["preset"]]
+        self._verb(f"train-{run.name}", ["train", self.folder / "spec.json", *place, *pairs])
+        if not self._is_trained(run):  # as one that is asked to stop exits with 0
+            raise StageError(f"{self.experiment.name}: train-{run.name} was stopped early; the same command goes on")
 
     def _folder(self, run: Run) -> Path:
         return self.folder / "runs" / run.name
 
-    def _train(self, run: Run) -> None:
-        settings = {**run.train, "hold_out": self.experiment.size.hold_out}
-        preset = settings.pop("preset")
-        pairs = [argument for key, value in settings.items() for argument in ("--set", f"{key}={_text(value)}")]
-        place = ["--store", self.folder / "store", "--run", self._folder(run), "--preset", preset]
-        self._verb(f"train-{run.name}", ["train", self.folder / "spec.json", *place, *pairs])
+    def _checkpoint(self, run: Run) -> Path:
+        from photonfarm.trainer.loop import CHECKPOINT
 
-    def _verb(self, stage: str, arguments: Sequence[Any]) -> None:
-        """Run a verb to its end; what it says goes to a log. Raises StageError."""
-        log = self.folder / "logs" / f"{stage}.log"
+        return self._folder(run) / CHECKPOINT
+
+    # -------------------------------------------------------------------------------------------------------- report
+
+    def report(self) -> Path:
+        """The report of all networks and of the denoisers that nobody trained; made anew where any of it is newer."""
+        size, out, runs = self.experiment.size, self.folder / "report", self.experiment.trained()
+        references = self.folder / "references"  # renewed by every file that comes or goes
+        arguments: list[Any] = ["report", "--store", self.folder / "store", "--out", out]
+        for run in runs:
+            arguments += ["--run", self._folder(run)]
+        arguments += ["--references", references]
+        arguments += [argument for name in size.untrained for argument in ("--denoiser", name)]
+        arguments += [argument for kept in size.kept for argument in ("--kept", kept)]
+        held_out = size.modifications * size.views * size.hold_out
+        arguments += ["--samples", round(held_out)]  # further passes of the same views come after these
+        made_of = [references, *(self._checkpoint(run) for run in runs)]
+        self._verb("report", arguments, made=[out / "report.json"], of=made_of)
+        return out
+
+    # --------------------------------------------------------------------------------------------------------- verbs
+
+    def _verb(
+        self, stage: str, arguments: Sequence[Any], *, made: Sequence[Path] = (), of: Iterable[Path] = ()
+    ) -> None:
+        """Run a verb to its end; what it says goes to a log. Raises StageError.
+
+        One that leaves the files `made` is not run again while they are there, its arguments are the same and none of
+        the files `of` is newer than its last end.
+        """
+        log, done = (self.folder / "logs" / f"{stage}{suffix}" for suffix in (".log", ".done"))
+        told = json.dumps([*map(str, arguments)])
+        if made and _is_done(done, told, made, of):
+            return
         log.parent.mkdir(exist_ok=True)
         began = time.monotonic()
         verb = command(*map(str, arguments))
@@ -100,7 +193,16 @@ class Stages:
         if code:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise StageError(f"{self.experiment.name}: {stage} ended with exit code {code}; {log} says: {last}")
+        if made:
+            done.write_text(told)
         tell(f"{self.experiment.name}: {stage} {time.monotonic() - began:.0f} s")
+
+
+def _is_done(done: Path, told: str, made: Iterable[Path], of: Iterable[Path]) -> bool:
+    """Whether a verb's last end was that of these arguments, after all it is made of, and left what it makes."""
+    if not done.is_file() or done.read_text() != told or not all(file.is_file() for file in made):
+        return False
+    return all(source.stat().st_mtime_ns < done.stat().st_mtime_ns for source in of)
 
 
 def tell(line: str) -> None:

@@ -277,9 +277,9 @@ READING = f"""\
 Errors are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
 out of MSE and is in all other metrics. Intervals are over held-out configurations (95 %, Student's t). They are
 {ONE_SEED}: another seed's may lie outside, and no order here is shown to be the
-architectures'. In the tables of neighbours ≈ is a gap of less than {CLOSE:.0%} of the first's error; < and > say whose
-error is larger. FID is of as few images as there are references, so it can be compared within this page only. n/a:
-not measured, or a row that a room lacks.
+architectures'. In the tables of neighbours ≈ is a gap of less than {CLOSE:.0%} of the first's error; < and > say
+whose error is larger. FID is of as few images as there are references, so it can be compared within this page only.
+n/a: not measured, or a row that a room lacks.
 
 Time is from the scene to the image on one core, without editing the scene, which all need: each room's table has it
 as “edit”. “paper” are the published figures, of four other rooms' average at 256² on the authors' machine. No value

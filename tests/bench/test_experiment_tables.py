@@ -126,9 +126,8 @@ def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
     large = report(film=256)
     large["evaluation"]["device"] = "cuda"
     page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small")
-    assert (
-        "A GPU took part: networks ran on cuda (fixed-living-room); cpu (fixed-dining-room); of the rooms only" in page
-    )
+    assert "A GPU took part: networks ran on cuda (fixed-living-room); cpu (fixed-dining-room); of the rooms" in page
+    assert "only fixed-living-room is at the paper's resolution" in page
     assert "images are 256 × 256 (fixed-living-room); 64 × 64 (fixed-dining-room)." in page
 
 

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import pytest
 
 import experiment
+import run
 from experiment import Experiment, SizeName, merged, names
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.scene import SCENES_VARIABLE
@@ -101,8 +102,18 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
     return Experiment.load("tiny", "small")
 
 
+def with_size(tiny: Experiment, **changes: Any) -> Experiment:
+    return tiny.model_copy(update={"size": tiny.size.model_copy(update=changes)})
+
+
+def reports(stages: Stages) -> list[int]:
+    """When what is made last was written: checkpoints, references and the report."""
+    files = [*stages.folder.glob("runs/*/checkpoint*"), *stages.folder.glob("references/*.npz")]
+    return [file.stat().st_mtime_ns for file in [*sorted(files), stages.folder / "report" / "report.json"]]
+
+
 @pytest.mark.slow
-def test_all_stages_lead_to_a_report(tiny: Experiment, tmp_path: Path) -> None:
+def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tmp_path: Path) -> None:
     stages = Stages(tiny, tmp_path / "work", workers=2)
     out = stages.run()
     report = json.loads((out / "report.json").read_text())
@@ -114,11 +125,75 @@ def test_all_stages_lead_to_a_report(tiny: Experiment, tmp_path: Path) -> None:
     assert rows[0]["frame_seconds"]["render"] == 0
     assert [run["steps"] for run in report["runs"]] == [3, 3]
 
+    before = reports(stages)
+    assert stages.run() == out
+    assert reports(stages) == before
+
+    strange = tmp_path / "work" / "references" / "notes.txt"
+    strange.write_text("Not ours.")
+    fewer = tiny.size.references.model_copy(update={"views": 1})
+    Stages(with_size(tiny, references=fewer), tmp_path / "work", workers=2).run()
+    assert json.loads((out / "report.json").read_text())["evaluation"]["references"]["views"] == 1
+    assert len(list(strange.parent.glob("*.npz"))) == 1
+    assert strange.is_file()
+
 
 def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
-    refused = {"train": {**tiny.size.train, "loss": "l1"}, "train_denoisers": {}}
-    wrong = tiny.size.model_copy(update=refused)
-    stages = Stages(tiny.model_copy(update={"size": wrong}), tmp_path / "work", workers=1)
+    refused = with_size(tiny, train={**tiny.size.train, "loss": "l1"}, train_denoisers={})
+    stages = Stages(refused, tmp_path / "work", workers=1)
     stages.write_spec()
     with pytest.raises(StageError, match=r"tiny: train-light_transport ended with exit code 3; .*train-light_trans"):
         stages.train()
+
+
+def test_training_that_ends_early_without_an_error_is_not_taken_for_done(tiny: Experiment, tmp_path: Path) -> None:
+    """Nothing is rendered, and the trainer waits for samples until its time is over; then it exits with 0."""
+    brief = with_size(tiny, train={**tiny.size.train, "max_seconds": 0.1}, architectures=("light_transport",))
+    stages = Stages(brief, tmp_path / "work", workers=1)
+    stages.write_spec()
+    with pytest.raises(StageError, match="tiny: train-light_transport was stopped early; the same command goes on"):
+        stages.train()
+
+
+def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
+    """The stages of an experiment of one network, of which a checkpoint of some step is there."""
+    from photonfarm.trainer import checkpoint
+    from photonfarm.trainer.settings import preset
+
+    told = {key: experiment.size.train[key] for key in ("max_steps", "loss")}
+    settings = preset("small", network={"width": 4, "points": 128}, hold_out=experiment.size.hold_out, **told)
+    state = {"scene_id": experiment.spec().scene_id, "settings": settings.model_dump(mode="json"), "step": step}
+    (folder / "runs" / "light_transport").mkdir(parents=True)
+    checkpoint.save(folder / "runs" / "light_transport" / "checkpoint.safetensors", state)
+    return Stages(experiment, folder, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"train": {"decay": 0.5}}, "decay = 0.99, and 0.5 is asked for now: move that folder away"),
+        ({"train": {"max_steps": 4}}, "max_steps = 3, and 4 is asked for now"),
+        ({"train": {"preset": "paper-static"}}, "batch = 2, and 128 is asked for now"),
+        ({"hold_out": 0.3}, "hold_out = 0.4, and 0.3 is asked for now"),
+        ({"changes": {"points": 512}}, "scene_id = "),
+    ],
+)
+def test_a_run_of_other_settings_is_refused_with_its_folder(
+    tiny: Experiment, tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    tiny = with_size(tiny, architectures=("light_transport",))
+    trained(tiny, tmp_path / "work", step=3).train()
+    assert not (tmp_path / "work" / "logs").exists()  # nothing had to be done
+    other = with_size(tiny, **{key: merged(getattr(tiny.size, key), value) if isinstance(value, dict) else value
+                               for key, value in changes.items()})  # fmt: skip
+    with pytest.raises(StageError, match=said) as refused:
+        Stages(other, tmp_path / "work", workers=1).train()
+    assert str(tmp_path / "work" / "runs" / "light_transport") in str(refused.value)
+
+
+@pytest.mark.parametrize("workers", ["0", "-1", "two"])
+def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run.options().parse_args([f"--workers={workers}"])
+    assert ended.value.code == 2
+    assert f"{workers!r} is no number of processes" in capsys.readouterr().err

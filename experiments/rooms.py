@@ -63,7 +63,7 @@ class Room:
     def machine(self) -> str:
         """What it was timed on."""
         found = self.report["machine"]
-        return "nothing" if found is None else f"{found['cpu']}, {found['cores']} cores, {found['architecture']}"
+        return f"{found['cpu'] or 'a CPU of unknown model'}, {found['cores']} cores, {found['architecture']}"
 
     def spent(self, kind: str) -> dict[str, Any]:
         """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""

@@ -15,7 +15,7 @@ from photonfarm.shared.errors import IncompleteError, SpecError
 from rooms import Room
 
 NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")
-MACHINE = {"cpu": "Some CPU", "cores": 2, "architecture": "x86_64", "load_average": 0.4}
+MACHINE = {"cpu": "Some CPU", "cores": 2, "architecture": "x86_64", "load_average": [0.4, 0.6, 1.2]}
 
 
 def of_images(values: list[float]) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> Non
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
     assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
     assert told["edit, ms"] == "149"
-    assert told["load average"] == "0.4"
+    assert told["load average of 1, 5, 15 min"] == "0.4, 0.6, 1.2"
 
 
 def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
@@ -148,7 +148,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
             "estimate": {"mean": 0.01, "standard_error": None, "count": 1}, "values": [0.01],
         }  # fmt: skip
     bare["evaluation"]["rows"][1]["frame_seconds"] = None
-    bare |= {"machine": None, "edit_seconds": None}
+    bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
     found = room("movable-living-room", bare)
     page = tables.page([found], "small")
     assert cells(page, "cnn")[1:] == [
@@ -157,6 +157,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
     ]  # fmt: skip
     assert cells(page, "feature_projection")[1] == "n/a"
     assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
+    assert "Timed on a CPU of unknown model, 2 cores" in page
     json.dumps(found.document())
 
 

@@ -14,7 +14,10 @@ import run
 from experiment import Experiment, SizeName, merged, names
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.scene import SCENES_VARIABLE
+from photonfarm.trainer.report.published import MOVABLE_LIGHTS
+from rooms import Room
 from stages import StageError, Stages
+from tables import paper_table, room_table
 
 ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
 EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]
@@ -124,6 +127,12 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert rows[1]["frame_seconds"]["render"] > 0
     assert rows[0]["frame_seconds"]["render"] == 0
     assert [run["steps"] for run in report["runs"]] == [3, 3]
+
+    room = Room.read(tiny, out / "report.json")
+    assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
+    assert "| denoise_4 |" in paper_table([room], MOVABLE_LIGHTS)
+    assert room_table([room]).splitlines()[-1].startswith("| tiny | A tiny room |")
+    assert room.document()["rows"]["light_transport"]["network_seconds_range"][0] > 0
 
     before = reports(stages)
     assert stages.run() == out

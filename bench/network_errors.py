@@ -19,6 +19,7 @@ from photonfarm.trainer.metrics.intervals import t_975
 F64 = NDArray[np.float64]
 
 REPLICATES = 4000
+LEVELS = (0.025, 0.975)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,15 +105,36 @@ def seed_spread(arms: Sequence[Errors]) -> float:
     return math.sqrt(sum(float(np.sum(one**2)) for one in apart) / (len(arms) * (seeds - 1)))
 
 
-def replicates(arms: Sequence[Errors], count: int = REPLICATES) -> F64:
+def replicates(arms: Sequence[Errors], count: int = REPLICATES, seed: int = 0) -> F64:
     """Mean errors of each arm as other configurations and seeds might have given them, (R, A).
 
     Configurations are drawn with replacement, the same for all arms. Two seeds are too few to draw from: each arm's
     mean is moved by a normal deviate instead, of `seed_spread` / √S.
     """
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     of_units = np.stack([group_means(arm.of_views(), arm.units) for arm in arms])
     units = of_units.shape[1]
     means = rng.multinomial(units, np.full(units, 1 / units), size=count) @ of_units.T / units
     moved: F64 = means * (1 + seed_spread(arms) / math.sqrt(len(arms[0].values)) * rng.normal(size=means.shape))
     return moved
+
+
+def own_errors(arms: Sequence[Errors]) -> F64:
+    """Standard errors of the arms' means, (A,), without what the arms of a room have in common.
+
+    How hard a configuration is, as a share of an arm's mean and the same for all, is taken out: it moves all arms
+    together. What seeds move is pooled as in `seed_spread`.
+    """
+    of_units = np.stack([group_means(arm.of_views(), arm.units) for arm in arms])
+    means = of_units.mean(axis=1)
+    shares = of_units / means[:, None]
+    apart = (shares - shares.mean(axis=0)).var(axis=1, ddof=1) / of_units.shape[1]
+    whole = apart * len(arms) / (len(arms) - 1)  # an arm is part of the mean that is taken out of it
+    found: F64 = means * np.sqrt(whole + seed_spread(arms) ** 2 / len(arms[0].values))
+    return found
+
+
+def within(replicated: F64) -> tuple[float, float]:
+    """The 95 % interval of replicates (R,), by values that occur: nothing lies between a number and infinity."""
+    low, high = np.quantile(replicated, LEVELS, method="closest_observation")
+    return float(low), float(high)

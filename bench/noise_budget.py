@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,8 @@ import torch
 import results
 import room_study
 from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
-from budget_fit import Fit, Point, fit
-from network_errors import Errors, each_seed, of_intervals, stated
+from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
+from network_errors import F64, Errors, each_seed, of_intervals, stated
 from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared import allocation
 from photonfarm.shared.allocation import Allocation
@@ -72,15 +73,7 @@ class Room:
     costs: SampleCosts
     references: References
     arms: tuple[Measured, ...]
-
-    def points(self) -> list[Point]:
-        """What the model is fitted to."""
-        found = []
-        for arm in self.arms:
-            of = arm.shown.estimate()
-            error = of.standard_error or 1.0
-            found.append(Point(self.name, arm.allocation, self.costs.relative_noise, of.mean, error))
-        return found
+    errors: RoomErrors  # of the arms, in their order
 
 
 def spec_of(room: str) -> SceneSpec:
@@ -128,8 +121,8 @@ def paid(costs: SampleCosts, share: Share, budget: float) -> int:
     return int(budget / one)
 
 
-def measured_room(plan: Planned, told: argparse.Namespace) -> Room:
-    """Samples, networks and errors of one room."""
+def measured_room(number: int, plan: Planned, told: argparse.Namespace) -> Room:
+    """Samples, networks and errors of one room, which has a number among all."""
     held_out = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
     asked: list[Request | TopUp] = [*requests(plan.counts, len(told.seeds), told.plan_seed), held_out]
     room_study.render(plan.spec, plan.store, asked, told.processes)
@@ -137,7 +130,9 @@ def measured_room(plan: Planned, told: argparse.Namespace) -> Room:
     networks = {share: runs(share, plan, told) for share in SHARES}
     room_study.train_all([run for of_share in networks.values() for run in of_share], told.processes)
     arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
-    return Room(plan.name, plan.spec, plan.costs, references, arms)
+    shown = [(arm.allocation, arm.shown) for arm in arms]
+    errors = RoomErrors.of(plan.name, plan.costs.relative_noise, shown, number)
+    return Room(plan.name, plan.spec, plan.costs, references, arms, errors)
 
 
 def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
@@ -170,7 +165,7 @@ def table(room: Room, found: Fit) -> str:
         "spp of a sample", "views of a configuration", "passes of a view", "configurations", "samples", "MSE (95 %)",
         "of each seed", "the model's", "linear MSE (95 %)",
     )  # fmt: skip
-    predicted = [found.predicted(point) for point in room.points()]
+    predicted = found.predicted(room.errors)
     lines = [
         [
             arm.share.spp, arm.share.views, arm.share.passes, arm.configurations, arm.allocation.samples,
@@ -195,14 +190,35 @@ def pairs_table(room: Room) -> str:
 
 
 def optimum(room: Room, found: Fit, budget: float) -> str:
-    """What the model says of this room, in words."""
-    told = {"kappa": found.kappa, "rho": found.rho}
-    best = allocation.best(room.costs, budget, **told)
-    real = allocation.best_spp(room.costs, 1, **told)
+    """What was measured to be best in this room, and what the model says is, in words."""
+    first, of_arms = room.errors.best()
+    best = allocation.best(room.costs, budget, kappa=found.kappa, rho=found.rho)
+    real = allocation.best_spp(room.costs, 1, kappa=found.kappa, rho=found.rho)
+    bought = best_of_replicates(room, found, budget)
     return (
-        f"By the model the best of {budget:g} core-seconds is {best.modifications} configurations of {best.views} "
-        f"views with {best.spp} spp each (s* = {real:.1f} with one view)."
+        f"Measured best: `{room.arms[first].share}`, the best in {of_arms[first]:.0%} of replicates. By the model the "
+        f"best of {budget:g} core-seconds is {best.modifications} configurations of {best.views} views with "
+        f"{best.spp} spp each (s* = {real:.1f} with one view). Of the replicates' κ and ρ the best has "
+        f"{shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
     )
+
+
+def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
+    """What the model says is best in a room, by the constants of each replicate."""
+    best = cache(lambda kappa, rho: allocation.best(room.costs, budget, kappa=kappa, rho=rho))
+    return [best(float(kappa), float(rho)) for kappa, rho in zip(found.kappas, found.rhos, strict=True)]
+
+
+def shares(values: Sequence[int], what: str) -> str:
+    """How often which number occurs, in words, the most frequent first."""
+    counted = Counter(values).most_common()
+    return ", ".join(f"{value} {what} in {count / len(values):.0%}" for value, count in counted)
+
+
+def in_range(low: float, high: float, grid: F64) -> str:
+    """A range of a constant, and where the grid that was searched ends it."""
+    below = " or less" if low == grid[0] > 0 else ""
+    return f"{low:.3g}{below} … {high:.3g}{' or more' if high == grid[-1] else ''}"
 
 
 def room_part(room: Room, found: Fit, told: argparse.Namespace) -> str:
@@ -227,7 +243,7 @@ def page(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
     """The tables as Markdown."""
     settings = settings_of(ARCHITECTURE, told.seeds[0], told)
     parts = "\n\n".join(room_part(room, found, told) for room in rooms)
-    (low, high), (low_rho, high_rho) = found.kappa_range, found.rho_range
+    kappas, rhos = in_range(*found.kappa_range, KAPPAS), in_range(*found.rho_range, RHOS)
     return f"""# What a budget of core-seconds is best spent on
 
 Every arm is charged {told.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
@@ -243,8 +259,11 @@ references' noise taken out; **linear MSE** in exposed linear radiance.
 {of_intervals(len(told.seeds))}
 
 **The model** is that of `photonfarm.shared.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b of
-each room and κ and ρ of all: κ = {found.kappa:.3g} ({low:.3g} … {high:.3g}), ρ = {found.rho:.3g} ({low_rho:.3g} …
-{high_rho:.3g}), where χ² is up to 1 above the least, {found.chi2:.1f} with {found.freedom} degrees of freedom.
+each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
+with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms of a room have in
+common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 % intervals of a
+bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with replacement, the same
+for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it, pooled over its room.
 
 {parts}
 
@@ -270,22 +289,28 @@ def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dic
     return {"budget_core_s": told.budget, "model": model, "rooms": of_rooms}
 
 
-def main() -> int:
-    """Run the benchmark; returns the exit code."""
+def options() -> argparse.ArgumentParser:
+    """What can be told."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
     parser.add_argument("--budget", type=float, default=200.0, help="core-seconds of each arm (200)")
     room_study.add_options(parser, "noise_budget")
     parser.set_defaults(steps=2000, decay=0.88, loss="paired", demodulation=0.2)
     results.add_options(parser)
+    return parser
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    parser = options()
     told = parser.parse_args()
     torch.set_num_threads(1)
     try:
         plans = [planned(name, told) for name in told.rooms]
     except (SpecError, ValueError) as error:
         parser.error(str(error))
-    rooms = [measured_room(plan, told) for plan in plans]
-    found = fit([point for room in rooms for point in room.points()])
+    rooms = [measured_room(number, plan, told) for number, plan in enumerate(plans)]
+    found = fit([room.errors for room in rooms])
     results.write("noise_budget", page(told, rooms, found), document(told, rooms, found), told.out)
     return 0
 

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from network_errors import F64, Errors, replicates
+from network_errors import F64, Errors, replicates, within
 from photonfarm.shared.keys import Key
 from photonfarm.shared.records import F32
 from photonfarm.trainer.losses import RELATIVE_EPSILON
-
-LEVELS = (0.025, 0.975)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +46,7 @@ def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> 
     """The budget at which arms come down to the errors that are wanted, with its bootstrap interval."""
     value = crossing(budgets, [arm.estimate().mean for arm in arms], wanted.estimate().mean)
     found = [crossing(budgets, one[1:], one[0]) for one in replicates([wanted, *arms])]
-    return Found(value, *_interval(np.array(found)))
+    return Found(value, *within(np.array(found)))
 
 
 def factors_of_seeds(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> list[float]:
@@ -61,14 +59,8 @@ def ratio(above: F64, below: F64, units: Sequence[Key]) -> Found:
     """The ratio of two means over views (N,), with its bootstrap interval over configurations."""
     errors = [Errors(values[None], tuple(units)) for values in (above, below)]
     drawn = replicates(errors)
-    low, high = _interval(drawn[:, 0] / drawn[:, 1])
+    low, high = within(drawn[:, 0] / drawn[:, 1])
     return Found(errors[0].estimate().mean / errors[1].estimate().mean, low, high)
-
-
-def _interval(values: F64) -> tuple[float, float]:
-    """By values that occur: nothing lies between a number and infinity."""
-    low, high = np.quantile(values, LEVELS, method="closest_observation")
-    return float(low), float(high)
 
 
 # ------------------------------------------------------------------------------------------------------------ targets

@@ -1,0 +1,121 @@
+#!/usr/bin/env python3
+"""What samples of each experiment's scene cost, how noisy they are, and what that says of samples per pixel.
+
+    python bench/sample_costs.py [--budget 2000] [--views 12] [--out DIR]
+
+Measures the scenes of experiments/ in their small size as `photonfarm scene cost` does, and puts costs and noise into
+`photonfarm.shared.allocation`. PHOTONFARM_SCENES names the folder of the scene files. Exit code 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict, dataclass, replace
+
+import results
+import room_study
+from photonfarm.shared.allocation import KAPPA, RHO, Allocation, best, best_spp, excess, seconds
+from photonfarm.shared.errors import SpecError
+from photonfarm.shared.sample_costs import SampleCosts
+from photonfarm.shared.scene import SceneSpec
+
+NAME = "sample_costs"
+SPP = (2, 8, 32, 128)
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A scene, with what was measured."""
+
+    name: str
+    spec: SceneSpec
+    costs: SampleCosts
+
+    @property
+    def rho(self) -> float:
+        """ρ: of a static scene, which has one configuration, 0."""
+        return RHO if self.spec.groups else 0.0
+
+    @property
+    def charged(self) -> SampleCosts:
+        """The costs, where the one configuration of a static scene is paid for once and for all."""
+        return self.costs if self.spec.groups else replace(self.costs, configuration_s=0.0)
+
+    def best(self, budget: float) -> Allocation:
+        """What is best bought."""
+        return best(self.charged, budget, rho=self.rho, most_views=16 if self.spec.groups else 1)
+
+    def more_than_best(self, spp: int, budget: float) -> float:
+        """By what factor the excess error is more where the budget is spent on single views of so many samples."""
+        count = budget / seconds(self.charged, Allocation(1, 1, 1, spp))
+        spent = excess(self.costs.relative_noise, Allocation(1, 1, 1, spp), rho=self.rho) / count
+        return spent / excess(self.costs.relative_noise, self.best(budget), rho=self.rho)
+
+
+def measured(name: str, views: int) -> Room:
+    """Costs and noise of one experiment's scene. Raises SpecError."""
+    from photonfarm.renderer.sample_costs import measured_costs
+
+    spec = room_study.named_room(name)
+    room = Room(name, spec, measured_costs(spec, frames=views))
+    room_study.tell(f"{name}: {room.costs.line()}")
+    return room
+
+
+def line(room: Room, budget: float) -> list[str]:
+    """A row of the table."""
+    costs, found = room.costs, room.best(budget)
+    parts = (costs.configuration_s, costs.view_s, costs.pass_s, costs.spp_s)
+    dearer = (f"{room.more_than_best(spp, budget):.2f}" for spp in SPP)
+    return [
+        room.name,
+        *(f"{1e3 * part:.1f}" for part in parts),
+        f"{costs.relative_noise:.2f}",
+        f"{best_spp(room.charged, 1, rho=room.rho):.2f}",
+        f"{found.modifications} × {found.views} × {found.spp} spp",
+        *dearer,
+    ]
+
+
+def page(rooms: list[Room], budget: float, views: int) -> str:
+    """The table as Markdown."""
+    header = (
+        "experiment", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "noise ν of 1 spp", "s*",
+        f"best of {budget:g} core-s: configurations × views", *(f"excess at {spp} spp" for spp in SPP),
+    )  # fmt: skip
+    return f"""# What samples cost, how noisy they are, and how many samples per pixel that asks for
+
+Scenes of `experiments/` at 64 × 64; core-milliseconds, medians over {views} views. ν is the relative noise of one
+sample per pixel (`photonfarm.shared.sample_costs.relative_noise`); s* the samples per pixel, both halves together, of
+least excess error with one view of each configuration, and “best” the best of all shares with 2 spp and more
+(`photonfarm.shared.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
+core-seconds spent on single views of so many spp, over that of the best.
+
+{results.table(header, (line(room, budget) for room in rooms))}
+
+{results.footer(NAME)}"""
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--budget", type=float, default=2000.0, help="core-seconds (%(default)s)")
+    parser.add_argument("--views", type=int, default=12, help="that are measured of each (%(default)s)")
+    results.add_options(parser)
+    told = parser.parse_args()
+    room_study.find_experiments()
+    from experiment import names
+
+    try:
+        rooms = [measured(name, told.views) for name in names()]
+    except SpecError as error:
+        parser.error(str(error))
+    values = {room.name: asdict(room.costs) for room in rooms}
+    document = {"budget_core_s": told.budget, "views": told.views, "kappa": KAPPA, "rho": RHO, "rooms": values}
+    results.write(NAME, page(rooms, told.budget, told.views), document, told.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -148,8 +148,8 @@ def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
 
 def measure(share: Share, plan: Planned, networks: Sequence[Run], references: References) -> Measured:
     """Look at the held-out views with networks that are trained on one share of the budget."""
-    source = StoreSource(plan.folder / "store", plan.spec.scene_id)
-    made = [room_study.images(run.trained(), source, references.rows) for run in networks]
+    where = plan.folder / "store", plan.spec.scene_id
+    made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
     shown = Errors(np.stack([references.shown_errors(images) for images in made]), references.units)
     linear = Errors(np.stack([references.linear_errors(images) for images in made]), references.units)
     room_study.tell(f"{share}: {each_seed(shown)}")

@@ -225,7 +225,7 @@ def verb(store: Store, out: Path, *more: str, scene: str = "room") -> list[str]:
 
 def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, store: Store, room: LoadedScene) -> None:
     before = sorted(Path(store.root).rglob("*"))
-    options = ["--rows", "3", "--rows", "0", "--kept", "1", "--kept", "4", "--timed", "3"]
+    options = ["--row", "3", "--row", "0", "--kept", "1", "--kept", "4", "--timed", "3"]
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options), catch_exceptions=False)
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'costs.npz'}: 2 rows, 3 timed frames\n")
     assert "render_s 1/4 0." in result.stderr
@@ -245,6 +245,23 @@ def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, st
     assert sorted(Path(store.root).rglob("*")) == before
 
 
+def test_no_more_points_are_looked_for_than_are_asked_for(
+    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = set()
+    sees = LoadedScene.sees
+
+    def counted(scene: LoadedScene, view: View, points: np.ndarray) -> np.ndarray:
+        counts.add(len(points))
+        return sees(scene, view, points)
+
+    monkeypatch.setattr(LoadedScene, "sees", counted)
+    arguments = verb(store, tmp_path, "--row", "0", "--timed", "1", "--points", "100")
+    CliRunner().invoke(measure_frames, arguments, catch_exceptions=False)
+    assert min(counts) == 100
+    assert 4096 not in counts, "all of the cloud"
+
+
 @pytest.mark.parametrize(
     ("scene", "rows", "message"),
     [
@@ -255,7 +272,7 @@ def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, st
 def test_a_row_or_a_scene_that_is_not_there_is_named(
     tmp_path: Path, store: Store, scene: str, rows: list[str], message: str
 ) -> None:
-    options = [part for row in rows for part in ("--rows", row)]
+    options = [part for row in rows for part in ("--row", row)]
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options, scene=scene))
     assert isinstance(result.exception, StoreError)
     assert result.exception.exit_code == 4
@@ -266,4 +283,4 @@ def test_a_row_or_a_scene_that_is_not_there_is_named(
 def test_the_verb_needs_rows(tmp_path: Path, store: Store) -> None:
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path))
     assert result.exit_code == 2
-    assert "Missing option '--rows'" in result.output
+    assert "Missing option '--row'" in result.output

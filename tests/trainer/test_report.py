@@ -24,7 +24,7 @@ from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.loop import CHECKPOINT, SETTINGS, train
 from photonfarm.trainer.report import write_report as report_of
-from photonfarm.trainer.report.frame_times import frame_time
+from photonfarm.trainer.report.frame_times import frame_time, points_used
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.store_source import StoreSource
@@ -276,6 +276,19 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
         ),
     )
     assert frame_time(with_photons, network, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
+
+
+def test_points_are_charged_as_many_as_a_network_uses(measured) -> None:
+    _, (transport, denoiser), _ = measured
+    runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
+    assert points_used(runs) is points_used(runs[1:]) is None, "it uses all, or there is none that uses any"
+
+    def with_points(count: int) -> TrainedRun:
+        settings = runs[0].settings
+        network = settings.network.model_copy(update={"points": count})
+        return replace(runs[0], settings=settings.model_copy(update={"network": network}))
+
+    assert points_used([with_points(64), with_points(128), runs[1]]) == 128
 
 
 def test_runs_are_called_by_what_tells_them_apart(measured) -> None:

@@ -68,7 +68,7 @@ class FrameCosts:
     surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
     edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
     buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal
-    points_s: NDArray[np.float64]  # (T,) which points of the base cloud, as modified, the view sees
+    points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first, as modified, the view sees
     photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without, as the next
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees
     kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels

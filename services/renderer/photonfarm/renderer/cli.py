@@ -138,15 +138,23 @@ def buffers(
 @click.command("measure-frames")
 @store_option
 @click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
-@click.option("--rows", type=click.IntRange(0), multiple=True, required=True, metavar="ROW",
+@click.option("--row", "rows", type=click.IntRange(0), multiple=True, required=True,
               help="A complete sample, whose configuration and view are measured; may be repeated.")  # fmt: skip
 @click.option("--kept", type=click.IntRange(1), multiple=True, default=(1,), show_default=True, metavar="K",
               help="Time a half-estimate of one of K pixels; may be repeated.")  # fmt: skip
 @click.option("--timed", type=click.IntRange(1), default=9, show_default=True, metavar="FRAMES",
-              help="Frames to time, after 2 that do not count.")  # fmt: skip
+              help="Frames to time, after some that do not count.")  # fmt: skip
+@click.option("--points", type=click.IntRange(1), metavar="P",
+              help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
 def measure_frames(
-    store: str | Path, scene: str, rows: tuple[int, ...], kept: tuple[int, ...], timed: int, out: Path
+    store: str | Path,
+    scene: str,
+    rows: tuple[int, ...],
+    kept: tuple[int, ...],
+    timed: int,
+    points: int | None,
+    out: Path,
 ) -> None:
     """Measure what the parts of a frame cost here, on one core, and what kind of surface each pixel shows.
 
@@ -157,7 +165,7 @@ def measure_frames(
     backend.load(threads=1)
     from photonfarm.renderer.frame_costs import write_frame_costs
 
-    costs = write_frame_costs(store, scene, rows, kept, timed, out)
+    costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
     parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
     click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()), err=True)
     click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
@@ -199,7 +207,7 @@ def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool)
 @click.command()
 @click.argument("spec")
 @click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
-              help="Random configurations that are measured, a view of each, after 2 that do not count.")  # fmt: skip
+              help="Random configurations to measure, a view of each, after some that do not count.")  # fmt: skip
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
 def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:

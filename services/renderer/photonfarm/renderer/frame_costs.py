@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import drjit as dr
 import numpy as np
@@ -26,7 +26,7 @@ from photonfarm.shared.frame_costs import PARTS, FrameCosts
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import BasePointCloud
+from photonfarm.shared.records import BasePointCloud, arrays_of
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.find import scene_named
 from photonfarm.shared.view import View
@@ -48,10 +48,11 @@ class Frame:
 
 
 def write_frame_costs(
-    store: str | Path, scene: str, rows: Sequence[int], kept: Sequence[int], timed: int, out: Path
+    store: str | Path, scene: str, rows: Sequence[int], kept: Sequence[int], timed: int, points: int | None, out: Path
 ) -> FrameCosts:
-    """Measure some rows of a scene into a file. The backend must have been loaded, with one thread.
+    """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
 
+    The backend must have been loaded, with one thread.
     Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError where the scene's files are
     not here.
     """
@@ -59,7 +60,8 @@ def write_frame_costs(
     reader.refresh()
     _check_complete(reader, rows)
     frames = [_frame(reader, row) for row in rows]
-    costs = frame_costs(LoadedScene.load(located(reader.spec)), reader.base()[1], frames, kept, timed)
+    used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
+    costs = frame_costs(LoadedScene.load(located(reader.spec)), BasePointCloud(**used), frames, kept, timed)
     costs.write(out)
     return costs
 

@@ -15,7 +15,7 @@ from photonfarm.trainer import evaluate
 from photonfarm.trainer.evaluate import Evaluation, Row, Tell
 from photonfarm.trainer.evaluation_samples import Reference
 from photonfarm.trainer.report.dataset_card import DatasetCard
-from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs
+from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
 from photonfarm.trainer.report.gauges import Gauges
 from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
@@ -94,7 +94,7 @@ def gathered(
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    close_look = _CloseLook(store, first.scene_id, kept, timed=timed)
+    close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), timed=timed)
     evaluation = evaluate.compare(
         store, runs, denoisers, references=references, inception=inception, most=most, device=device, tell=tell,
         choose=close_look,
@@ -142,8 +142,10 @@ class _CloseLook:
     Called as `evaluate.Choose`, right after networks have been timed, it names the worst cases' rows.
     """
 
-    def __init__(self, store: str | Path, scene_id: str, kept: Sequence[int], *, timed: bool) -> None:
-        self._store, self._scene_id, self._kept, self._timed = store, scene_id, kept, timed
+    def __init__(
+        self, store: str | Path, scene_id: str, kept: Sequence[int], points: int | None, *, timed: bool
+    ) -> None:
+        self._store, self._scene_id, self._kept, self._points, self._timed = store, scene_id, kept, points, timed
         self.costs: FrameCosts | None = None
         self.untimed = "it was not asked for"
         self.worst: list[WorstCase] = []
@@ -151,7 +153,8 @@ class _CloseLook:
 
     def __call__(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
         if self._timed:
-            found = measured_costs(self._store, self._scene_id, list(references or images), self._kept)
+            rows = list(references or images)
+            found = measured_costs(self._store, self._scene_id, rows, self._kept, self._points)
             self.costs, self.untimed = (None, found) if isinstance(found, str) else (found, "")
         self.machine = Machine.here()
         self.worst = worst_cases(self._views(images, references))

@@ -51,29 +51,43 @@ class FrameTime:
         return {**medians, "total": self.total, "ranges": ranges}
 
 
-def measured_costs(store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int]) -> FrameCosts | str:
-    """What the renderer measures of the frames in some rows; or why it does not: what it said stands on stderr."""
+def measured_costs(
+    store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int], points: int | None
+) -> FrameCosts | str:
+    """What the renderer measures of the frames in some rows, with so many points of the cloud, or with all.
+
+    Or why it does not: what it said stands on stderr.
+    """
     if not is_installed(VERB):
         return "the renderer, which makes buffers and photons, is not installed here"
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
-        asked += ["--timed", str(TIMED)]
-        asked += [argument for row in rows for argument in ("--rows", str(row))]
+        asked += ["--timed", str(TIMED), *([] if points is None else ["--points", str(points)])]
+        asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
         if code := subprocess.run(command(VERB, *asked), stdout=subprocess.DEVNULL, check=False).returncode:
             return f"`photonfarm {VERB}` ended with exit code {code} here"
         return FrameCosts.read(file)
 
 
+def points_used(runs: Sequence[TrainedRun]) -> int | None:
+    """The most points that a network of these has to know the visibility of; None for all of the cloud."""
+    used = [run.settings.network.points for run in runs if _sees_points(run)]
+    return None if None in used else max((points for points in used if points), default=None)
+
+
 def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
-    exact = isinstance(predictor, TrainedRun) and predictor.settings.network.occlusion == "exact"
     return FrameTime(
         render=costs.renders()[needs.kept] if needs.kept else None,
         buffers=parts["buffers_s"],
-        points=parts["points_s"] if needs.points and exact else None,
+        points=parts["points_s"] if _sees_points(predictor) else None,
         photons=Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
         network=network,
     )
+
+
+def _sees_points(predictor: TrainedRun | Untrained) -> bool:
+    return predictor.needs.points and predictor.settings.network.occlusion == "exact"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from photonfarm.shared.allocation import MOST_VIEWS, RHO, Allocation, best, excess, seconds
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.plan import Extent, Request
+from photonfarm.shared.processes import usable_cores
 from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec, load_spec
 from photonfarm.shared.store import Store
@@ -80,11 +80,6 @@ def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: 
     of = bytes_of_rows(loaded)
     size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
     return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
-
-
-def usable_cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def measured_costs(spec: str) -> SampleCosts | str:

@@ -25,6 +25,11 @@ def tied(command: Sequence[str]) -> list[str]:
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
 
 
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 NAP_S = 0.1  # at the longest, until a `Stop` is noticed
 
 

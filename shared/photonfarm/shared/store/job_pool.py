@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Self
 
+from photonfarm.shared.processes import usable_cores
 from photonfarm.shared.store.content_check import Tally
 from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.halves import HalvesTest
@@ -27,7 +27,7 @@ class JobPool:
         self._own = threading.local()
         self._scene = scene
         self._scenes = scenes
-        self._threads = ThreadPoolExecutor(min(MOST_THREADS, _cores()))
+        self._threads = ThreadPoolExecutor(min(MOST_THREADS, usable_cores()))
 
     def __enter__(self) -> Self:
         return self
@@ -80,7 +80,3 @@ class _Checker:
         damaged = {finding.file for finding in found if finding.cause is Cause.CHECKSUM and finding.file}
         renewed = [renew_copy(self._scene.storage, file) for file in sorted(damaged)]
         return any(renewed)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

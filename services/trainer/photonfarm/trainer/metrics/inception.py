@@ -11,6 +11,8 @@ Shape letters: N images, C channels, H W image or feature map.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from photonfarm.shared.processes import usable_cores
 from photonfarm.trainer.metrics.inception_weights import InceptionWeights, find_weights, read_weights
 
 SIDE = 299  # pixels
@@ -138,13 +141,25 @@ class Inception:
     weights: InceptionWeights
 
     def features(self, images: Tensor, batch: int = 8) -> Features:
-        """Features of display images, (N, H, W, 3) in [0, 1], so many at a time; N ≥ 1."""
+        """Features of display images, (N, H, W, 3) in [0, 1], so many at a time, on all cores; N ≥ 1."""
         device = next(self.network.parameters()).device
         parts = []
-        for start in range(0, len(images), batch):
-            blocks = self.network(network_input(images[start : start + batch].to(device)))
-            parts.append([block.mean((2, 3)).cpu().numpy() for block in blocks])
+        with _all_cores():
+            for start in range(0, len(images), batch):
+                blocks = self.network(network_input(images[start : start + batch].to(device)))
+                parts.append([block.mean((2, 3)).cpu().numpy() for block in blocks])
         return Features(tuple(np.concatenate(block) for block in zip(*parts, strict=True)))
+
+
+@contextmanager
+def _all_cores() -> Iterator[None]:
+    """As many threads of torch as this process may use cores, as nothing here is timed; then as many as before."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(usable_cores())
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def network_input(images: Tensor) -> Tensor:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from analytic_scene import small_spec
+from analytic_scene import AnalyticScene, small_spec
 from numpy.typing import NDArray
 
 import room_study
@@ -20,7 +22,7 @@ from photonfarm.shared.store import Store
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.store_source import StoreSource
-from room_study import HELD_OUT, References
+from room_study import HELD_OUT, References, Run
 from store_contents import Pool, commit
 
 SIZE, SLOTS = 8, 8
@@ -46,6 +48,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
     store = Store(tmp_path_factory.mktemp("study") / "store", create=True)
     spec = small_spec(film={"width": SIZE, "height": SIZE}, transport={"half_spp": HALF_SPP})
     scene = store.add(spec)
+    scene.write_base(*AnalyticScene(spec).base())
     for modifications, views, passes in ((8, 1, 8), (20, 2, 2), (40, 1, 1)):
         request = Request(modifications=modifications, views_per_modification=views, passes=passes)
         scene.plan(request, shard_rows=16)
@@ -125,6 +128,23 @@ def test_what_fails_in_a_process_is_raised_here() -> None:
     assert room_study.in_processes(math.hypot, [(3.0, 4.0), (5.0, 12.0)], 1, "measured") == [5, 13]
     with pytest.raises(ValueError, match="math domain error"):
         room_study.in_processes(math.sqrt, [(-1.0,)], 1, "measured")
+
+
+def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(root: Root, tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    room_study.add_options(parser, "test")
+    told = parser.parse_args(["--steps", "2"])
+    source = partial(Arm, *root, Share(2, 1, 1), 8)
+    runs = [Run(source, room_study.settings_of("cnn", seed, told), tmp_path, "few") for seed in (0, 1)]
+    room_study.train_all(runs[:1], 1)
+    assert [run.is_at_its_end() for run in runs] == [True, False]
+    (runs[0].folder / "metrics.jsonl").unlink()
+
+    room_study.train_all(runs, 1)
+    assert all(run.is_at_its_end() for run in runs)
+    assert not (runs[0].folder / "metrics.jsonl").exists(), "left as it was"
+    assert runs[1].trained().settings.seed == 1
+    assert runs[1].seconds() > 0
 
 
 # ------------------------------------------------------------------------------------------------------------- errors

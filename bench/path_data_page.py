@@ -135,12 +135,12 @@ def page(study: Study, targets: Targets, picture: str) -> str:
 The room of the experiment `{told.experiment}` at {spec.film.width}², connections {spec.transport.connections}, light
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
 `rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
-each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid, such that a sample costs about as
-much, by times that were taken before; budgets below are of the core-seconds in the markers of the stores, medians over
-jobs, with editing, buffers, photons and visibility. Both stores are of one spec: the views, point clouds, photons and
-held-out configurations of `path`'s are those of `bdpt`'s bit by bit, and its first
-{study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has beyond, at
-budgets above 1, are further configurations.
+each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
+images were seen to be too dark; a sample costs about as much, by times that were taken before. Budgets below are of
+the core-seconds in the markers of the stores, medians over jobs, with editing, buffers, photons and visibility. Both
+stores are of one spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s
+bit by bit, and its first {study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has
+beyond, at budgets above 1, are further configurations.
 
 `{settings.network.architecture}`, preset `small`: width {settings.network.width}, {settings.network.points} points;
 for each arm alike {told.steps} steps of {settings.batch} samples; {room_study.described(settings)}.

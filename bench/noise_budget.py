@@ -32,8 +32,7 @@ from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
 from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from network_errors import F64, Errors, each_seed, of_intervals, stated
 from photonfarm.renderer.strategy.cache import write_whole
-from photonfarm.shared import allocation
-from photonfarm.shared.allocation import Allocation
+from photonfarm.shared.allocation import Allocation, Terms, seconds
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.sample_costs import SampleCosts
@@ -115,7 +114,7 @@ def measured_costs(room: SceneSpec) -> SampleCosts:
 
 def paid(costs: SampleCosts, share: Share, budget: float) -> int:
     """How many configurations the budget pays for; raises ValueError where that is none."""
-    one = allocation.seconds(costs, Allocation(1, share.views, share.passes, share.spp))
+    one = seconds(costs, Allocation(1, share.views, share.passes, share.spp))
     if one > budget:
         raise ValueError(f"--budget {budget:g}: a configuration of {share} costs {one:.2f} core-seconds; give more")
     return int(budget / one)
@@ -192,8 +191,8 @@ def pairs_table(room: Room) -> str:
 def optimum(room: Room, found: Fit, budget: float) -> str:
     """What was measured to be best in this room, and what the model says is, in words."""
     first, of_arms = room.errors.best()
-    best = allocation.best(room.costs, budget, kappa=found.kappa, rho=found.rho)
-    real = allocation.best_spp(room.costs, 1, kappa=found.kappa, rho=found.rho)
+    terms = Terms(room.costs, found.kappa, found.rho)
+    best, real = terms.best(budget), terms.best_spp(1)
     bought = best_of_replicates(room, found, budget)
     return (
         f"Measured best: `{room.arms[first].share}`, the best in {of_arms[first]:.0%} of replicates. By the model the "
@@ -205,7 +204,7 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
 
 def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
     """What the model says is best in a room, by the constants of each replicate."""
-    best = cache(lambda kappa, rho: allocation.best(room.costs, budget, kappa=kappa, rho=rho))
+    best = cache(lambda kappa, rho: Terms(room.costs, kappa, rho).best(budget))
     return [best(float(kappa), float(rho)) for kappa, rho in zip(found.kappas, found.rhos, strict=True)]
 
 

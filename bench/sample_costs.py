@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import results
 import room_study
-from photonfarm.shared.allocation import KAPPA, MOST_VIEWS, RHO, Allocation, best, best_spp, excess, seconds
+from photonfarm.shared.allocation import KAPPA, RHO, Allocation, Terms
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec
@@ -33,24 +33,15 @@ class Room:
     costs: SampleCosts
 
     @property
-    def rho(self) -> float:
-        """ρ: of a static scene, which has one configuration, 0."""
-        return RHO if self.spec.groups else 0.0
-
-    @property
-    def charged(self) -> SampleCosts:
-        """The costs, where the one configuration of a static scene is paid for once and for all."""
-        return self.costs if self.spec.groups else replace(self.costs, configuration_s=0.0)
-
-    def best(self, budget: float) -> Allocation:
-        """What is best bought."""
-        return best(self.charged, budget, rho=self.rho, most_views=MOST_VIEWS if self.spec.groups else 1)
+    def terms(self) -> Terms:
+        """What allocations are weighed by."""
+        return Terms.of(self.costs, static=not self.spec.groups)
 
     def more_than_best(self, spp: int, budget: float) -> float:
         """By what factor the excess error is more where the budget is spent on single views of so many samples."""
-        count = budget / seconds(self.charged, Allocation(1, 1, 1, spp))
-        spent = excess(self.costs.relative_noise, Allocation(1, 1, 1, spp), rho=self.rho) / count
-        return spent / excess(self.costs.relative_noise, self.best(budget), rho=self.rho)
+        single = Allocation(1, 1, 1, spp)
+        spent = self.terms.excess(single) / (budget / self.terms.seconds(single))
+        return spent / self.terms.excess(self.terms.best(budget))
 
 
 def measured(name: str, views: int) -> Room:
@@ -65,14 +56,14 @@ def measured(name: str, views: int) -> Room:
 
 def line(room: Room, budget: float) -> list[str]:
     """A row of the table."""
-    costs, found = room.costs, room.best(budget)
+    costs, found = room.costs, room.terms.best(budget)
     parts = (costs.configuration_s, costs.view_s, costs.pass_s, costs.spp_s)
     dearer = (f"{room.more_than_best(spp, budget):.2f}" for spp in SPP)
     return [
         room.name,
         *(f"{1e3 * part:.1f}" for part in parts),
         f"{costs.relative_noise:.2f}",
-        f"{best_spp(room.charged, 1, rho=room.rho):.2f}",
+        f"{room.terms.best_spp(1):.2f}",
         f"{found.modifications} × {found.views} × {found.spp} spp",
         *dearer,
     ]

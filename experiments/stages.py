@@ -20,9 +20,11 @@ from experiment import Experiment, Run
 from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.hold_out import are_held_out
 from photonfarm.shared.processes import tied
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.markers import COMMITTED
 from photonfarm.shared.verbs import command
+
+PREVIEW = "preview.html"  # what `up` makes last
 
 REFERENCE = re.compile(r"([0-9a-f]{32})(\.partial)?\.npz")
 """A file that `store merge` leaves, by the key of its view."""
@@ -64,13 +66,14 @@ class Stages:
         where = ["--where", f"held-out={size.hold_out:g}", "--where", f"views=first:{size.references.views}"]
         self._verb("plan", ["top-up", spec, *store, "--spp", size.references.spp, *where, "--no-queue"])
         farm = ["--workers", self.workers, "--train-steps", 0, "--run", self.folder / "farm", "--out", self.folder]
-        self._verb("render", ["up", spec, *store, *samples, *farm])
+        if self._scene.missing_jobs() or not (self.folder / PREVIEW).is_file():
+            self._verb("render", ["up", spec, *store, *samples, *farm])
         self._merge()
 
     def _merge(self) -> None:
         """A reference of each view that is asked for, merged anew where anything was rendered since; and no other."""
         scene_id, out = self._scene_id, self.folder / "references"
-        committed = Store(self.folder / "store").scene(scene_id).folder / COMMITTED  # renewed by every commit
+        committed = self._scene.folder / COMMITTED  # renewed by every commit
         passes = -(-self.experiment.size.references.spp // (2 * self.experiment.spec().transport.half_spp))
         merge = ["store", "merge", "--store", self.folder / "store", "--scene", scene_id, "--least", passes]
         wanted = self._references()
@@ -89,6 +92,10 @@ class Stages:
         held_out = are_held_out(reader.modification_keys(shown) if reader.spec.groups else keys, size.hold_out)
         wanted = [key.hex() for key, held in zip(keys, held_out, strict=True) if held][: size.references.views]
         return [self.folder / "references" / f"{key}.npz" for key in wanted]
+
+    @property
+    def _scene(self) -> SceneStore:
+        return Store(self.folder / "store").scene(self._scene_id)
 
     @property
     def _scene_id(self) -> str:

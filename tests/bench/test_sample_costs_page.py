@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from analytic_scene import small_spec
 
-from photonfarm.shared.allocation import Allocation, seconds
+from photonfarm.shared.allocation import Allocation
 from photonfarm.shared.sample_costs import SampleCosts
 from sample_costs import SPP, Room, line, page
 
@@ -20,13 +20,13 @@ def room(**changes: float) -> Room:
 
 def test_none_of_the_shares_is_better_than_the_best() -> None:
     of = room()
-    assert seconds(of.charged, of.best(BUDGET)) <= BUDGET
+    assert of.terms.seconds(of.terms.best(BUDGET)) <= BUDGET
     assert all(of.more_than_best(spp, BUDGET) >= 0.99 for spp in SPP)
 
 
 def test_the_share_that_is_the_best_has_its_excess() -> None:
     of = room(configuration_s=0.0, view_s=0.0, relative_noise=0.0)
-    best = of.best(BUDGET)
+    best = of.terms.best(BUDGET)
     assert best == Allocation(best.modifications, 1, 1, 2)
     assert of.more_than_best(2, BUDGET) == pytest.approx(1, rel=0.01)
 

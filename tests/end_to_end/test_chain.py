@@ -1,43 +1,100 @@
-"""The main job, small: submitted, rendered by two workers, trained on meanwhile, shown and reported."""
+"""The main job, small: rendered by two workers, trained on meanwhile, reported; evaluated, and filmed."""
 
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parents[2]
+UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
+
+pytestmark = pytest.mark.slow
+Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.mark.slow
-def test_the_whole_farm_renders_trains_and_reports(photonfarm, tmp_path: Path, small_room: Path) -> None:
-    arguments = ("up", small_room, "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
-    result = photonfarm(*arguments, timeout=400)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, photonfarm_in, small_room_in) -> Path:
+    """Where the farm was at work."""
+    folder = tmp_path_factory.mktemp("farm")
+    small_room_in(folder)
+    result = photonfarm_in(folder)(*UP, timeout=400)
     assert result.returncode == 0, result.stderr
-    report = json.loads((tmp_path / "out/report.json").read_text())
+    return folder
+
+
+@pytest.fixture
+def photonfarm(folder: Path, photonfarm_in) -> Command:
+    """The command line, there."""
+    return photonfarm_in(folder)
+
+
+def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
+    report = json.loads((folder / "out/report.json").read_text())
     assert report["dataset"]["samples_complete"] == 32
     assert report["dataset"]["core_seconds_per_sample"] > 0
     (run,) = report["runs"]
     assert run["steps"] == 40
     assert run["curve"][-1]["error"] < run["curve"][0]["error"]
     for page in ("out/preview.html", "out/report.html"):
-        text = (tmp_path / page).read_text()
+        text = (folder / page).read_text()
         assert text.count("data:image/png;base64,") >= 6
         assert not re.search(r'(src|href)="(?!data:|#)', text)
 
-    markers = {p.name: p.read_bytes() for p in tmp_path.glob("store/scenes/*/committed/*.json")}
-    again = photonfarm(*arguments, timeout=400)
+
+def test_the_same_again_renders_nothing(photonfarm: Command, folder: Path) -> None:
+    def markers() -> dict[str, bytes]:
+        return {p.name: p.read_bytes() for p in folder.glob("store/scenes/*/committed/*.json")}
+
+    before = markers()
+    again = photonfarm(*UP, timeout=400)
     assert again.returncode == 0, again.stderr
-    assert {p.name: p.read_bytes() for p in tmp_path.glob("store/scenes/*/committed/*.json")} == markers
-
-    _read_as_the_readme_does(tmp_path)
+    assert markers() == before
 
 
-def _read_as_the_readme_does(folder: Path) -> None:
-    """The reading example of README.md, run as it stands, reads committed samples with plain zarr-python."""
+def test_the_reading_example_of_the_readme_reads_committed_samples_with_plain_zarr(folder: Path) -> None:
     (example,) = re.findall(r"```python\n(from pathlib import Path.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     check = "\nimport sys, numpy\nassert numpy.isfinite(half_a).all() and not numpy.array_equal(half_a, half_b)\n"
     check += "assert not any(name.startswith('photonfarm') for name in sys.modules)\n"
     subprocess.run([sys.executable, "-c", example + check], cwd=folder, check=True)
+
+
+def test_the_network_is_evaluated_beside_a_denoiser(photonfarm: Command, folder: Path) -> None:
+    assert photonfarm("store", "merge", "--out", "references").returncode == 0
+    asked = ("--references", "references", "--denoiser", "fill-in", "--kept", "4", "--json")
+    evaluated = photonfarm("evaluate", *asked)
+    assert evaluated.returncode == 0, evaluated.stderr
+    found = json.loads(evaluated.stdout)
+    assert found == json.loads((folder / "run/evaluation.json").read_text())
+    with Image.open(folder / "run/comparison.png") as side_by_side:
+        assert side_by_side.width > 3 * 64
+    assert [row["predictor"] for row in found["rows"]] == ["light_transport (run)", "fill-in 1/4"]
+    assert all(np.isfinite(row["metric_space"]["mse"]["estimate"]["mean"]) for row in found["rows"])
+
+
+def test_the_network_shows_a_camera_path_and_buffers_that_were_made_before_alike(
+    photonfarm: Command, folder: Path
+) -> None:
+    views = [{"origin": [1.9, 1.6, 1.7], "look_at": [0, 0.6, 0]}, {"origin": [-1.9, 1.6, 1.7], "look_at": [0, 0.6, 0]}]
+    (folder / "path.json").write_text(json.dumps({"frames": 3, "views": views}))
+    shown = photonfarm("infer", "--camera-path", "path.json", "--out", "film")
+    assert shown.returncode == 0, shown.stderr
+    with Image.open(folder / "film/path.gif") as gif:
+        assert gif.n_frames == 3
+    pictures = [np.asarray(Image.open(folder / f"film/frame-000{i}.png")).astype(int) for i in range(3)]
+    assert np.abs(pictures[0] - pictures[2]).mean() > 1
+
+    assert photonfarm("buffers", "--scene", "room", "--camera-path", "path.json").returncode == 0
+    assert photonfarm("infer", "--buffers", "buffers.npz", "--out", "again").returncode == 0
+    assert (folder / "again/frame-0001.png").read_bytes() == (folder / "film/frame-0001.png").read_bytes()
+
+
+def test_a_modification_that_is_too_short_is_refused(photonfarm: Command) -> None:
+    missing = photonfarm("infer", "--orbit", "2", "--modification", "0 0 0 1")
+    assert missing.returncode == 3
+    assert "44 are required" in missing.stderr

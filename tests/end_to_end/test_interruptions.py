@@ -63,7 +63,7 @@ def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_be
         log = tmp_path / "run/metrics.jsonl"
         return log.stat().st_mtime_ns if log.exists() else 0
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+    for number in (signal.SIGTERM, signal.SIGKILL):
         before = logged()
         farm = start(60, steps=1_000_000)
         wait_until(lambda earlier=before: logged() > earlier)  # the trainer is at work

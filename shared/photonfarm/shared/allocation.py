@@ -25,9 +25,9 @@ never worse. Passes are for top-ups of what is there.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Self
 
 from photonfarm.shared.sample_costs import SampleCosts
 
@@ -39,7 +39,7 @@ RHO = 1.0
 """ρ, how much configurations differ beside what their views show. Provisional, likewise."""
 
 MOST_SPP, MOST_VIEWS = 1024, 16
-"""Of what `best` looks at."""
+"""Of what `Terms.best` looks at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,42 +69,60 @@ def excess(noise: float, of: Allocation, *, kappa: float = KAPPA, rho: float = R
     return (rho + of_view / of.views) / of.modifications
 
 
-def best_spp(costs: SampleCosts, views: int, passes: int = 1, *, kappa: float = KAPPA, rho: float = RHO) -> float:
-    """s*: the samples per pixel of a pass with the least excess at a fixed budget, as a real number.
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What samples of a scene cost, and what its held-out error is taken to follow from."""
 
-    Infinite where samples cost nothing, 0 where there is no noise.
-    """
-    besides = costs.configuration_s / views + costs.view_s + passes * costs.pass_s
-    gained, paid = besides * costs.relative_noise, kappa * costs.spp_s * (1 + rho * views)
-    if not gained:
-        return 0.0
-    return math.sqrt(gained / paid) / passes if paid else math.inf
+    costs: SampleCosts
+    kappa: float = KAPPA
+    rho: float = RHO
+    most_views: int = MOST_VIEWS  # of a configuration that `best` looks at
 
+    @classmethod
+    def of(cls, costs: SampleCosts, *, static: bool) -> Self:
+        """Those of a scene that was measured.
 
-def best(
-    costs: SampleCosts,
-    budget_s: float,
-    *,
-    most_views: int = MOST_VIEWS,
-    kappa: float = KAPPA,
-    rho: float = RHO,
-) -> Allocation:
-    """The allocation of least excess that a budget of core-seconds pays for, of those that `_affordable` names.
+        A static scene has one configuration, paid for once and no source of error: its views are what is drawn first,
+        and stand in an allocation as configurations of one view.
+        """
+        return cls(replace(costs, configuration_s=0.0), rho=0.0, most_views=1) if static else cls(costs)
 
-    Of equals it is the one of fewer views, then of fewer samples per pixel. Raises ValueError for a budget that pays
-    for none.
-    """
-    found = list(_affordable(costs, budget_s, range(1, most_views + 1)))
-    if not found:
-        raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {seconds(costs, Allocation(1, 1, 1, 2))}")
-    return min(found, key=partial(excess, costs.relative_noise, kappa=kappa, rho=rho))
+    def seconds(self, of: Allocation) -> float:
+        """Core-seconds of an allocation."""
+        return seconds(self.costs, of)
 
+    def excess(self, of: Allocation) -> float:
+        """The excess of its held-out error."""
+        return excess(self.costs.relative_noise, of, kappa=self.kappa, rho=self.rho)
 
-def _affordable(costs: SampleCosts, budget_s: float, views: Iterable[int]) -> Iterator[Allocation]:
-    """One pass of 2, 4, 8 … 1024 spp of each number of views, of as many configurations as the budget pays for."""
-    for of_each in views:
-        for spp in (2**power for power in range(1, MOST_SPP.bit_length())):
-            one = seconds(costs, Allocation(1, of_each, 1, spp))
-            count = int(budget_s / one * (1 + 1e-9)) if one else 0  # rounding must not take one of those asked for
-            if count:
-                yield Allocation(count, of_each, 1, spp)
+    def best_spp(self, views: int, passes: int = 1) -> float:
+        """s*: the samples per pixel of a pass with the least excess at a fixed budget, as a real number.
+
+        Infinite where samples cost nothing, 0 where there is no noise.
+        """
+        costs = self.costs
+        besides = costs.configuration_s / views + costs.view_s + passes * costs.pass_s
+        gained, paid = besides * costs.relative_noise, self.kappa * costs.spp_s * (1 + self.rho * views)
+        if not gained:
+            return 0.0
+        return math.sqrt(gained / paid) / passes if paid else math.inf
+
+    def best(self, budget_s: float) -> Allocation:
+        """The allocation of least excess that a budget of core-seconds pays for, of those that `_affordable` names.
+
+        Of equals it is the one of fewer views, then of fewer samples per pixel. Raises ValueError for a budget that
+        pays for none.
+        """
+        found = list(self._affordable(budget_s))
+        if not found:
+            raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {self.seconds(Allocation(1, 1, 1, 2))}")
+        return min(found, key=self.excess)
+
+    def _affordable(self, budget_s: float) -> Iterator[Allocation]:
+        """One pass of 2, 4, 8 … 1024 spp of each number of views, of as many configurations as the budget pays for."""
+        for views in range(1, self.most_views + 1):
+            for spp in (2**power for power in range(1, MOST_SPP.bit_length())):
+                one = self.seconds(Allocation(1, views, 1, spp))
+                count = int(budget_s / one * (1 + 1e-9)) if one else 0  # rounding must not take one of those asked for
+                if count:
+                    yield Allocation(count, views, 1, spp)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from photonfarm.shared.allocation import MOST_VIEWS, RHO, Allocation, best, excess, seconds
+from photonfarm.shared.allocation import Allocation, Terms
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.plan import Extent, Request
 from photonfarm.shared.processes import usable_cores
@@ -113,18 +113,14 @@ def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCos
 
 
 def _best(spec: SceneSpec, wanted: Request, costs: SampleCosts) -> tuple[float, Allocation]:
-    """The share of the excess error that the best allocation of the request's cost saves, at least 0, and that one.
-
-    A static scene has one configuration, paid for once and no source of error: its views are what is drawn first.
-    """
-    spp, rho, most_views = 2 * spec.transport.half_spp, RHO, MOST_VIEWS
+    """The share of the excess error that the best allocation of the request's cost saves, at least 0, and that one."""
+    terms = Terms.of(costs, static=not spec.groups)
+    spp = 2 * spec.transport.half_spp
     asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
     if not spec.groups:
-        asked = Allocation(asked.modifications * asked.views, 1, asked.passes, spp)
-        costs, rho, most_views = replace(costs, configuration_s=0.0), 0.0, 1
-    found = best(costs, seconds(costs, asked), most_views=most_views, rho=rho)
-    errors = [excess(costs.relative_noise, each, rho=rho) for each in (asked, found)]
-    return max(0.0, 1 - errors[1] / errors[0]), found
+        asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
+    found = terms.best(terms.seconds(asked))
+    return max(0.0, 1 - terms.excess(found) / terms.excess(asked)), found
 
 
 def _suggested(of: Allocation, spec: SceneSpec) -> Suggestion:

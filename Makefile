@@ -21,7 +21,7 @@ demo: $(STAMP)
 # Two at a time, as most tests wait or use one core; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)

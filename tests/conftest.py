@@ -1,5 +1,6 @@
 """What tests of several packages start or render."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,10 @@ import s3_server
 from photonfarm.shared.queue import connect
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import Store
+
+# Read where torch is loaded, also by processes that tests start: threads that turn while they wait would take from
+# other tests the cores that these share, and images then take four times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 @pytest.fixture(scope="session")

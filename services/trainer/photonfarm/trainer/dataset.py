@@ -200,7 +200,7 @@ def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: N
     for place, (row, sample) in enumerate(zip(rows, source.read_batch(rows), strict=True)):
         fill(memory, place, sample, spec, cloud)
         if memory.inputs.photons is not None:
-            _fill_photons(memory.inputs.photons, place, source.read_photons(row))
+            fill_photons(memory.inputs.photons, place, source.read_photons(row))
         if needs.kept:
             _fill_noisy(memory, place, kept_pixels(sample, spec, needs.kept))
         units.append(sample.modification.key(spec.scene_id) if spec.groups else make_key(sample.view.vector))
@@ -225,6 +225,13 @@ def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BaseP
         i.photons.seen[place] = torch.from_numpy(sample.visibility.photons)
 
 
+def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
+    """Write a configuration's photons into a batch's memory, but for which of them a view sees."""
+    for name, array in arrays_of(photons).items():
+        getattr(memory, name)[place] = torch.from_numpy(array)
+    memory.present[place] = memory.bounce[place] >= 0
+
+
 def _fill_points(
     memory: PointInputs, place: int, position: F32, visible: NDArray[np.bool_], seen: NDArray[np.bool_]
 ) -> None:
@@ -232,12 +239,6 @@ def _fill_points(
     memory.position[place] = torch.from_numpy(position[:points])
     memory.visible[place] = torch.from_numpy(visible[:points])
     memory.seen[place] = torch.from_numpy(seen[:points])
-
-
-def _fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
-    for name, array in arrays_of(photons).items():
-        getattr(memory, name)[place] = torch.from_numpy(array)
-    memory.present[place] = memory.bounce[place] >= 0
 
 
 def _fill_noisy(batch: Batch, place: int, kept: NDArray[np.bool_]) -> None:

@@ -19,14 +19,14 @@ import torch
 from photonfarm.shared.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.frames import Frames
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.records import F32, BasePointCloud, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store, store_errors
 from photonfarm.shared.store.find import Query, find_samples
 from photonfarm.shared.verbs import command, is_installed
 from photonfarm.shared.view import View
 from photonfarm.trainer import animation
-from photonfarm.trainer.dataset import Batch, fill, rows_held_out
+from photonfarm.trainer.dataset import Batch, fill, fill_photons, rows_held_out
 from photonfarm.trainer.evaluation import error_of
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.networks.inputs import given
@@ -188,10 +188,8 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
     """The frames one by one, in memory that is used again."""
     points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
     memory = Batch.empty(1, points, spec, run.needs)
-    if (photons := memory.inputs.photons) is not None:
-        for name, array in arrays_of(given(frames.photons)).items():
-            getattr(photons, name)[0] = torch.from_numpy(array)
-        photons.present[0] = photons.bounce[0] >= 0
+    if memory.inputs.photons is not None:
+        fill_photons(memory.inputs.photons, 0, given(frames.photons))
     black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
     for i, view in enumerate(frames.views):
         shown = _Unrendered(frames.modification, view, frames.buffers(i), frames.visibility(i), black)

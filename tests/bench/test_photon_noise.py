@@ -1,0 +1,64 @@
+"""Photons that are emitted anew for a network: as many as are stored are those, and the page says what more do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import photon_noise
+from network_errors import Errors
+from photon_noise import Room, Shown, page
+from photonfarm.renderer.jobs import ShardRenderer, load_scene
+from photonfarm.shared.plan import Request
+from photonfarm.shared.records import arrays_of
+from photonfarm.shared.scene import load_spec
+from photonfarm.shared.store import Store
+from photonfarm.trainer.dataset import Batch
+from photonfarm.trainer.networks.inputs import Needs, given
+from photonfarm.trainer.store_source import StoreSource
+from room_study import References
+
+VIEWS = 6
+UNITS = tuple(bytes([unit]) * 16 for unit in range(VIEWS))
+
+
+@pytest.mark.slow
+def test_as_many_light_paths_as_are_stored_give_the_photons_that_are_stored(tmp_path: Path) -> None:
+    plain = load_spec("room")
+    film = plain.film.model_copy(update={"width": 16, "height": 16})
+    photons = plain.photons.model_copy(update={"paths": 64})
+    spec = plain.model_copy(update={"film": film, "photons": photons, "points": 256})
+    store = Store(tmp_path, create=True)
+    store.add(spec).plan(Request(modifications=2, views_per_modification=1), shard_rows=2)
+    ShardRenderer(store, worker="test").render(spec.scene_id, 0)
+
+    source = StoreSource(tmp_path, spec.scene_id)
+    row = int(source.refresh()[1])
+    cloud, scene = source.base()[1], load_scene(spec)
+    memory = Batch.empty(1, 256, spec, Needs(photons=True))
+    (sample,) = source.read_batch([row])
+    photon_noise._fill(memory, sample, scene, spec, cloud)
+    made, stored = given(memory.inputs.photons), source.read_photons(row)
+    for name, values in arrays_of(stored).items():
+        np.testing.assert_allclose(getattr(made, name)[0].numpy(), values, rtol=1e-3, atol=1e-3)  # float16 in part
+    np.testing.assert_array_equal(made.seen[0].numpy(), sample.visibility.photons)
+    assert 0 < made.seen.sum() < made.present.sum()
+
+
+def test_the_page_and_its_figures_say_how_much_more_error_there_is() -> None:
+    def errors(level: float) -> Errors:
+        return Errors(np.array([[level + 0.001 * view for view in range(VIEWS)]]), UNITS)
+
+    shown = [Shown(64, 10.0, errors(0.5), errors(0.04)), Shown(256, 40.0, errors(0.4), errors(0.01))]
+    halves = np.zeros((VIEWS, 2, 4, 4, 3), np.float32)
+    room = Room("made-up", References(tuple(range(VIEWS)), UNITS, halves, 512), errors(0.02), shown)
+    text = page([room])
+    assert "`light_transport`: 0.02250 (" in text
+    first, second = (line.split(" | ") for line in text.splitlines() if line.startswith(("| 64 ", "| 256 ")))
+    assert (first[4].split()[0], second[4].split()[0]) == ("0.02000", "-0.01000")
+    values = json.loads(json.dumps(photon_noise.document([room]), allow_nan=False))["made-up"]
+    assert [one["paths"] for one in values["shown"]] == [64, 256]
+    assert values["shown"][1]["light_transport_photons"][0] == 0.01

@@ -47,6 +47,7 @@ class Shown:
 
     paths: int
     seen: float  # photons that a view sees, the median
+    effective: float  # so many of equal power would be as noisy, (Σ p)² / Σ p², the median
     photon_map: Errors  # of the image that the network's output is added to
     network: Errors
 
@@ -86,22 +87,26 @@ def _shown(run: TrainedRun, store: Store, references: References, times: int) ->
     source.refresh()
     base = source.base()
     stored = located(source.spec)
-    photons = stored.photons.model_copy(update={"paths": times * stored.photons.paths})
-    spec = stored.model_copy(update={"photons": photons})  # networks divide by the number of paths that it names
+    paths = times * stored.photons.paths
+    more = stored.photons.model_copy(update={"paths": paths})
+    spec = stored.model_copy(update={"photons": more})  # networks divide by the number of paths that it names
     scene, network = load_scene(spec), run.network(spec, base).eval()
     points = min(run.settings.network.points or len(base[1].position), len(base[1].position))
     memory = Batch.empty(1, points, spec, run.needs)
-    maps, made, seen = [], [], []
+    maps, made, seen, effective = [], [], [], []
     for row in references.rows:
         (sample,) = source.read_batch([row])
         _fill(memory, sample, scene, spec, base[1])
         with torch.no_grad():
             maps.append(torch.as_tensor(network.known(memory.inputs, network.further(memory.inputs))).numpy().copy())
             made.append(network(memory.inputs).numpy().copy())
-        seen.append(int(given(memory.inputs.photons).seen.sum()))
+        photons = given(memory.inputs.photons)
+        power = photons.power[photons.seen].mean(dim=-1).double()
+        seen.append(len(power))
+        effective.append(float(power.sum() ** 2 / (power**2).sum()) if len(power) else 0.0)
     found = [errors(np.concatenate(images), references) for images in (maps, made)]
-    room_study.tell(f"{photons.paths} paths: map {stated(found[0])}, network {stated(found[1])}")
-    return Shown(photons.paths, float(np.median(seen)), *found)
+    room_study.tell(f"{paths} paths: map {stated(found[0])}, network {stated(found[1])}")
+    return Shown(paths, float(np.median(seen)), float(np.median(effective)), *found)
 
 
 def _fill(memory: Batch, sample: StoredSample, scene: SceneRenderer, spec: SceneSpec, cloud: BasePointCloud) -> None:
@@ -116,12 +121,12 @@ def _fill(memory: Batch, sample: StoredSample, scene: SceneRenderer, spec: Scene
 def table(room: Room) -> str:
     """A line for each number of light paths."""
     header = (
-        "light paths", "photons that a view sees", "MSE of the photon map (95 %)", f"MSE of `{WITH}` (95 %)",
+        "light paths", "photons that a view sees", "as noisy as", "MSE of the photon map (95 %)", f"MSE of `{WITH}` (95 %)",
         f"more than that of `{WITHOUT}` (95 %)",
     )  # fmt: skip
     lines = [
         [
-            shown.paths, f"{shown.seen:.0f}", stated(shown.photon_map), stated(shown.network),
+            shown.paths, f"{shown.seen:.0f}", f"{shown.effective:.0f}", stated(shown.photon_map), stated(shown.network),
             stated(shown.network.less(room.without)),
         ]
         for shown in room.shown
@@ -141,7 +146,8 @@ def page(rooms: Sequence[Room]) -> str:
 The networks of `make experiments-small`, as they were trained: with the photons of the first line's number of light
 paths. Each further line shows the same network more photons of the same held-out configurations; it divides by their
 number, so that only their noise differs. The photon map is the image that the network's output is added to
-(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. MSE is in the metric space, the
+(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. It is “as noisy as” that of so many photons of equal power,
+(Σ p)² / Σ p². MSE is in the metric space, the
 references' noise taken out. Intervals are over configurations, for these networks (one seed).
 
 {parts}
@@ -160,7 +166,13 @@ def document(rooms: Sequence[Room]) -> dict[str, Any]:
             "units": [unit.hex() for unit in room.references.units],
             WITHOUT: of(room.without),
             "shown": [
-                {"paths": one.paths, "seen": one.seen, "photon_map": of(one.photon_map), WITH: of(one.network)}
+                {
+                    "paths": one.paths,
+                    "seen": one.seen,
+                    "effective": one.effective,
+                    "photon_map": of(one.photon_map),
+                    WITH: of(one.network),
+                }
                 for one in room.shown
             ],
         }

@@ -52,13 +52,13 @@ def test_the_page_and_its_figures_say_how_much_more_error_there_is() -> None:
     def errors(level: float) -> Errors:
         return Errors(np.array([[level + 0.001 * view for view in range(VIEWS)]]), UNITS)
 
-    shown = [Shown(64, 10.0, errors(0.5), errors(0.04)), Shown(256, 40.0, errors(0.4), errors(0.01))]
+    shown = [Shown(64, 10.0, 5.0, errors(0.5), errors(0.04)), Shown(256, 40.0, 20.0, errors(0.4), errors(0.01))]
     halves = np.zeros((VIEWS, 2, 4, 4, 3), np.float32)
     room = Room("made-up", References(tuple(range(VIEWS)), UNITS, halves, 512), errors(0.02), shown)
     text = page([room])
     assert "`light_transport`: 0.02250 (" in text
     first, second = (line.split(" | ") for line in text.splitlines() if line.startswith(("| 64 ", "| 256 ")))
-    assert (first[4].split()[0], second[4].split()[0]) == ("0.02000", "-0.01000")
+    assert (first[5].split()[0], second[5].split()[0]) == ("0.02000", "-0.01000")
     values = json.loads(json.dumps(photon_noise.document([room]), allow_nan=False))["made-up"]
     assert [one["paths"] for one in values["shown"]] == [64, 256]
     assert values["shown"][1]["light_transport_photons"][0] == 0.01

@@ -23,8 +23,8 @@ h1 { font-size: 1.5rem; overflow-wrap: anywhere; } h2 { font-size: 1.15rem; marg
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; }
 .plots img { width: 30rem; max-width: 100%; height: auto; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; }
-td, th { padding: .25rem .8rem .25rem 0; text-align: left; font-weight: normal; vertical-align: top; }
+table { border-collapse: collapse; font-size: .8rem; }
+td, th { padding: .25rem .55rem .25rem 0; text-align: left; font-weight: normal; vertical-align: top; }
 thead th { color: #555; border-bottom: 1px solid #ccc; vertical-align: bottom; }
 tbody tr:nth-child(even) { background: #f7f7f7; }
 .wide td { white-space: nowrap; }

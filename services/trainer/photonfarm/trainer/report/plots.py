@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
+NARROW = 20  # times the least value: axes of less have ticks at round numbers
 SIZE = (5.2, 3.6)  # inches, of 72 CSS pixels and a third each
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
@@ -25,7 +26,7 @@ STYLE: dict[Any, Any] = {  # names of matplotlib
     "axes.grid": True,
     "grid.alpha": 0.3,
     "axes.prop_cycle": "cycler('color', ['#1f5fa8', '#c2571a', '#3b8f4d', '#8a4fa3', '#8c6d31', '#777777', '#d62728', "
-    "'#17a2b8', '#e377c2', '#a6a61a'])",
+    "'#17a2b8', '#e377c2', '#a6a61a', '#111111', '#8fbcff'])",
 }
 
 
@@ -89,7 +90,8 @@ def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float]
             axes.axhline(value, linestyle=style, color="#555555", linewidth=1, label=name)
     axes.set_xlabel(label)
     axes.set_ylabel("held-out squared error, linear")
-    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+    _plain_ticks(axes)
+    _legend(axes)
 
 
 # ------------------------------------------------------------------------------------------------------ over frame time
@@ -144,8 +146,8 @@ def _over_time(contents: Contents) -> Iterator[Plot]:
             yield _drawn(f"time-{measure.name}", about, partial(_scatter, measure=measure, points=points))
 
 
-GROUPS = {"networks": "D", "denoisers, trained": "o-", "denoisers, not trained on the scene": "s--"}
-"""Kinds of predictors, each with how matplotlib marks it."""
+GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
+"""Kinds of predictors, each with how matplotlib marks them and joins them by a line."""
 
 
 def _group(entry: Entry) -> str:
@@ -156,20 +158,39 @@ def _group(entry: Entry) -> str:
 
 
 def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, float]]) -> None:
-    groups: dict[str, list[tuple[Entry, float]]] = {name: [] for name in GROUPS}
-    for entry, value in points:
-        groups[_group(entry)].append((entry, value))
-    for name, members in groups.items():
-        shown = sorted((1e3 * entry.time.total, value, entry.name) for entry, value in members if entry.time)
-        if shown:
+    for name, (marker, line) in GROUPS.items():
+        members = [(1e3 * entry.time.total, value, entry.name) for entry, value in points
+                   if entry.time and _group(entry) == name]  # fmt: skip
+        if members:
+            joined = sorted(members)
             axes.plot(
-                [x for x, _, _ in shown], [y for _, y, _ in shown], GROUPS[name], label=name, markersize=4, linewidth=1
-            )
-        for x, y, label in shown:
-            axes.annotate(label, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=6)
+                [x for x, _, _ in joined], [y for _, y, _ in joined],
+                linestyle=line, marker=marker, label=name, color="#999999", markersize=3, linewidth=1,
+            )  # fmt: skip
+        for x, y, label in members:
+            axes.plot(x, y, marker, label=label, markersize=5)
     axes.set_xscale("log")
     if measure.name not in ("mssim", "kid") and min(value for _, value in points) > 0:
         axes.set_yscale("log")
+    _plain_ticks(axes)
     axes.set_xlabel("time per frame, ms")
     axes.set_ylabel(measure.title)
-    axes.legend(fontsize=7, frameon=False)
+    _legend(axes)
+
+
+# ---------------------------------------------------------------------------------------------------------------- axes
+
+
+def _legend(axes: Axes) -> None:
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Round numbers on logarithmic axes of so little that few powers of ten lie in them, written in full."""
+    from matplotlib.ticker import MaxNLocator, NullLocator
+
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if axis.get_scale() == "log" and high < NARROW * low:
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(lambda value, _: f"{value:g}")
+            axis.set_minor_locator(NullLocator())

@@ -121,8 +121,8 @@ def _fill(memory: Batch, sample: StoredSample, scene: SceneRenderer, spec: Scene
 def table(room: Room) -> str:
     """A line for each number of light paths."""
     header = (
-        "light paths", "photons that a view sees", "as noisy as", "MSE of the photon map (95 %)", f"MSE of `{WITH}` (95 %)",
-        f"more than that of `{WITHOUT}` (95 %)",
+        "light paths", "photons that a view sees", "as noisy as", "MSE of the photon map (95 %)",
+        f"MSE of `{WITH}` (95 %)", f"more than that of `{WITHOUT}` (95 %)",
     )  # fmt: skip
     lines = [
         [
@@ -146,9 +146,9 @@ def page(rooms: Sequence[Room]) -> str:
 The networks of `make experiments-small`, as they were trained: with the photons of the first line's number of light
 paths. Each further line shows the same network more photons of the same held-out configurations; it divides by their
 number, so that only their noise differs. The photon map is the image that the network's output is added to
-(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. It is “as noisy as” that of so many photons of equal power,
-(Σ p)² / Σ p². MSE is in the metric space, the
-references' noise taken out. Intervals are over configurations, for these networks (one seed).
+(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. It is “as noisy as” that of so many
+photons of equal power, (Σ p)² / Σ p². MSE is in the metric space, the references' noise taken out. Intervals are over
+configurations, for these networks (one seed).
 
 {parts}
 

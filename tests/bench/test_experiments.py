@@ -147,7 +147,7 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
 
 
 def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
-    refused = with_size(tiny, train={**tiny.size.train, "loss": "l1"}, train_denoisers={})
+    refused = with_size(tiny, train={**tiny.size.train, "loss": "l1"}, architectures=("light_transport",))
     stages = Stages(refused, tmp_path / "work", workers=1)
     stages.write_spec()
     with pytest.raises(StageError, match=r"tiny: train-light_transport ended with exit code 3; .*train-light_trans"):

@@ -65,7 +65,7 @@ time_t time(time_t *now) {
 """
 
 MACHINE = """
-import sys
+import contextlib, io, json, sys, traceback
 from pathlib import Path
 from photonfarm.renderer.jobs import ShardRenderer
 from photonfarm.shared.plan import Request
@@ -75,8 +75,17 @@ from photonfarm.shared.store.check import check_store
 from photonfarm.shared.top_up import TopUp
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
-root, url = sys.argv[2:4]
-store = Store(root)
+
+names = dict(globals())
+for line in sys.stdin:
+    code, root, url = json.loads(line)
+    said, error = io.StringIO(), ""
+    try:
+        with contextlib.redirect_stdout(said):
+            exec(code, {**names, "root": root, "url": url, "store": Store(root)})
+    except Exception:
+        error = traceback.format_exc()
+    print(json.dumps([said.getvalue().strip(), error]), flush=True)
 """
 
 
@@ -97,18 +106,32 @@ def clock(tmp_path_factory: pytest.TempPathFactory) -> Path:
 Machine = Callable[..., str]
 
 
-@pytest.fixture
-def machine(clock: Path, analytic: ModuleType) -> Machine:
-    """Function (skew in seconds, store, code, URL of Redis) → what the code prints on a machine with that skew."""
+@pytest.fixture(scope="module")
+def machine(clock: Path, analytic: ModuleType) -> Iterator[Machine]:
+    """Function (skew in seconds, store, code, URL of Redis) → what the code prints on the machine with that skew."""
+    machines: dict[int, subprocess.Popen[str]] = {}
+
+    def started(skew_s: int) -> subprocess.Popen[str]:
+        told = os.environ | {"LD_PRELOAD": str(clock), "CLOCK_SKEW_S": str(skew_s)}
+        command = [sys.executable, "-c", MACHINE, str(analytic.FOLDER)]
+        return subprocess.Popen(command, env=told, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def at(skew_s: int, root: Path, code: str, url: str = "") -> str:
-        told = os.environ | {"LD_PRELOAD": str(clock), "CLOCK_SKEW_S": str(skew_s)}
-        command = [sys.executable, "-c", MACHINE + code, str(analytic.FOLDER), str(root), url]
-        done = subprocess.run(command, env=told, capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0, done.stderr
-        return done.stdout.strip()
+        if skew_s not in machines:
+            machines[skew_s] = started(skew_s)
+        talk = machines[skew_s]
+        assert talk.stdin is not None
+        assert talk.stdout is not None
+        talk.stdin.write(json.dumps([code, str(root), url]) + "\n")
+        talk.stdin.flush()
+        said, error = json.loads(talk.stdout.readline())
+        assert not error, error
+        return str(said)
 
-    return at
+    yield at
+    for process in machines.values():
+        process.communicate()  # closes what it listens to, which ends it
+        assert process.returncode == 0
 
 
 @pytest.fixture

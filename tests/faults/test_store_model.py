@@ -616,7 +616,7 @@ def test_a_store_under_random_use_is_what_a_dictionary_would_be(tmp_path: Path) 
     run_state_machine_as_test(
         lambda: StoreMachine(tmp_path / str(next(number))),
         settings=settings(
-            max_examples=EXAMPLES or 15,
+            max_examples=EXAMPLES or 12,
             stateful_step_count=STEPS,
             derandomize=not EXAMPLES,
             database=None,

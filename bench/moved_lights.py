@@ -28,7 +28,7 @@ from photonfarm.shared.records import ViewBuffers
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import View, sample_view
 from photonfarm.trainer.metrics import metric_space
-from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.metrics.intervals import confidence_interval
 
 NAME = "moved_lights"
 ROOMS = ["room", "movable-living-room", "movable-living-room-2", "movable-dining-room", "movable-veach-ajar"]
@@ -112,10 +112,8 @@ def measured(name: str, views: int, half_spp: int) -> Room:
 def stated(values: Sequence[float]) -> str:
     """Mean and 95 % interval, by Student's t: views are of different configurations."""
     found = Estimate.of(np.array(values))
-    if found.standard_error is None:
-        return f"{found.mean:.5f}"
-    spread = t_975(found.count - 1) * found.standard_error
-    return f"{found.mean:.5f} ({found.mean - spread:.5f} … {found.mean + spread:.5f})"
+    limits = confidence_interval(found)
+    return f"{found.mean:.5f}" if limits is None else f"{found.mean:.5f} ({limits[0]:.5f} … {limits[1]:.5f})"
 
 
 def page(rooms: Sequence[Room], views: int, half_spp: int) -> str:

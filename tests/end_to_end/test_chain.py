@@ -47,6 +47,16 @@ def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
         assert not re.search(r'(src|href)="(?!data:|#)', text)
 
 
+def test_the_same_again_renders_nothing(photonfarm: Command, folder: Path) -> None:
+    def markers() -> dict[str, bytes]:
+        return {p.name: p.read_bytes() for p in folder.glob("store/scenes/*/committed/*.json")}
+
+    before = markers()
+    again = photonfarm(*UP[:-1], "0")  # without a trainer, which has nothing left to do either
+    assert again.returncode == 0, again.stderr
+    assert markers() == before
+
+
 def test_the_reading_example_of_the_readme_reads_committed_samples_with_plain_zarr(folder: Path) -> None:
     (example,) = re.findall(r"```python\n(from pathlib import Path.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     check = "\nimport sys, numpy\nassert numpy.isfinite(half_a).all() and not numpy.array_equal(half_a, half_b)\n"
@@ -82,3 +92,9 @@ def test_the_network_shows_a_camera_path_and_buffers_that_were_made_before_alike
     assert photonfarm("buffers", "--scene", "room", "--camera-path", "path.json").returncode == 0
     assert photonfarm("infer", "--buffers", "buffers.npz", "--out", "again").returncode == 0
     assert (folder / "again/frame-0001.png").read_bytes() == (folder / "film/frame-0001.png").read_bytes()
+
+
+def test_a_modification_that_is_too_short_is_refused(photonfarm: Command) -> None:
+    missing = photonfarm("infer", "--orbit", "2", "--modification", "0 0 0 1")
+    assert missing.returncode == 3
+    assert "44 are required" in missing.stderr

@@ -248,7 +248,7 @@ def test_a_glass_caustic_gets_light_paths_whatever_a_short_pilot_happens_to_see(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mirror_room", "cove"])
+@pytest.mark.parametrize("name", ["cornell", "mirror_room", "cove"])
 def test_the_choice_holds_on_images_that_the_pilot_has_not_seen(name: str) -> None:
     """Error × time of the chosen settings is within a fifth of the least, which leaves room for the noise of both."""
     clock = Clock()

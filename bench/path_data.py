@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Training data made by `bdpt` against data made by Mitsuba's `path`, at equal core-seconds of rendering.
 
-    python bench/path_data.py [--experiment fixed-veach-ajar] [--samples 400] [--steps 2000] [--seeds 0 1]
+    python bench/path_data.py [--experiment fixed-veach-ajar] [--samples 400] [--steps 1500] [--seeds 0 1]
                               [--processes 2] [--out docs/results]
 
 Takes the room of an experiment of experiments/, times both integrators, and renders a store of each kind whose
@@ -157,7 +157,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
     parser.add_argument("--samples", type=int, default=400, help="of bdpt, trained on at budget 1 (%(default)s)")
     room_study.add_options(parser, "path_data")
-    parser.set_defaults(steps=2000, decay=0.86, loss="paired", demodulation=0.2)
+    parser.set_defaults(steps=1500, decay=0.86, loss="paired", demodulation=0.2)
     results.add_options(parser)
     return parser
 

@@ -60,6 +60,11 @@ class Fit:
     rhos: F64  # (R,)
 
     @property
+    def constants(self) -> list[tuple[float, float]]:
+        """κ and ρ of each replicate."""
+        return [(float(kappa), float(rho)) for kappa, rho in zip(self.kappas, self.rhos, strict=True)]
+
+    @property
     def kappa_range(self) -> tuple[float, float]:
         """κ's 95 % interval."""
         return within(self.kappas)

@@ -49,7 +49,7 @@ class Change:
     """Half the mean squared difference of two images, of each view: the variance of what was drawn anew."""
 
     whole: list[float]
-    same_surface: list[float]  # of the pixels that show in both what they showed; no view shows none
+    same_surface: list[float]  # of the pixels that show one surface in both; without views in which none does
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,17 +110,17 @@ def measured(name: str, views: int, half_spp: int) -> Room:
 
 
 def stated(values: Sequence[float]) -> str:
-    """Mean and 95 % interval, by Student's t: views are of different configurations."""
-    found = Estimate.of(np.array(values))
+    """Mean, 95 % interval by Student's t, as views are of different configurations, and median."""
+    found, median = Estimate.of(np.array(values)), f"{np.median(values):.5f}"
     limits = confidence_interval(found)
-    return f"{found.mean:.5f}" if limits is None else f"{found.mean:.5f} ({limits[0]:.5f} … {limits[1]:.5f})"
+    return f"{found.mean:.5f}" if limits is None else f"{found.mean:.5f} ({limits[0]:.5f} … {limits[1]:.5f}), {median}"
 
 
 def page(rooms: Sequence[Room], views: int, half_spp: int) -> str:
     """The table as Markdown."""
     header = (
-        "room", "lights anew (95 %)", "on surfaces that stay in view", "objects anew (95 %)",
-        "on surfaces that stay in view",
+        "room", "lights anew: mean (95 %), median", "on surfaces that stay in view",
+        "objects anew: mean (95 %), median", "likewise",
     )  # fmt: skip
     lines = (
         [
@@ -134,8 +134,10 @@ def page(rooms: Sequence[Room], views: int, half_spp: int) -> str:
 {views} random views of random configurations of each room, at 64 × 64, each rendered again with the lights, and then
 with the objects, as in another random configuration. Given is half the mean squared difference in the metric space,
 clip(exposure · I, 0, 1)^(1/2.2), with the noise taken out by halves of {half_spp} spp: the variance over what was
-drawn anew, and so the least MSE of whoever knows all but that. The other columns leave out the pixels in which another
-surface comes to be seen, which buffers tell.
+drawn anew, and so the least MSE of whoever knows all but that. What that curve makes of the noise is left in, and where
+little changes a value may come out negative. The other columns leave out the pixels in which another surface comes to
+be seen, which buffers tell, and views in which none is left. The lamp of `room` counts as an object, as it
+takes its light along. Means are carried by few views, so that their intervals are rough.
 
 {results.table(header, lines)}
 

@@ -30,7 +30,7 @@ import results
 import room_study
 from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
 from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
-from network_errors import F64, Errors, each_seed, of_intervals, stated
+from network_errors import F64, Errors, each_seed, of_intervals, stated, within
 from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.allocation import Allocation, Terms, seconds
 from photonfarm.shared.errors import SpecError
@@ -185,7 +185,18 @@ def pairs_table(room: Room) -> str:
             low, high = gap.interval()
             word = "worse" if low > 0 else "better" if high < 0 else "not told apart"
             lines.append([str(arm.share), stated(gap), each_seed(gap, "+.5f"), word])
-    return f"Against `{best.share}`:\n\n" + results.table(("share", "more MSE (95 %)", "of each seed", "it is"), lines)
+    said = f"Against `{best.share}`, which was picked for its low error, each by an interval of its own:\n\n"
+    return said + results.table(("share", "more MSE (95 %)", "of each seed", "it is"), lines)
+
+
+def levels(room: Room, found: Fit) -> str:
+    """What of the errors the model takes for excess, which alone the shares of a budget change, in words."""
+    a, b = found.levels[room.name]
+    beyond = [(model - a) / model for model in found.predicted(room.errors)]
+    return (
+        f"By the model endless data would leave a = {a:.5f}, and b = {b:.5f}: of an arm's MSE "
+        f"{min(beyond):.0%} to {max(beyond):.0%} is excess, which is all that a budget and its shares can change."
+    )
 
 
 def optimum(room: Room, found: Fit, budget: float) -> str:
@@ -193,19 +204,20 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
     first, of_arms = room.errors.best()
     terms = Terms(room.costs, found.kappa, found.rho)
     best, real = terms.best(budget), terms.best_spp(1)
+    low, high = within(np.array([Terms(room.costs, kappa, rho).best_spp(1) for kappa, rho in found.constants]))
     bought = best_of_replicates(room, found, budget)
     return (
         f"Measured best: `{room.arms[first].share}`, the best in {of_arms[first]:.0%} of replicates. By the model the "
         f"best of {budget:g} core-seconds is {best.modifications} configurations of {best.views} views with "
-        f"{best.spp} spp each (s* = {real:.1f} with one view). Of the replicates' κ and ρ the best has "
-        f"{shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
+        f"{best.spp} spp each; with one view s* = {real:.2f} ({low:.2f} … {high:.2f}). Of the replicates' κ and ρ the "
+        f"best has {shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
     )
 
 
 def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
     """What the model says is best in a room, by the constants of each replicate."""
     best = cache(lambda kappa, rho: Terms(room.costs, kappa, rho).best(budget))
-    return [best(float(kappa), float(rho)) for kappa, rho in zip(found.kappas, found.rhos, strict=True)]
+    return [best(kappa, rho) for kappa, rho in found.constants]
 
 
 def shares(values: Sequence[int], what: str) -> str:
@@ -232,6 +244,8 @@ noise of one sample per pixel {costs.relative_noise:.2f}. Measured on
 with references of {room.references.spp} spp.
 
 {table(room, found)}
+
+{levels(room, found)}
 
 {pairs_table(room)}
 
@@ -262,7 +276,10 @@ each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.r
 with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms of a room have in
 common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 % intervals of a
 bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with replacement, the same
-for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it, pooled over its room.
+for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it, pooled over its room. These
+deviates are drawn independently, though arms of one seed are not quite that: the configurations of those with few are
+among those of the others. Where a range reaches the end of the grid that was searched, "or more", "or less", the
+constant is bounded on one side only, and its best value says little.
 
 {parts}
 
@@ -285,6 +302,7 @@ def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dic
         for room in rooms
     }
     model = {"kappa": found.kappa, "rho": found.rho, "kappa_range": found.kappa_range, "rho_range": found.rho_range}
+    model |= {"levels": found.levels, "chi2": found.chi2, "freedom": found.freedom}
     return {"budget_core_s": told.budget, "model": model, "rooms": of_rooms}
 
 

@@ -44,7 +44,7 @@ def with_interval(found: Found, budgets: Sequence[float]) -> str:
 
 def arms_table(study: Study) -> str:
     header = (
-        "data", "budget", "samples", "core-seconds", "each seen", "MSE (95 %)", "of each seed",
+        "data", "× samples", "samples", "core-seconds", "each seen", "MSE (95 %)", "of each seed",
         f"of {BLOCK} × {BLOCK} means", "linear MSE (95 %)",
     )  # fmt: skip
     drawn = study.told.steps * study.settings.batch
@@ -61,7 +61,7 @@ def arms_table(study: Study) -> str:
 
 def pairs_table(study: Study) -> str:
     header = (
-        "budget", "MSE with `path` less that with `bdpt` (95 %)", "of each seed", "share of `path`'s", "of views",
+        "× samples", "MSE with `path` less that with `bdpt` (95 %)", "of each seed", "share of `path`'s", "of views",
     )  # fmt: skip
     lines = []
     for ours in study.of("bdpt"):
@@ -136,8 +136,9 @@ The room of the experiment `{told.experiment}` at {spec.film.width}², connectio
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
 `rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
 each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
-images were seen to be too dark; a sample costs about as much, by times that were taken before. Budgets below are of
-the core-seconds in the markers of the stores, medians over jobs, with editing, buffers, photons and visibility. Both
+images were seen to be too dark; a sample costs about as much, by times that were taken before. Budgets are told as
+multiples of the samples of `bdpt`'s largest (“× samples”); core-seconds are those in the markers of the stores, medians
+over jobs, with editing, buffers, photons and visibility, and factors are of them. Both
 stores are of one spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s
 bit by bit, and its first {study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has
 beyond, at budgets above 1, are further configurations.
@@ -152,7 +153,8 @@ All arms are measured after the last step, on {room_study.counted(len(references
 **MSE** is in the metric space, clip(I, 0, 1)^(1/2.2), against references of {references.spp} spp by `bdpt` whose
 noise is taken out by their halves, but for what that curve makes of it; **of {BLOCK} × {BLOCK} means**, the same of
 blocks of pixels. **Linear MSE** is in exposed linear radiance, in the same way.
-{of_intervals(len(told.seeds))}
+{of_intervals(len(told.seeds))} All are for this one draw of configurations and of noise, which
+the seeds share: with another draw values may lie outside.
 
 ## What a sample costs, and its noise
 

@@ -45,9 +45,10 @@ NO_POINTS = np.empty((0, 3), np.float32), np.empty(0, np.bool_)
 class Shown:
     """What came of one number of light paths."""
 
+    times: int  # as many light paths as in the store
     paths: int
     seen: float  # photons that a view sees, the median
-    effective: float  # so many of equal power would be as noisy, (Σ p)² / Σ p², the median
+    effective: float  # (Σ p)² / Σ p² of their powers, the median: so many of equal power make as noisy a sum
     photon_map: Errors  # of the image that the network's output is added to
     network: Errors
 
@@ -70,9 +71,9 @@ def errors(images: F32, references: References) -> Errors:
 def measured(name: str, told: argparse.Namespace) -> Room:
     """An experiment's networks on its references. Raises PhotonfarmError where they are not there."""
     folder = told.work / name
-    store = Store(folder / "store")
-    (scene,) = store.scenes()
     runs = {kind: TrainedRun.load(folder / "runs" / kind) for kind in (WITH, WITHOUT)}
+    store = Store(folder / "store")
+    scene = store.scene(runs[WITH].scene_id)
     references = References.of(store, scene.spec, told.reference_spp, runs[WITH].settings.hold_out)
     plain = StoreSource(store.root, scene.spec.scene_id)
     without = errors(room_study.images(runs[WITHOUT], plain, references.rows), references)
@@ -89,7 +90,7 @@ def _shown(run: TrainedRun, store: Store, references: References, times: int) ->
     stored = located(source.spec)
     paths = times * stored.photons.paths
     more = stored.photons.model_copy(update={"paths": paths})
-    spec = stored.model_copy(update={"photons": more})  # networks divide by the number of paths that it names
+    spec = stored.model_copy(update={"photons": more})
     scene, network = load_scene(spec), run.network(spec, base).eval()
     points = min(run.settings.network.points or len(base[1].position), len(base[1].position))
     memory = Batch.empty(1, points, spec, run.needs)
@@ -106,7 +107,7 @@ def _shown(run: TrainedRun, store: Store, references: References, times: int) ->
         effective.append(float(power.sum() ** 2 / (power**2).sum()) if len(power) else 0.0)
     found = [errors(np.concatenate(images), references) for images in (maps, made)]
     room_study.tell(f"{paths} paths: map {stated(found[0])}, network {stated(found[1])}")
-    return Shown(paths, float(np.median(seen)), float(np.median(effective)), *found)
+    return Shown(times, paths, float(np.median(seen)), float(np.median(effective)), *found)
 
 
 def _fill(memory: Batch, sample: StoredSample, scene: SceneRenderer, spec: SceneSpec, cloud: BasePointCloud) -> None:
@@ -121,13 +122,13 @@ def _fill(memory: Batch, sample: StoredSample, scene: SceneRenderer, spec: Scene
 def table(room: Room) -> str:
     """A line for each number of light paths."""
     header = (
-        "light paths", "photons that a view sees", "as noisy as", "MSE of the photon map (95 %)",
+        "light paths", "photons that a view sees", "of equal power", "MSE of the photon map (95 %)",
         f"MSE of `{WITH}` (95 %)", f"more than that of `{WITHOUT}` (95 %)",
     )  # fmt: skip
     lines = [
         [
-            shown.paths, f"{shown.seen:.0f}", f"{shown.effective:.0f}", stated(shown.photon_map), stated(shown.network),
-            stated(shown.network.less(room.without)),
+            f"{shown.paths} (× {shown.times})", f"{shown.seen:.0f}", f"{shown.effective:.0f}", stated(shown.photon_map),
+            stated(shown.network), stated(shown.network.less(room.without)),
         ]
         for shown in room.shown
     ]  # fmt: skip
@@ -143,12 +144,13 @@ def page(rooms: Sequence[Room]) -> str:
     )
     return f"""# What the noise of the photon map costs
 
-The networks of `make experiments-small`, as they were trained: with the photons of the first line's number of light
-paths. Each further line shows the same network more photons of the same held-out configurations; it divides by their
-number, so that only their noise differs. The photon map is the image that the network's output is added to
-(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. It is “as noisy as” that of so many
-photons of equal power, (Σ p)² / Σ p². MSE is in the metric space, the references' noise taken out. Intervals are over
-configurations, for these networks (one seed).
+The networks of `make experiments-small`, as they were trained: with the photons of × 1. Further lines show the same
+networks more photons of the same held-out configurations; a photon's power is that of its light path over their number,
+so that only the noise differs. The photon map is the image that the network's output is added to
+(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. Nothing is trained: what a network would
+reach that had learned from so many photons is not measured, and can be less. Photons seen are medians over views, and
+so are those of equal power that would make as noisy a sum, (Σ p)² / Σ p². MSE is in the metric space, the references'
+noise taken out. Intervals are over configurations, for these networks (one seed).
 
 {parts}
 

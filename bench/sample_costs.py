@@ -59,26 +59,35 @@ def line(room: Room, budget: float) -> list[str]:
     costs, found = room.costs, room.terms.best(budget)
     parts = (costs.configuration_s, costs.view_s, costs.pass_s, costs.spp_s)
     dearer = (f"{room.more_than_best(spp, budget):.2f}" for spp in SPP)
+    film = room.spec.film
     return [
         room.name,
+        f"{film.width} × {film.height}",
         *(f"{1e3 * part:.1f}" for part in parts),
         f"{costs.relative_noise:.2f}",
         f"{room.terms.best_spp(1):.2f}",
-        f"{found.modifications} × {found.views} × {found.spp} spp",
+        shared_out(found, static=not room.spec.groups),
         *dearer,
     ]
+
+
+def shared_out(found: Allocation, *, static: bool) -> str:
+    """An allocation in short; a static scene has one configuration, and stands as in `Terms.of`."""
+    parts = (1, found.modifications) if static else (found.modifications, found.views)
+    return " × ".join(map(str, parts)) + f" × {found.spp} spp"
 
 
 def page(rooms: list[Room], budget: float, views: int) -> str:
     """The table as Markdown."""
     header = (
-        "experiment", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "noise ν of 1 spp", "s*",
+        "experiment", "image", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "noise ν of 1 spp", "s*",
         f"best of {budget:g} core-s: configurations × views", *(f"excess at {spp} spp" for spp in SPP),
     )  # fmt: skip
     return f"""# What samples cost, how noisy they are, and how many samples per pixel that asks for
 
-Scenes of `experiments/` at 64 × 64; core-milliseconds, medians over {views} views. ν is the relative noise of one
-sample per pixel (`photonfarm.shared.sample_costs.relative_noise`); s* the samples per pixel, both halves together, of
+Scenes of `experiments/` in their small size; core-milliseconds, medians over {views} views. ν is the relative noise of
+one sample per pixel (`photonfarm.shared.sample_costs.relative_noise`), from halves of the scene's samples per pixel,
+which are stratified: with fewer it is somewhat more. s* is the samples per pixel, both halves together, of
 least excess error with one view of each configuration, and “best” the best of all shares with 2 spp and more
 (`photonfarm.shared.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
 core-seconds spent on single views of so many spp, over that of the best.

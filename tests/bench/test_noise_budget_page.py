@@ -54,6 +54,9 @@ def test_the_page_and_its_figures_are_made(seeds: int) -> None:
     assert (of_room["seeds"], len(of_room["units"])) == (list(range(seeds)), VIEWS)
     assert [arm["spp"] for arm in of_room["arms"]] == [share.spp for share in SHARES]
     assert all(np.shape(arm["mse"]) == (seeds, VIEWS) for arm in of_room["arms"])
+    a, b = values["model"]["levels"]["room 1"]
+    assert f"endless data would leave a = {a:.5f}, and b = {b:.5f}" in text
+    assert a == pytest.approx(0.01 * 1.0, rel=0.3)  # units are as hard as 1 on average
     low, high = values["model"]["kappa_range"]
     assert low <= values["model"]["kappa"] <= high
 

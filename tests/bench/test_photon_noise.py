@@ -52,7 +52,7 @@ def test_the_page_and_its_figures_say_how_much_more_error_there_is() -> None:
     def errors(level: float) -> Errors:
         return Errors(np.array([[level + 0.001 * view for view in range(VIEWS)]]), UNITS)
 
-    shown = [Shown(64, 10.0, 5.0, errors(0.5), errors(0.04)), Shown(256, 40.0, 20.0, errors(0.4), errors(0.01))]
+    shown = [Shown(1, 64, 10.0, 5.0, errors(0.5), errors(0.04)), Shown(4, 256, 40.0, 20.0, errors(0.4), errors(0.01))]
     halves = np.zeros((VIEWS, 2, 4, 4, 3), np.float32)
     room = Room("made-up", References(tuple(range(VIEWS)), UNITS, halves, 512), errors(0.02), shown)
     text = page([room])

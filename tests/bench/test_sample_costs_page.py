@@ -7,7 +7,7 @@ from analytic_scene import small_spec
 
 from photonfarm.shared.allocation import Allocation
 from photonfarm.shared.sample_costs import SampleCosts
-from sample_costs import SPP, Room, line, page
+from sample_costs import SPP, Room, line, page, shared_out
 
 BUDGET = 200.0
 
@@ -36,8 +36,13 @@ def test_noisier_scenes_are_said_to_want_more_samples_per_pixel(noise: float) ->
     of = room(relative_noise=noise)
     cells = line(of, BUDGET)
     assert cells[0] == "made-up"
-    assert cells[1:5] == ["500.0", "50.0", "0.0", "10.0"]
-    assert (float(cells[6]) > 8) == (noise > 1)
+    assert cells[1:6] == ["8 × 8", "500.0", "50.0", "0.0", "10.0"]
+    assert (float(cells[7]) > 8) == (noise > 1)
+
+
+def test_views_of_a_static_scene_are_of_one_configuration() -> None:
+    assert shared_out(Allocation(7, 1, 1, 4), static=True) == "1 × 7 × 4 spp"
+    assert shared_out(Allocation(7, 2, 1, 4), static=False) == "7 × 2 × 4 spp"
 
 
 def test_the_page_has_a_line_for_each_scene() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
-from moved_lights import Change, Image, Room, half_square, mixed, page, same_surface
+from moved_lights import Change, Image, Room, half_square, measured, mixed, page, same_surface
 from photonfarm.shared.modification import sample_modification
 from photonfarm.shared.records import ViewBuffers
 from photonfarm.shared.scene import load_spec
@@ -45,6 +48,24 @@ def test_only_pixels_that_show_the_same_are_compared() -> None:
     same = same_surface(first, second)
     assert not same[:3].any()
     assert same[3:].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moving", ["lights", "objects"])
+def test_what_does_not_move_changes_nothing(tmp_path: Path, moving: str) -> None:
+    """A room rendered once more as it was differs by its noise alone, which the halves take out but for its scatter."""
+    plain = load_spec("room")
+    film = plain.film.model_copy(update={"width": 16, "height": 16})
+    still: dict[str, Any] = {"objects" if moving == "lights" else "lights": ()}
+    spec = plain.model_copy(update={"film": film, "points": 256, **still})
+    file = tmp_path / "moving.json"
+    file.write_text(spec.model_dump_json())
+    room = measured(str(file), views=2, half_spp=32)
+    moved, unmoved = (room.lights, room.objects) if moving == "lights" else (room.objects, room.lights)
+    assert len(moved.whole) == len(unmoved.whole) == 2
+    assert min(moved.whole) > 20 * max(np.abs(unmoved.whole)) > 0  # 0: noise that is not drawn anew
+    assert min(moved.same_surface) > 0
+    assert unmoved.same_surface == unmoved.whole
 
 
 def test_the_page_has_a_line_for_each_room() -> None:

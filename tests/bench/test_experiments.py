@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,7 +17,7 @@ from photonfarm.shared.errors import SpecError
 from photonfarm.shared.scene import SCENES_VARIABLE
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from rooms import Room
-from stages import StageError, Stages
+from stages import PREVIEW, StageError, Stages, _is_done
 from tables import paper_table, room_table
 
 ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
@@ -110,9 +111,10 @@ def with_size(tiny: Experiment, **changes: Any) -> Experiment:
 
 
 def reports(stages: Stages) -> list[int]:
-    """When what is made last was written: checkpoints, references and the report."""
+    """When what is made last was written: the farm's preview and log, checkpoints, references and the report."""
     files = [*stages.folder.glob("runs/*/checkpoint*"), *stages.folder.glob("references/*.npz")]
-    return [file.stat().st_mtime_ns for file in [*sorted(files), stages.folder / "report" / "report.json"]]
+    files = [*sorted(files), *(stages.folder / name for name in (PREVIEW, "logs/render.log", "report/report.json"))]
+    return [file.stat().st_mtime_ns for file in files]
 
 
 @pytest.mark.slow
@@ -144,6 +146,39 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     Stages(with_size(tiny, references=fewer), tmp_path / "work", workers=2).render()
     assert len(list(strange.parent.glob("*.npz"))) == 1
     assert strange.is_file()
+
+    shutil.rmtree(tmp_path / "work" / "store")  # a report that is made anew, as references are others, ends at once
+    with pytest.raises(StageError, match="tiny: report ended with exit code"):
+        stages.report()
+
+
+@pytest.mark.parametrize(
+    ("since", "done"),
+    [
+        ("nothing", True),
+        ("it did not end", False),
+        ("other arguments", False),
+        ("an output is missing", False),
+        ("a source is newer", False),
+        ("a source is as old", False),
+    ],
+)
+def test_a_verb_is_done_until_its_arguments_what_it_is_made_of_or_what_it_made_change(
+    tmp_path: Path, since: str, done: bool
+) -> None:
+    end, *made = (tmp_path / name for name in ("end", "made", "made too"))
+    of = [tmp_path / name for name in ("old", "older")]
+    for second, file in enumerate([*reversed(of), *made, end]):
+        file.write_text("as told")
+        os.utime(file, (second, second))
+    if since == "it did not end":
+        end.unlink()
+    elif since == "an output is missing":
+        made[1].unlink()
+    elif since.startswith("a source"):
+        second = end.stat().st_mtime + (since == "a source is newer")
+        os.utime(of[1], (second, second))
+    assert _is_done(end, "otherwise" if since == "other arguments" else "as told", made, of) is done
 
 
 def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -29,6 +30,7 @@ from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
 
 YEAR_S = 365 * 86400
+ENDED_S = 60.0  # for a process to end that nobody talks to any more
 SKEWS = pytest.mark.parametrize("skew_s", [YEAR_S, -YEAR_S], ids=["a year ahead", "a year behind"])
 
 CLOCK = r"""
@@ -122,16 +124,24 @@ def machine(clock: Path, analytic: ModuleType) -> Iterator[Machine]:
         talk = machines[skew_s]
         assert talk.stdin is not None
         assert talk.stdout is not None
-        talk.stdin.write(json.dumps([code, str(root), url]) + "\n")
-        talk.stdin.flush()
-        said, error = json.loads(talk.stdout.readline())
+        with suppress(BrokenPipeError):  # it has ended: there is no line then
+            talk.stdin.write(json.dumps([code, str(root), url]) + "\n")
+            talk.stdin.flush()
+        line = talk.stdout.readline()
+        assert line, f"the machine {skew_s} s off has ended by itself, with return code {talk.wait(ENDED_S)}"
+        said, error = json.loads(line)
         assert not error, error
         return str(said)
 
-    yield at
-    for process in machines.values():
-        process.communicate()  # closes what it listens to, which ends it
-        assert process.returncode == 0
+    try:
+        yield at
+        for process in machines.values():
+            process.communicate(timeout=ENDED_S)  # closes what it listens to, which ends it
+        assert {skew_s: process.returncode for skew_s, process in machines.items()} == dict.fromkeys(machines, 0)
+    finally:
+        for process in machines.values():
+            with process:  # waits
+                process.kill()
 
 
 @pytest.fixture

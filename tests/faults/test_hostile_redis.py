@@ -64,7 +64,7 @@ from redis import Redis
 from rq import SimpleWorker
 worker = SimpleWorker(["photonfarm"], connection=Redis.from_url(sys.argv[1]), serializer=sys.argv[2])
 if sys.argv[3] == "listening":
-    worker.work(logging_level="ERROR")
+    worker.work(logging_level="INFO")
 else:
     worker.work(burst=True, with_scheduler=True, logging_level="ERROR")
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
@@ -281,12 +281,19 @@ def test_a_plain_worker_repeats_what_redis_says_and_loads_what_lies_there(where:
     assert where.plain_bytes > LARGE
 
 
-def test_a_plain_worker_is_ended_by_a_message(where: Field, server: EmbeddedRedis, analytic: ModuleType) -> None:
-    """It is sent until it works: RQ loses the signal that it becomes if that comes within a call of Redis' client."""
-    with connect(server.url) as connection:
+def test_a_plain_worker_is_ended_by_a_message(
+    where: Field, server: EmbeddedRedis, analytic: ModuleType, tmp_path: Path
+) -> None:
+    """It is sent until it works: RQ loses the signal that it becomes if that comes within a call of Redis' client.
+
+    Its exit code is that of the signal where RQ does not handle it yet, and 0 also where its loop has failed by
+    itself, which only its log tells.
+    """
+    log = tmp_path / "log"
+    with connect(server.url) as connection, log.open("wb") as output:
         connection.flushall()
         command = [sys.executable, "-c", PLAIN, server.url, "json", "listening"]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        with subprocess.Popen(command, stdout=output, stderr=output) as process:
             try:
                 analytic.wait_for(lambda: connection.pubsub_channels("rq:pubsub:*"), 120)
                 (channel,) = connection.pubsub_channels("rq:pubsub:*")
@@ -300,6 +307,11 @@ def test_a_plain_worker_is_ended_by_a_message(where: Field, server: EmbeddedRedi
                 analytic.wait_for(is_ended, 120)
             finally:
                 process.kill()
+    said = log.read_text()
+    assert process.returncode in {0, -signal.SIGINT}, said
+    before, received, _ = said.partition("Received shutdown command")
+    assert received, said
+    assert "unhandled exception" not in before, said
 
 
 def files_of(where: Field) -> set[Path]:

@@ -53,7 +53,7 @@ def test_only_pixels_that_show_the_same_are_compared() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("moving", ["lights", "objects"])
 def test_what_does_not_move_changes_nothing(tmp_path: Path, moving: str) -> None:
-    """A room rendered once more as it was differs by its noise alone, which the halves take out but for its scatter."""
+    """A room rendered once more as it was differs by noise alone, which the halves take out but for its scatter."""
     plain = load_spec("room")
     film = plain.film.model_copy(update={"width": 16, "height": 16})
     still: dict[str, Any] = {"objects" if moving == "lights" else "lights": ()}

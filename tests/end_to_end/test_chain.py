@@ -6,10 +6,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from photonfarm.trainer import checkpoint
 
 ROOT = Path(__file__).parents[2]
 UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
@@ -47,14 +50,26 @@ def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
         assert not re.search(r'(src|href)="(?!data:|#)', text)
 
 
-def test_the_same_again_renders_nothing(photonfarm: Command, folder: Path) -> None:
+def test_the_same_again_renders_nothing_and_trains_nothing(photonfarm: Command, folder: Path) -> None:
     def markers() -> dict[str, bytes]:
         return {p.name: p.read_bytes() for p in folder.glob("store/scenes/*/committed/*.json")}
 
-    before = markers()
-    again = photonfarm(*UP[:-1], "0")  # without a trainer, which has nothing left to do either
+    def network() -> dict[str, bytes]:
+        state = checkpoint.load(folder / "run/checkpoint.safetensors")["network"]
+        return {name: values.numpy().tobytes() for name, values in state.items()}
+
+    def records() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (folder / "run/metrics.jsonl").read_text().splitlines()]
+
+    (folder / "photonfarm.toml").write_text("[report]\nuntimed = true\n")  # its report may cost less
+    before, trained, told = markers(), network(), records()
+    again = photonfarm(*UP)
     assert again.returncode == 0, again.stderr
     assert markers() == before
+    assert network() == trained
+    (end,) = records()[len(told) :]
+    assert records()[: len(told)] == told
+    assert (end["kind"], end["step"], end["draws"]) == ("end", 40, told[-1]["draws"])
 
 
 def test_the_reading_example_of_the_readme_reads_committed_samples_with_plain_zarr(folder: Path) -> None:

@@ -13,6 +13,9 @@ from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 CONVERGED_SPP = 4096
 """Samples per pixel from which a reference counts as converged [method §4, ours]."""
 
+FEW_UNITS = 6
+"""Configurations or views below which intervals by Student's t say little."""
+
 
 def told(evaluation: Evaluation) -> str:
     """The head, the rows as a Markdown table, and the foot."""
@@ -26,12 +29,17 @@ def notes(evaluation: Evaluation) -> list[str]:
     denoisers = any(row.kept is not None for row in evaluation.rows)
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over the "
-        f"{counted(evaluation.units, evaluation.unit)}"
+        f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
         return [*found, "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)"]
     return [*found, *_of_references(evaluation.references, denoisers=denoisers), *_of_inception(metrics)]
+
+
+def _of_few(units: int) -> str:
+    few = "; of so few they are wide, and may reach beyond what is possible"
+    return few if units < FEW_UNITS else ""
 
 
 def place_of_networks(evaluation: Evaluation) -> str:

@@ -6,9 +6,10 @@ import base64
 from html import escape
 
 from photonfarm.shared.pictures import Picture, png_uri
+from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents
-from photonfarm.trainer.report.pictures import LARGEST, Case, cases
-from photonfarm.trainer.report.plots import Plot
+from photonfarm.trainer.report.pictures import Case, cases, legend_of_cases
+from photonfarm.trainer.report.plots import OF_CURVES, OF_TIME, Plot
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 STYLE = """
@@ -21,7 +22,7 @@ h1 { font-size: 1.5rem; overflow-wrap: anywhere; } h2 { font-size: 1.15rem; marg
 .figures div { border: 1px solid #ddd; border-radius: 6px; padding: .5rem .9rem; }
 .figures b { display: block; font-size: 1.25rem; }
 .plots { display: flex; flex-wrap: wrap; gap: 1rem; }
-.plots img { width: 30rem; max-width: 100%; height: auto; }
+.plots img { width: 28rem; max-width: 100%; height: auto; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .8rem; }
 td, th { padding: .25rem .55rem .25rem 0; text-align: left; font-weight: normal; vertical-align: top; }
@@ -34,9 +35,9 @@ tbody tr { background: #fff; }
 figure { margin: 0; width: 8.5rem; }
 figure img { width: 100%; image-rendering: pixelated; display: block; margin-bottom: 2px; }
 figcaption { font-size: .72rem; line-height: 1.3; overflow-wrap: anywhere; }
-p, li { max-width: 52rem; } code { overflow-wrap: anywhere; }
+p, li { max-width: 52rem; } li, code { overflow-wrap: anywhere; }
 ul { padding-left: 1.2rem; font-size: .88rem; color: #444; }
-.facts td { overflow-wrap: anywhere; } .facts td:first-child { color: #555; }
+.facts td { overflow-wrap: anywhere; } .facts td:first-child { color: #555; white-space: nowrap; }
 """
 PICTURE_WIDTH = 128  # px, at least, of a picture as it is stored in the page
 
@@ -51,8 +52,8 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
         f"<h1>{escape(title)}</h1>",
         _headline(contents),
         _table(first),
-        _plots("Error over the time of a frame", over_time),
-        _plots("Learning", curves),
+        _plots("Metrics over the time of a frame", OF_TIME, over_time),
+        _plots("Learning", OF_CURVES, curves),
         _pictures(cases(contents), contents),
         *map(_table, others),
         _facts(contents),
@@ -68,16 +69,16 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
 def _headline(contents: Contents) -> str:
     card, evaluation = contents.card, contents.evaluation
     samples, colour = card.samples, contents.gauges.mean_colour.error.mean
-    best = min(contents.entries[: len(contents.stories)], key=lambda entry: entry.row.held_out.error.mean)
-    error = best.row.held_out.error
-    spread = "–" if error.standard_error is None else f"{error.standard_error:.2g}"
+    first = contents.entries[0]
+    error, reach = first.row.held_out.error, confidence_interval(first.row.held_out.error)
+    spread = "" if reach is None else f" (95 %: {reach[0]:.3g} … {reach[1]:.3g})"
     rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
     cells = [
         (f"{samples.rows}", f"samples of {samples.planned} planned"),
         ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
-        (f"{error.mean:.4g}", f"held-out error (± {spread}), {best.name}"),
-        (f"{colour:.4g}", f"mean colour: {colour / error.mean:.1f} ×" if error.mean > 0 else "mean colour"),
-        (f"{contents.gauges.untrained.error.mean:.4g}", "before training"),
+        (f"{error.mean:.4g}", f"held-out error of {first.name}{spread}"),
+        (f"{contents.gauges.untrained.error.mean:.4g}", f"of {first.name} before its first step"),
+        (f"{colour:.4g}", f"of the mean colour{f': {colour / error.mean:.1f} × as much' if error.mean > 0 else ''}"),
         (f"{evaluation.noise_floor:.4g}", "noise of the targets"),
     ]
     boxes = "".join(f"<div><b>{value}</b>{escape(name)}</div>" for value, name in cells)
@@ -85,8 +86,7 @@ def _headline(contents: Contents) -> str:
         f'<div class="figures">{boxes}</div>\n<p>Errors are mean squared errors of linear radiance × exposure, on '
         f"{evaluation.samples} samples of {evaluation.units} {evaluation.unit}s that were never trained on. The noise "
         "of the targets is taken out exactly: each sample has two independent renders A and B, and (f − A)(f − B) "
-        "averages to the error against the clean image, which nobody rendered. Noise would add the last figure on "
-        "top.</p>"
+        "averages to the error against the clean image. Noise would add the last figure on top.</p>"
     )
 
 
@@ -100,14 +100,14 @@ def _table(table: Table) -> str:
     )
 
 
-def _plots(title: str, drawn: list[Plot]) -> str:
+def _plots(title: str, said: str, drawn: list[Plot]) -> str:
     if not drawn:
         return ""
     images = "".join(
         f'<img alt="{escape(plot.about)}" src="data:image/svg+xml;base64,{base64.b64encode(plot.svg).decode()}">'
         for plot in drawn
     )
-    return f'<h2>{escape(title)}</h2>\n<div class="plots">{images}</div>'
+    return f'<h2>{escape(title)}</h2>\n<p>{escape(said)}</p>\n<div class="plots">{images}</div>'
 
 
 def _pictures(found: list[Case], contents: Contents) -> str:
@@ -118,12 +118,7 @@ def _pictures(found: list[Case], contents: Contents) -> str:
             images = (shown.picture, f"image by {shown.name}"), (shown.difference, f"difference of {shown.name}")
             figures.append(_figure(f"{shown.name}, MSE {shown.mse:.4f}", *images))
         blocks.append(f'<h3>{escape(case.caption)}</h3><div class="case">{"".join(figures)}</div>')
-    legend = (
-        f"<p>Shown as clip(exposure · I, 0, 1)<sup>1/2.2</sup>; below each image its difference to the target, from "
-        f"black (0) to pale yellow ({LARGEST:g} and more), and its MSE against the target as shown, whose noise is in "
-        "it. The first are the first samples of the first configurations, the others the worst cases of "
-        f"{escape(contents.entries[0].name)}, found automatically.</p>"
-    )
+    legend = f"<p>{escape(legend_of_cases(contents))}</p>"
     return f"<h2>Held-out views</h2>\n{legend}\n{''.join(blocks)}"
 
 

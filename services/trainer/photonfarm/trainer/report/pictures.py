@@ -38,6 +38,16 @@ def cases(contents: Contents) -> list[Case]:
     return [_case(contents, target) for target in contents.evaluation.shown]
 
 
+def legend_of_cases(contents: Contents) -> str:
+    """What the pictures show, in sentences."""
+    others = "" if not contents.worst else f", then the worst cases of {contents.entries[0].name}, found automatically"
+    return (
+        "Shown as clip(exposure · I, 0, 1)^(1/2.2); below each image its difference to the target, from black (0) over "
+        f"red to pale yellow ({LARGEST:g} and more), and its MSE against the target as shown, the target's own noise "
+        f"left in. The views are the first of the first held-out configurations{others}."
+    )
+
+
 def _case(contents: Contents, target: Target) -> Case:
     kinds = [f"worst of {case.kind}" for case in contents.worst if case.row == target.row]
     what = "reference" if target.is_reference else "noisy target"

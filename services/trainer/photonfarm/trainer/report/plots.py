@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from photonfarm.shared.estimate import Estimate
+from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents, Entry
 from photonfarm.trainer.report.trained_runs import Point, RunStory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FEW = 3  # places along an axis: fewer show no curve
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
+MSSIM, KID = "mssim", "kid"  # the metrics whose axes are linear
 NARROW = 20  # times the least value: axes of less have ticks at round numbers
-SIZE = (5.2, 3.6)  # inches, of 72 CSS pixels and a third each
+SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; the legend's rows are in it
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
     "svg.hashsalt": "photonfarm",  # equal plots are equal bytes
@@ -39,6 +44,12 @@ class Plot:
     svg: bytes
 
 
+OF_CURVES = (
+    "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
+    "Hollow points were measured on fewer held-out samples than the last: the others had not been rendered."
+)
+
+
 def plots(contents: Contents) -> list[Plot]:
     """Learning curves, then each metric over the time of a frame where that is known."""
     return [*_curves(contents), *_over_time(contents)]
@@ -53,6 +64,7 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
         figure = Figure(SIZE, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure.add_subplot())
+        figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=2)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return Plot(name, about, stream.getvalue())
@@ -65,22 +77,27 @@ def _curves(contents: Contents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
     axes: tuple[tuple[str, str, Callable[[RunStory, Point], float]], ...] = (
-        ("samples", "samples drawn", lambda _, point: point.draws),
-        ("rendering", "core-seconds of rendering the samples used", lambda _, point: point.core_s(per_sample)),
+        ("samples", "samples drawn, repeats counted", lambda _, point: point.draws),
+        ("rendering", "core-seconds of rendering", lambda _, point: point.core_s(per_sample)),
         (
-            "all", f"core-seconds of that and of training steps{on_gpu}",
+            "all", f"core-seconds of rendering and of training{on_gpu}",
             lambda story, point: point.core_s(per_sample) + story.step_core_s(point),
         ),
     )  # fmt: skip
     for name, label, x in axes:
+        if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
+            continue  # all was rendered before much was learned
         about = f"Held-out error over {label}"
         yield _drawn(f"curve-{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
 def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float], label: str) -> None:
     for story in contents.stories:
-        shown = [(x(story, point), point.error) for point in story.curve if point.error > 0]
-        axes.plot(*zip(*shown, strict=True) if shown else ([], []), marker=".", label=story.name, linewidth=1.2)
+        shown = [point for point in story.curve if point.error > 0]
+        places = [(x(story, point), point.error) for point in shown]
+        whole = [place for place, point in zip(places, shown, strict=True) if point.held_out == shown[-1].held_out]
+        (line,) = axes.plot(*_columns(places), linewidth=1.2, marker="o", markersize=4, markerfacecolor="white")
+        axes.plot(*_columns(whole), "o", markersize=4, color=line.get_color(), label=story.name)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
     colour, noise = contents.gauges.mean_colour.error.mean, contents.evaluation.noise_floor
@@ -91,7 +108,10 @@ def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float]
     axes.set_xlabel(label)
     axes.set_ylabel("held-out squared error, linear")
     _plain_ticks(axes)
-    _legend(axes)
+
+
+def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in places], [y for _, y in places]
 
 
 # ------------------------------------------------------------------------------------------------------ over frame time
@@ -103,36 +123,32 @@ class Measure:
 
     name: str
     title: str
-    of: Callable[[Entry], float | None]
+    of: Callable[[Entry], Estimate | None]
 
 
 def measures() -> list[Measure]:
     """The metrics of Fig. 5, and those that we put beside them."""
 
     def feature(block: int) -> Measure:
-        def value(entry: Entry) -> float | None:
+        def value(entry: Entry) -> Estimate | None:
             found = entry.row.metrics
-            return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate.mean
+            return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate
 
         return Measure(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
 
-    def of(field: str) -> Callable[[Entry], float | None]:
-        return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate.mean
+    def of(field: str) -> Callable[[Entry], Estimate | None]:
+        return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate
 
-    def fid(entry: Entry) -> float | None:
+    def fid(entry: Entry) -> Estimate | None:
         found = entry.row.metrics
-        return None if found is None or found.fid is None else found.fid.value
-
-    def kid(entry: Entry) -> float | None:
-        found = entry.row.metrics
-        return None if found is None or found.kid is None else found.kid.mean
+        return None if found is None or found.fid is None else Estimate(found.fid.value, None, found.fid.predictions)
 
     return [
         Measure("mse", "MSE", of("mse")),
-        Measure("mssim", "MSSIM", of("mssim")),
+        Measure(MSSIM, "MSSIM", of("mssim")),
         Measure("fid", "FID", fid),
         *(feature(block) for block in range(4)),
-        Measure("kid", "KID", kid),
+        Measure(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
         Measure("flip", "FLIP", of("flip")),
     ]
 
@@ -147,7 +163,12 @@ def _over_time(contents: Contents) -> Iterator[Plot]:
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
-"""Kinds of predictors, each with how matplotlib marks them and joins them by a line."""
+"""Kinds of predictors, each with how matplotlib marks them and joins them by a line: as `OF_TIME` says."""
+
+OF_TIME = (
+    "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
+    "it; bars are 95 % intervals, which FID has none of. Less is better, but for MSSIM."
+)
 
 
 def _group(entry: Entry) -> str:
@@ -157,32 +178,29 @@ def _group(entry: Entry) -> str:
     return untrained if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, float]]) -> None:
+def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, Estimate]]) -> None:
+    logarithmic = measure.name not in (MSSIM, KID) and min(value.mean for _, value in points) > 0
+    floor = min(value.mean for _, value in points) / 2 if logarithmic else -math.inf  # bars end there
     for name, (marker, line) in GROUPS.items():
-        members = [(1e3 * entry.time.total, value, entry.name) for entry, value in points
-                   if entry.time and _group(entry) == name]  # fmt: skip
-        if members:
-            joined = sorted(members)
-            axes.plot(
-                [x for x, _, _ in joined], [y for _, y, _ in joined],
-                linestyle=line, marker=marker, label=name, color="#999999", markersize=3, linewidth=1,
-            )  # fmt: skip
-        for x, y, label in members:
-            axes.plot(x, y, marker, label=label, markersize=5)
+        members = sorted(
+            ((1e3 * entry.time.total, entry.name, value) for entry, value in points
+             if entry.time and _group(entry) == name), key=lambda member: member[:2],
+        )  # fmt: skip
+        places = _columns([(x, value.mean) for x, _, value in members])
+        axes.plot(*places, linestyle=line or "none", color="#999999", linewidth=1)
+        for x, label, value in members:
+            low, high = confidence_interval(value) or (value.mean, value.mean)
+            reach = [[value.mean - max(low, floor)], [high - value.mean]]
+            axes.errorbar(x, value.mean, reach, fmt=marker, label=label, markersize=5, elinewidth=0.8)
     axes.set_xscale("log")
-    if measure.name not in ("mssim", "kid") and min(value for _, value in points) > 0:
+    if logarithmic:
         axes.set_yscale("log")
     _plain_ticks(axes)
     axes.set_xlabel("time per frame, ms")
     axes.set_ylabel(measure.title)
-    _legend(axes)
 
 
 # ---------------------------------------------------------------------------------------------------------------- axes
-
-
-def _legend(axes: Axes) -> None:
-    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def _plain_ticks(axes: Axes) -> None:

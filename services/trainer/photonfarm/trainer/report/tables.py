@@ -38,13 +38,13 @@ def facts(contents: Contents) -> list[tuple[str, str]]:
     return [
         ("scene", f"{spec.name}, {about['source']}, id {spec.scene_id}"),
         ("credits", "not said" if owed is None else f"“{owed.title}” by {owed.author}, {owed.licence}"),
-        ("published at", NOT_AVAILABLE if owed is None or not owed.source else owed.source),
+        *([("published at", owed.source)] if owed is not None and owed.source else []),
         ("kind", about["kind"]),
         ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
         ("samples", f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
                     f"in two independent halves{_further_passes(contents)}"),
-        ("noise floor", f"{contents.evaluation.noise_floor:.4g}, of a target, squared exposed radiance"),
-        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {t.connections} connections, light ratio "
+        ("noise floor", f"{contents.evaluation.noise_floor:.4g}, of held-out targets, squared exposed radiance"),
+        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {counted(t.connections, 'connection')}, light ratio "
                       f"{t.light_ratio:g}"),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
@@ -107,23 +107,22 @@ def _versions(versions: dict[str, list[str]]) -> str:
 def _paper(contents: Contents) -> Table:
     """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; published figures beside ours, where there are."""
     beside = contents.published is not None
-    columns = (
-        "time per frame, ms",
-        f"× {contents.measure.name}",
-        "MSE (95 %)",
-        "MSSIM (95 %)",
-        "FID",
-        "Feature L1 (95 %)",
-    )
+    columns = ["time per frame, ms", f"× {contents.measure.name}"]
+    if _has_references(contents):
+        columns += ["MSE (95 %)", "MSSIM (95 %)", "FID", "Feature L1 (95 %)"]
     head = ["architecture"]
     for column in columns:
         head.append(column)
         if beside and column != columns[0]:
             head.append("paper")
-    rows = tuple(_paper_row(contents, entry, beside=beside) for entry in contents.entries)
+    rows = [_paper_row(contents, entry, beside=beside) for entry in contents.entries]
     named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
-    said = [_of_time(contents), *notes(contents.evaluation), *([_of_paper(contents)] if beside else [])]
-    return Table(named, tuple(head), rows, tuple(said))
+    said = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
+    return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(said))
+
+
+def _has_references(contents: Contents) -> bool:
+    return any(entry.row.metrics is not None for entry in contents.entries)
 
 
 def _of_time(contents: Contents) -> str:
@@ -194,19 +193,18 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 
 def _further(contents: Contents) -> Table:
     """What the paper does not have, and its Fig. 5 in numbers."""
-    shown = [m for m in measures() if m.name.startswith(("feature", "flip"))]
+    shown = [m for m in measures() if m.name.startswith(("feature", "flip"))] if _has_references(contents) else []
     first = contents.evaluation.rows[0]
     rows = []
     for entry in contents.entries:
-        behind = None if entry.row is first else entry.row.behind(first)
-        linear = with_interval(entry.row.held_out.error, 5)
+        behind = "–" if entry.row is first else with_interval(entry.row.behind(first), 5)
         values = (m.of(entry) for m in shown)
-        cells = [NOT_AVAILABLE if value is None else f"{value:.4f}" for value in values]
-        kid = with_interval(None if entry.row.metrics is None else entry.row.metrics.kid, 4)
-        rows.append((entry.name, linear, "" if behind is None else with_interval(behind, 5), *cells, kid))
-    titles = (*(m.title for m in shown), "KID (95 %)")
+        cells = [NOT_AVAILABLE if value is None else f"{value.mean:.4f}" for value in values]
+        kid = [with_interval(None if entry.row.metrics is None else entry.row.metrics.kid, 4)] if shown else []
+        rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
+    titles = (*(m.title for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
-    said = []
+    said = [notes(contents.evaluation)[0]]
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
         said.append(
             f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
@@ -222,7 +220,7 @@ def _frame_parts(contents: Contents) -> list[Table]:
     rows = tuple(
         (
             entry.name,
-            *(_ms(part) if part else "" for part in entry.time.parts.values()),
+            *(_ms(part) if part else "–" for part in entry.time.parts.values()),
             f"{1e3 * entry.time.total:.1f}",
         )
         for entry in contents.entries

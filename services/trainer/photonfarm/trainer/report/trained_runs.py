@@ -24,6 +24,7 @@ class Point:
     used: int  # that had been drawn at least once
     train_s: float  # wall seconds of steps
     error: float  # on held-out samples, noise removed
+    held_out: int  # these samples
 
     def core_s(self, per_sample: float) -> float:
         """Of rendering the samples that had been used by then, where each took `per_sample`."""
@@ -49,7 +50,7 @@ class RunStory:
         points = (
             Point(
                 r["step"], r["draws"], r["samples"], min(r["draws"], int(training[min(r["samples"], len(arrived))])),
-                r["seconds"]["train"], r["error"],
+                r["seconds"]["train"], r["error"], r["held_out"],
             )
             for r in records
             if r["kind"] == "validation"

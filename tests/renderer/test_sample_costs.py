@@ -71,7 +71,7 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     applied: list[Modification] = []
     rendered: list[tuple[Any, ...]] = []
     monkeypatch.setattr(room, "base", lambda: (None, cloud))
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(process_time=lambda: clock[0]))
+    monkeypatch.setattr(measuring, "time", SimpleNamespace(process_time=lambda: clock[0], monotonic=lambda: clock[0]))
     monkeypatch.setattr(room, "apply", configured)
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
@@ -84,7 +84,8 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
         return halves
 
     monkeypatch.setattr(room, "render_halves", takes(lambda _, __, spp: 7 + 2 * spp * 0.5, render))
-    costs = sample_costs(room, 3)  # of which one takes a hundred times as long
+    told: list[str] = []
+    costs = sample_costs(room, 3, told.append)  # of which one takes a hundred times as long
     assert costs.configuration_s == pytest.approx(100)
     assert costs.view_s == pytest.approx(10 + 4096 + 8192)
     assert costs.pass_s == pytest.approx(7)
@@ -95,6 +96,8 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     assert [spp for *_, spp in rendered] == [2, 8] * (WARM_UPS + 3)
     seeds = [seed for _, one, other, _ in rendered for seed in (one, other)]
     assert len(set(seeds)) == len(seeds)
+    views = WARM_UPS + 3
+    assert told == [f"{n} of {views} views, of which the first {WARM_UPS} do not count" for n in range(1, views + 1)]
 
 
 def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:

@@ -266,6 +266,8 @@ def test_what_cannot_be_compared_is_refused(
         compare(store, [run], [("none", 300)])
     with pytest.raises(SpecError, match="cannot be used here"):
         compare(store, [run], device="cuda:99")
+    with pytest.raises(SpecError, match="empty: there is no such folder"):
+        compare(store, [run], references=tmp_path / "empty")
     (tmp_path / "empty").mkdir()
     with pytest.raises(SpecError, match="holds no reference of the"):
         compare(store, [run], references=tmp_path / "empty")

@@ -77,6 +77,8 @@ def test_a_trainer_that_is_refused_leaves_the_sign_of_life_of_the_one_at_work(ru
 
 
 def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
+    with pytest.raises(SpecError, match=rf"{run}: there is no such folder$"):
+        read_settings(run)
     run.mkdir()
     with pytest.raises(
         SpecError,

@@ -211,7 +211,11 @@ def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool)
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
 def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
-    """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are."""
+    """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are.
+
+    Half a minute for a small room, minutes for a large one. `configuration` is taken by each configuration, `view` by
+    each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
+    """
     from photonfarm.renderer import backend
     from photonfarm.shared.scene import find_spec, load_spec
 

@@ -43,6 +43,9 @@ MOST_PATHS = 1 << 21
 """Eye paths of a half of the larger pass, unless one sample of each pixel needs more: those of clean images would
 take minutes, and beyond a launch of the integrator time is proportional to samples anyway."""
 
+TALK_SECONDS = 10.0
+"""How far apart it is told at least how far the measurement is."""
+
 Result = TypeVar("Result")
 Talk = Callable[[str], None]
 """Takes a line on what is going on."""
@@ -68,7 +71,7 @@ def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again:
     if not again and (kept := _kept(file)) is not None:
         return kept
     talk(f"measuring what samples of {spec.name} cost here, in {frames} views")
-    costs = measured_costs(spec, beside, frames)
+    costs = measured_costs(spec, beside, frames, talk)
     try:
         cache.write_whole(file, costs.json())
     except OSError as error:
@@ -83,16 +86,24 @@ def _kept(file: Path) -> SampleCosts | None:
         return None
 
 
-def measured_costs(spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES) -> SampleCosts:
+def measured_costs(
+    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, talk: Talk | None = None
+) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
-    return sample_costs(LoadedScene.load(spec, beside), frames)
+    return sample_costs(LoadedScene.load(spec, beside), frames, talk)
 
 
-def sample_costs(scene: LoadedScene, frames: int) -> SampleCosts:
+def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> SampleCosts:
     """Medians over the views of so many random configurations, one of each, after some that do not count."""
     cloud = scene.base()[1]
-    measured = [_measured(scene, cloud, number) for number in range(WARM_UPS + frames)][WARM_UPS:]
+    measured, told = [], time.monotonic()
+    for number in range(WARM_UPS + frames):
+        measured.append(_measured(scene, cloud, number))
+        if talk is not None and time.monotonic() - told > TALK_SECONDS:
+            talk(f"{number + 1} of {WARM_UPS + frames} views, of which the first {WARM_UPS} do not count")
+            told = time.monotonic()
+    measured = measured[WARM_UPS:]
     noise = [frame.noise for frame in measured if frame.noise is not None]
     return SampleCosts(
         scene.spec.scene_id,

@@ -104,7 +104,9 @@ class Samples:
 
 
 def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
-    """The references there are, by the first row that shows their view; raises SpecError for one of another size."""
+    """The references there are, by the first row that shows their view; raises SpecError where none can be used."""
+    if not folder.is_dir():
+        raise SpecError(f"{folder}: there is no such folder")
     spec = samples.source.spec
     film = spec.film
     found: dict[int, Reference] = {}

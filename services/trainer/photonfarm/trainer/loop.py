@@ -262,7 +262,8 @@ class Session:
         rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._following.growth.rows)} samples planned"
         if not self._following.held_out:
             raise SpecError(
-                f"{rule} none is held out, and one is needed to validate on; raise it, or plan more configurations"
+                f"{rule} none is held out, and one is needed to validate on; raise it (--hold-out), or plan more "
+                "configurations"
             )
         if not self._following.training_rows:
             raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
@@ -336,6 +337,8 @@ def read_settings(run: Path) -> TrainSettings:
         document = json.loads(path.read_text())
         settings = TrainSettings.model_validate(document)
     except FileNotFoundError as error:
+        if not run.is_dir():
+            raise SpecError(f"{run}: there is no such folder") from error
         raise SpecError(
             f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
         ) from error

@@ -17,21 +17,40 @@ from photonfarm.shared.estimate import Estimate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Room:
-    """An experiment and its report.json."""
+    """An experiment and what tables.json keeps of its report."""
 
     experiment: Experiment
-    report: dict[str, Any]
+    document: dict[str, Any]
 
     @classmethod
     def read(cls, experiment: Experiment, file: Path) -> Self:
-        """The report in a file; raises IncompleteError for one of an earlier version."""
+        """From its report.json; raises IncompleteError for one of an earlier version."""
         report = json.loads(file.read_text(encoding="utf-8"))
         if "machine" not in report:
             raise IncompleteError(
                 f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
                 f"`python experiments/run.py {experiment.name}` makes it anew"
             )
-        return cls(experiment, report)
+        return cls.of(experiment, report)
+
+    @classmethod
+    def of(cls, experiment: Experiment, report: Mapping[str, Any]) -> Self:
+        """With what is kept of a report."""
+        evaluation = report["evaluation"]
+        of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
+        of_run = ("architecture", "settings", "parameters", "steps", "trained_on", "seconds")
+        document = {
+            "title": experiment.title,
+            "about": experiment.about.strip(),
+            "size": experiment.size.about,
+            "machine": report["machine"],
+            "dataset": report["dataset"],
+            "evaluation": {key: evaluation[key] for key in of_all},
+            "edit_seconds": report["edit_seconds"],
+            "runs": {run["name"]: {key: run[key] for key in of_run} for run in report["runs"]},
+            "rows": {row["name"]: _compact(row) for row in evaluation["rows"]},
+        }
+        return cls(experiment, document)
 
     @property
     def name(self) -> str:
@@ -41,12 +60,12 @@ class Room:
     @property
     def rows(self) -> dict[str, dict[str, Any]]:
         """Those of its evaluation, by name."""
-        return {row["name"]: row for row in self.report["evaluation"]["rows"]}
+        return self.document["rows"]  # type: ignore[no-any-return]
 
     @property
     def film(self) -> tuple[int, int]:
         """Width and height of its images."""
-        card = self.report["dataset"]
+        card = self.document["dataset"]
         return card["width"], card["height"]
 
     @property
@@ -58,23 +77,23 @@ class Room:
     @property
     def device(self) -> str:
         """What its networks ran on, as torch names it."""
-        return str(self.report["evaluation"]["device"])
+        return str(self.document["evaluation"]["device"])
 
     def machine(self) -> str:
         """What it was timed on."""
-        found = self.report["machine"]
+        found = self.document["machine"]
         return f"{found['cpu'] or 'a CPU of unknown model'}, {found['cores']} cores, {found['architecture']}"
 
     def spent(self, kind: str) -> dict[str, Any]:
         """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""
-        found: dict[str, Any] = self.report["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
+        found: dict[str, Any] = self.document["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
         return found
 
     def steps(self, *, denoisers: bool) -> str:
         """How long its networks were trained, or its denoisers, by their settings; empty where it has none."""
         told = [
             f"{run['settings']['max_steps']} steps of {run['settings']['batch']}"
-            for run in self.report["runs"]
+            for run in self.document["runs"].values()
             if run["architecture"].startswith("denoise") == denoisers
         ]
         return " or ".join(dict.fromkeys(told))
@@ -92,40 +111,23 @@ class Room:
         independent.
         """
         pair = [self.rows.get(name) for name in (first, second)]
-        found = [row["metric_space"]["mse"] for row in pair if row is not None and row["metric_space"] is not None]
+        found = [row for row in pair if row is not None and "mse" in row]
         if len(found) < len(pair):
             return None
-        count, views = found[0]["estimate"]["count"], len(found[0]["values"])
+        count, views = found[0]["mse"]["count"], len(found[0]["mse_of_images"])
         if count != views:
             raise SpecError(
                 f"{self.name}: its {views} views are of {count} configurations; gaps are taken in pairs of views, "
                 "which are independent only where each configuration has one: set views = 1"
             )
-        values = [np.array(mse["values"]) for mse in found]
-        return Estimate.of(values[0] - values[1]), found[0]["estimate"]["mean"]
-
-    def document(self) -> dict[str, Any]:
-        """What tables.json keeps of it."""
-        evaluation = self.report["evaluation"]
-        of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
-        of_run = ("parameters", "steps", "trained_on", "seconds")
-        return {
-            "title": self.experiment.title,
-            "about": self.experiment.about.strip(),
-            "dataset": self.report["dataset"],
-            "evaluation": {key: evaluation[key] for key in of_all},
-            "edit_seconds": self.report["edit_seconds"],
-            "runs": {run["name"]: {key: run[key] for key in of_run} for run in self.report["runs"]},
-            "rows": {name: _compact(row) for name, row in self.rows.items()},
-        }
+        values = [np.array(row["mse_of_images"]) for row in found]
+        return Estimate.of(values[0] - values[1]), found[0]["mse"]["mean"]
 
 
-def estimate(row: Mapping[str, Any], metric: str, block: int | None = None) -> Estimate | None:
+def estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
     """Mean and standard error of a metric that each image has; None where it could not be computed."""
-    found = (row["metric_space"] or {}).get(metric)
-    if found is None:
-        return None
-    return Estimate(**(found if block is None else found[block])["estimate"])
+    found = row.get(metric)
+    return None if found is None else Estimate(**found)
 
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,14 +3,16 @@
 
     python experiments/tables.py [--size small] [--work build/experiments] [--out docs/results]
 
-Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json. What
-was found out beyond the figures stands in experiments/findings.md, which becomes the page's last part. Exit code 0,
+Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json. Rooms
+that the tables.json in OUT has of this size, and that have no report here, stay: they may have run elsewhere. What was
+found out beyond the figures stands in experiments/findings.md, which becomes the page's last part. Exit code 0,
 3 where a report's views are not independent, or 7 where no report is there or one is of an earlier version.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +37,8 @@ sys.path.insert(0, str(ROOT / "bench"))
 import results  # noqa: E402
 
 T = TypeVar("T")
+
+NAME = "tables"
 
 KINDS: Mapping[str, tuple[str, Table]] = {
     "movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS),
@@ -96,8 +100,8 @@ def _ours(rooms: Sequence[Room], name: str) -> list[str]:
         values = each(of)
         return NOT_AVAILABLE if values is None else f"{np.mean(values):.{digits}f}"
 
-    def interval(metric: str, digits: int, block: int | None = None) -> str:
-        values = each(lambda row: estimate(row, metric, block))
+    def interval(metric: str, digits: int) -> str:
+        values = each(lambda row: estimate(row, metric))
         return with_interval(None if values is None else mean(values), digits)
 
     network = averaged(lambda row: 1e3 * row["network_seconds"], 1)
@@ -109,13 +113,13 @@ def _ours(rooms: Sequence[Room], name: str) -> list[str]:
     return [
         total, f"{network} ({low} … {high})", ratio, interval("mse", 5), interval("mssim", 3),
         averaged(lambda row: _of_set(row, "fid", "value"), 1), averaged(lambda row: _of_set(row, "kid", "mean"), 4),
-        interval("feature_l1", 3, HEADLINE_BLOCK),
+        interval(f"feature_l1_{HEADLINE_BLOCK}", 3),
     ]  # fmt: skip
 
 
 def _of_set(row: Mapping[str, Any], metric: str, key: str) -> float | None:
     """A metric of a set of images, by the key of its value; None where it could not be computed."""
-    found = (row["metric_space"] or {}).get(metric)
+    found = row.get(metric)
     return None if found is None else found[key]
 
 
@@ -182,13 +186,13 @@ def room_table(rooms: Sequence[Room]) -> str:
 
 
 def _room_line(room: Room) -> list[str]:
-    card, evaluation = room.report["dataset"], room.report["evaluation"]
-    trained_on = sorted({run["trained_on"] for run in room.report["runs"]})
+    card, evaluation = room.document["dataset"], room.document["evaluation"]
+    trained_on = sorted({run["trained_on"] for run in room.document["runs"].values()})
     images, passes = room.spent("samples"), room.spent("top-up")
     references, owed = evaluation["references"], card["credits"]
-    edit, load = room.report["edit_seconds"], room.report["machine"]["load_average"]
+    edit, load = room.document["edit_seconds"], room.document["machine"]["load_average"]
     return [
-        room.name, room.experiment.title, " or ".join(map(str, trained_on)),
+        room.name, room.document["title"], " or ".join(map(str, trained_on)),
         " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)), f"{images['core_seconds']:.0f}",
         f"{passes['rows']}", f"{passes['core_seconds']:.0f}", f"{card['spp_per_sample']}",
         f"{references['views']} views, {references['spp']} spp" if references else NOT_AVAILABLE,
@@ -253,7 +257,7 @@ def introduction(found: Sequence[Room], size: SizeName) -> str:
         if (having := [room for room in found if steps(room)])
     ]
     return (
-        f"The size `{size}`: {said(found, lambda room: room.experiment.size.about)}. {_resolution(found)} Each row "
+        f"The size `{size}`: {said(found, lambda room: str(room.document['size']))}. {_resolution(found)} Each row "
         "of a room is one network (or denoiser), trained from one seed on that room's images alone: "
         f"{', '.join(trained)}. Denoisers see 1/k of the pixels of one noisy half-estimate."
     )
@@ -297,24 +301,38 @@ def options() -> argparse.ArgumentParser:
     return parser
 
 
+def rooms_of(work: Path, size: SizeName, kept: Path) -> list[Room]:
+    """Those that have a report here, and those that an earlier page has. Raises IncompleteError where none is."""
+    earlier = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+    documents = earlier["rooms"] if earlier.get("size") == size else {}
+    found = []
+    for name in names():
+        experiment, report = Experiment.load(name, size), work / name / "report/report.json"
+        if report.is_file():
+            found.append(Room.read(experiment, report))
+        elif name in documents:
+            found.append(Room(experiment, documents[name]))
+    if not found:
+        raise IncompleteError(f"{work}: holds no report; `make experiments-{size}` makes them")
+    return found
+
+
 def main() -> int:
     """Write the page; returns the exit code."""
     told = options().parse_args()
     try:
-        files = {name: told.work / told.size / name / "report/report.json" for name in names()}
-        found = [Room.read(Experiment.load(name, told.size), file) for name, file in files.items() if file.is_file()]
-        if not found:
-            raise IncompleteError(
-                f"{told.work / told.size}: holds no report; `make experiments-{told.size}` makes them"
-            )
+        found = rooms_of(told.work / told.size, told.size, told.out / f"{NAME}.json")
         text = page(found, told.size)
     except PhotonfarmError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
-    rooms = {room.name: room.document() for room in found}
-    machines = {room.name: room.report["machine"] for room in found}  # each report's, and not where this runs
-    told_of = {"command": command(told.size), "machine": machines, "size": told.size, "rooms": rooms}
-    results.write("tables", text, told_of, told.out)
+    told_of = {
+        "command": command(told.size),
+        "machine": "each room's own",  # and not the one that this runs on
+        "size": told.size,
+        "rooms": {room.name: room.document for room in found},
+    }
+    results.write(NAME, text, told_of, told.out)
     return 0
 
 

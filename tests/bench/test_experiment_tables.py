@@ -70,7 +70,7 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
 
 
 def room(name: str, document: dict[str, Any] | None = None) -> Room:
-    return Room(Experiment.load(name, "small"), document or report())
+    return Room.of(Experiment.load(name, "small"), document or report())
 
 
 def cells(page: str, first: str) -> list[str]:
@@ -158,7 +158,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
     assert cells(page, "feature_projection")[1] == "n/a"
     assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
     assert "Timed on a CPU of unknown model, 2 cores" in page
-    json.dumps(found.document())
+    json.dumps(found.document)
 
 
 def test_gaps_of_views_that_share_a_configuration_are_refused() -> None:
@@ -188,6 +188,29 @@ def test_tables_are_written_with_the_command_and_each_report_s_machine(
     assert tables.main() == 0
     document = json.loads((tmp_path / "out" / "tables.json").read_text())
     assert document["command"] == "python experiments/tables.py --size small"
-    assert document["machine"] == {"movable-living-room": MACHINE}
+    assert document["rooms"]["movable-living-room"]["machine"] == MACHINE
     assert document["rooms"]["movable-living-room"]["runs"]["cnn"]["trained_on"] == 769
     assert str(tmp_path) not in (tmp_path / "out" / "tables.md").read_text()
+
+
+def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(place: str, name: str, size: str = "small", **values: Any) -> dict[str, Any]:
+        file = tmp_path / place / size / name / "report" / "report.json"
+        file.parent.mkdir(parents=True)
+        file.write_text(json.dumps(report(**values)))
+        arguments = ["--size", size, "--work", str(tmp_path / place), "--out", str(tmp_path / "out")]
+        monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
+        assert tables.main() == 0
+        return json.loads((tmp_path / "out" / "tables.json").read_text())["rooms"]
+
+    first = made("here", "fixed-living-room")
+    page = (tmp_path / "out" / "tables.md").read_text()
+    second = made("elsewhere", "movable-living-room")
+    assert list(second) == ["fixed-living-room", "movable-living-room"]
+    assert second["fixed-living-room"] == first["fixed-living-room"]
+    part = page[page.index("## Table 1") : page.index("## What agrees")]
+    assert part in (tmp_path / "out" / "tables.md").read_text()
+    assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
+    assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size

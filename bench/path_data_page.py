@@ -108,15 +108,23 @@ def described(bias: Bias) -> str:
     return f"{bias.ratio:.4f} ± {bias.standard_error:.4f} (z = {bias.z:+.1f})"
 
 
+def known(found: Found) -> str:
+    """Whether a factor is told apart from 1."""
+    return ", which is not told apart from once" if found.low <= 1 <= found.high else ""
+
+
 def verdict(study: Study, targets: Targets) -> str:
-    """What came out, in two sentences."""
+    """What came out, and how much there was to be had."""
     found, samples = study.factor("shown")[0], study.of("bdpt")[-1].arm.samples
+    first, last = next(one for one in study.of("path") if one.arm.samples == samples), study.of("path")[-1]
+    change = last.shown.values.mean() / first.shown.values.mean() - 1
     linear, relative = (study.noise(targets, relative=relative)[2] for relative in (False, True))
     return (
         f"For the held-out error of networks trained on {samples} samples of `bdpt`, data of `path` must be given "
-        f"{with_interval(found, study.budgets)} times the core-seconds, by MSE. The variance of noise alone, at "
-        f"equal core-seconds, predicts {in_interval(linear)} in exposed linear radiance, and {in_interval(relative)} "
-        "relative to brightness."
+        f"{with_interval(found, study.budgets)} times the core-seconds, by MSE{known(found)}. "
+        f"{last.arm.samples / samples:g} times the samples of `path` change its own error by {change:+.0%}. "
+        "The variance of noise alone, at equal core-seconds, predicts "
+        f"{in_interval(linear)} in exposed linear radiance, and {in_interval(relative)} relative to brightness."
     )
 
 

@@ -49,6 +49,12 @@ def test_what_lies_beyond_the_arms_is_no_number() -> None:
     assert path_data_page.with_interval(Found(1.5, 0.0, math.inf), ARMS) == "1.50 (less than 0.25 … more than 4.00)"
 
 
+def test_a_factor_is_told_apart_from_1_where_its_interval_leaves_it_out() -> None:
+    assert path_data_page.known(Found(5.0, 0.9, math.inf)) == ", which is not told apart from once"
+    assert not path_data_page.known(Found(5.0, 1.1, math.inf))
+    assert not path_data_page.known(Found(0.5, 0.2, 0.8))
+
+
 def test_of_errors_that_rise_again_the_first_crossing_counts() -> None:
     assert crossing(ARMS, [0.5, 0.3, 0.4, 0.1, 0.2], 0.35) == pytest.approx(0.25 * 2**0.75)
 

@@ -105,17 +105,18 @@ def seed_spread(arms: Sequence[Errors]) -> float:
     return math.sqrt(sum(float(np.sum(one**2)) for one in apart) / (len(arms) * (seeds - 1)))
 
 
-def replicates(arms: Sequence[Errors], count: int = REPLICATES, seed: int = 0) -> F64:
+def replicates(arms: Sequence[Errors], count: int = REPLICATES, seed: int = 0, *, spread: float | None = None) -> F64:
     """Mean errors of each arm as other configurations and seeds might have given them, (R, A).
 
     Configurations are drawn with replacement, the same for all arms. Two seeds are too few to draw from: each arm's
-    mean is moved by a normal deviate instead, of `seed_spread` / √S.
+    mean is moved by a normal deviate instead, of `spread` / √S: `seed_spread` of these arms unless another is given.
     """
     rng = np.random.default_rng(seed)
     of_units = np.stack([group_means(arm.of_views(), arm.units) for arm in arms])
     units = of_units.shape[1]
     means = rng.multinomial(units, np.full(units, 1 / units), size=count) @ of_units.T / units
-    moved: F64 = means * (1 + seed_spread(arms) / math.sqrt(len(arms[0].values)) * rng.normal(size=means.shape))
+    spread = seed_spread(arms) if spread is None else spread
+    moved: F64 = means * (1 + spread / math.sqrt(len(arms[0].values)) * rng.normal(size=means.shape))
     return moved
 
 

@@ -13,7 +13,7 @@ import path_statistics
 import results
 import room_study
 from mosaic import Column, mosaic
-from network_errors import each_seed, of_intervals, stated
+from network_errors import Errors, each_seed, of_intervals, stated
 from path_data_study import BLOCK, METRICS, Study, Targets
 from path_statistics import Bias, Found
 from photonfarm.trainer.losses import RELATIVE_EPSILON
@@ -76,18 +76,27 @@ def pairs_table(study: Study) -> str:
 def factors_table(study: Study, targets: Targets) -> str:
     lines = []
     for name, metric in METRICS.items():
-        found, by_seed = study.factor(metric)
+        (found, by_seed), (later, _) = study.factor(metric), study.factor(metric, 1)
         seeds = " · ".join(in_words(one, study.budgets) for one in by_seed)
-        lines.append([f"error of networks: {name}", with_interval(found, study.budgets), seeds])
+        intervals = [
+            f"{in_words(one.low, study.budgets)} … {in_words(one.high, study.budgets)} "
+            f"({study.spread(metric, least):.1%})"
+            for one, least in ((found, 0), (later, 1))
+        ]
+        lines.append([f"error of networks: {name}", in_words(found.value, study.budgets), *intervals, seeds])
     for name, relative in (("noise of targets: variance", False), ("the same, relative to brightness", True)):
         found = study.noise(targets, relative=relative)[2]
-        lines.append([name, in_interval(found), ""])
-    return results.table(("by", "factor of core-seconds (95 %)", "of each seed"), lines)
+        lines.append([name, f"{found.value:.2f}", f"{found.low:.2f} … {found.high:.2f}", "", ""])
+    header = (
+        "by", "factor of core-seconds", "95 % (spread by seeds, all arms)", "95 % (spread by seeds, arms from × 1)",
+        "of each seed",
+    )  # fmt: skip
+    return results.table(header, lines)
 
 
 def costs_table(study: Study, targets: Targets) -> str:
     header = (
-        "data", "spp of a half", "core-seconds of both halves", "of a sample with all that goes with it",
+        "data", "spp of a half", "core-seconds of both halves", "of a sample with all that goes with it, by the stores",
         "noise of a target", "relative noise of a target",
     )  # fmt: skip
     costs = study.costs
@@ -108,24 +117,28 @@ def described(bias: Bias) -> str:
     return f"{bias.ratio:.4f} ± {bias.standard_error:.4f} (z = {bias.z:+.1f})"
 
 
-def known(found: Found) -> str:
-    """Whether a factor is told apart from 1."""
-    return ", which is not told apart from once" if found.low <= 1 <= found.high else ""
-
-
 def verdict(study: Study, targets: Targets) -> str:
-    """What came out, and how much there was to be had."""
-    found, samples = study.factor("shown")[0], study.of("bdpt")[-1].arm.samples
-    first, last = next(one for one in study.of("path") if one.arm.samples == samples), study.of("path")[-1]
-    change = last.shown.values.mean() / first.shown.values.mean() - 1
+    """What came out: errors first, as a factor may hang on little of them."""
+    ours = study.of("bdpt")[-1]
+    theirs = [(one, budget) for one, budget in zip(study.of("path"), study.budgets, strict=True) if one.arm.share >= 1]
+    dearer = ", ".join(f"{budget:.2f}" for _, budget in theirs)
+    errors = ", ".join(f"{one.shown.estimate().mean:.5f}" for one, _ in theirs)
+    apart = [f"× {one.arm.share:g}" for one, _ in theirs if is_apart(one.shown.less(ours.shown))]
     linear, relative = (study.noise(targets, relative=relative)[2] for relative in (False, True))
     return (
-        f"For the held-out error of networks trained on {samples} samples of `bdpt`, data of `path` must be given "
-        f"{with_interval(found, study.budgets)} times the core-seconds, by MSE{known(found)}. "
-        f"{last.arm.samples / samples:g} times the samples of `path` change its own error by {change:+.0%}. "
-        "The variance of noise alone, at equal core-seconds, predicts "
-        f"{in_interval(linear)} in exposed linear radiance, and {in_interval(relative)} relative to brightness."
+        f"After {ours.arm.samples} samples of `bdpt` the held-out MSE is {ours.shown.estimate().mean:.5f}. After data "
+        f"of `path` of {dearer} times the core-seconds it is {errors}; told apart from that of `bdpt`: "
+        f"{' and '.join(apart) or 'none'}. By lines through these, `path` must be given "
+        f"{with_interval(study.factor('shown', 1)[0], study.budgets)} times the core-seconds for the error of `bdpt`. "
+        f"By the variance of noise alone it is {in_interval(relative)} times, relative to brightness, and "
+        f"{in_interval(linear)} times in exposed linear radiance, where what is brightest leads."
     )
+
+
+def is_apart(gap: Errors) -> bool:
+    """Whether the interval of a difference leaves out 0."""
+    low, high = gap.interval()
+    return low > 0 or high < 0
 
 
 # --------------------------------------------------------------------------------------------------------------- page
@@ -136,7 +149,7 @@ def page(study: Study, targets: Targets, picture: str) -> str:
     told, spec, references, settings = study.told, study.spec, study.references, study.settings
     all_light, alike = path_statistics.bias(targets.bdpt, targets.path)
     redrawn = " and ".join(f"{made.redrawn} of `{kind}`" for kind, made in study.made.items())
-    return f"""# Training data by `bdpt` and by `path`, at equal core-seconds
+    return f"""# Training data by `bdpt` and by `path`, against core-seconds
 
 {verdict(study, targets)}
 
@@ -144,7 +157,7 @@ The room of the experiment `{told.experiment}` at {spec.film.width}², connectio
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
 `rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
 each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
-images were seen to be too dark; a sample costs about as much, by times that were taken before. Budgets are told as
+images were seen to be too dark; a sample is meant to cost as much, by times that were taken before. Budgets are told as
 multiples of the samples of `bdpt`'s largest (“× samples”); core-seconds are those in the markers of the stores, medians
 over jobs, with editing, buffers, photons and visibility, and factors are of them. Both
 stores are of one spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s
@@ -171,7 +184,10 @@ the seeds share: with another draw values may lie outside.
 Core-seconds of both halves are means over views, of the times taken before; {study.costs.path_fixed_s:.3f} of those
 of `path` are its calls', whatever the samples. Launches of `bdpt` are recorded and replayed; those of `path` are not,
 as replayed they take longer. Were its calls for nothing, all factors would be {study.without_calls:.3f} times what
-they are. **Noise of a target**: standard deviation of (A + B)/2, from the
+they are. By the stores a sample of `path` costs {study.dearer:.2f} times one of `bdpt`; by the times taken before, with
+all else as in `bdpt`'s, {study.dearer_before:.2f} times. Why is not known; the farm's processes share caches and
+memory. By the latter, all factors would be {study.dearer_before / study.dearer:.2f} times what they are.
+**Noise of a target**: standard deviation of (A + B)/2, from the
 difference of A and B, root mean square over pixels of the held-out views, exposed linear radiance; **relative**, over
 √(I² + {RELATIVE_EPSILON:g}) of the references' brightness I, much as the loss weighs pixels. Renders that were not
 finite, and drawn again: {redrawn}.
@@ -187,21 +203,28 @@ At equal numbers of samples, one of `path` at {study.dearer:.3f} times the core-
 
 {pairs_table(study)}
 
+From {room_study.counted(len(told.seeds), "seed")} little is known of what seeds change: intervals of arms whose seeds
+differ are wide, and may pass 0. Small arms are where training is the least reliable; what follows is decided by those
+from × 1. Much of what is left there cannot be learned from what the network is given, as the pattern of Veach's floor,
+which is of metal and in no buffer ([training.md](../training.md)).
+
 ## By what factor the core-seconds of `path` must grow
 
 {factors_table(study, targets)}
 
 **Error of networks**: the budget of `path`, over that of `bdpt` at budget 1, at which its error comes down to that of
-`bdpt`, by lines through its arms over the logarithm of the budget. Intervals are a bootstrap's: configurations drawn
+`bdpt` first, by lines through its arms over the logarithm of the budget; where these are as flat as here, a difference
+within the noise of seeds moves it far. Intervals are a bootstrap's: configurations drawn
 with replacement, the same for all arms, and each arm's mean moved by a normal deviate of what seeds move it,
-pooled over arms. **Noise of targets**: the ratio of variances × that of core-seconds of a sample, over held-out
-configurations. The two need not agree: more samples of `path` are more configurations too, and not all of a network's
-error comes from noise.
+pooled over all arms or over those from × 1. **Noise of targets**: the ratio of variances × that of core-seconds of a
+sample, over held-out configurations. The two need not agree: more samples of `path` are more configurations too, and
+not all of a network's error comes from noise.
 
 ## Pictures
 
-From left to right: the reference; a target of `bdpt` and one of `path` of the same cost, both held-out too; what is
-predicted after `bdpt` at budget 1 and after `path` at each budget from 1, from seed {told.seeds[0]}, with the MSE.
+From left to right: the reference; a target of `bdpt` and one of `path` at {study.dearer:.2f} times the cost, both
+held-out too; what is predicted after `bdpt` at budget 1 and after `path` at each budget from 1, from seed
+{told.seeds[0]}, with the MSE.
 From top to bottom: the views at the quantiles {", ".join(f"{q:g}" for q in SHOWN)} of the error with `bdpt`.
 
 ![the reference, targets of both kinds and predictions of {len(SHOWN)} held-out views]({picture})
@@ -245,6 +268,7 @@ def document(study: Study, targets: Targets) -> dict[str, Any]:
         "bias": {"all_light": asdict(all_light), "each_view_alike": asdict(alike), "views": len(targets.units)},
         "noise": {name: {"bdpt": a, "path": b, "ratio": asdict(found)} for name, (a, b, found) in noise.items()},
         "factors": {metric: in_json(*study.factor(metric)) for metric in METRICS.values()},
+        "factors_by_seeds_from_1": {metric: in_json(*study.factor(metric, 1)) for metric in METRICS.values()},
         "arms": arms,
     }
 

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 
 import path_statistics
-from network_errors import Errors
+from network_errors import Errors, seed_spread
 from path_scene import Costs, Rendered
 from path_statistics import Found
 from photonfarm.shared.keys import Key
@@ -80,11 +80,24 @@ class Study:
         """Core-seconds of the arms of `path`, over those of the last arm of `bdpt`."""
         return [self.core_s(one.arm) / self.core_s(self.of("bdpt")[-1].arm) for one in self.of("path")]
 
-    def factor(self, metric: str) -> tuple[Found, list[float]]:
-        """By what `path` must grow for the error of `bdpt` at budget 1: of all seeds, and of each."""
+    @property
+    def dearer_before(self) -> float:
+        """The same, by the times of halves that were taken before; all else as in `bdpt`'s samples."""
+        costs, bdpt_s = self.costs, self.made["bdpt"].core_s
+        return (bdpt_s + costs.path_fixed_s + costs.path_spp * costs.path_spp_s - costs.bdpt_s) / bdpt_s
+
+    def spread(self, metric: str, least: float = 0.0) -> float:
+        """What seeds move an arm's mean by, as a share of it, pooled over arms of `least` × samples and more."""
+        return seed_spread([getattr(one, metric) for one in self.measured if one.arm.share >= least])
+
+    def factor(self, metric: str, least: float = 0.0) -> tuple[Found, list[float]]:
+        """By what `path` must grow for the error of `bdpt` at budget 1: of all seeds, and of each.
+
+        The interval is by `spread` of these arms.
+        """
         wanted, found = getattr(self.of("bdpt")[-1], metric), [getattr(one, metric) for one in self.of("path")]
         by_seed = path_statistics.factors_of_seeds(wanted, found, self.budgets)
-        return path_statistics.factor(wanted, found, self.budgets), by_seed
+        return path_statistics.factor(wanted, found, self.budgets, self.spread(metric, least)), by_seed
 
     @property
     def without_calls(self) -> float:

@@ -42,10 +42,13 @@ def crossing(budgets: Sequence[float], errors: Sequence[float] | F64, wanted: fl
     return math.inf
 
 
-def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> Found:
-    """The budget at which arms come down to the errors that are wanted, with its bootstrap interval."""
+def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float], spread: float) -> Found:
+    """The budget at which arms come down to the errors that are wanted, with its bootstrap interval.
+
+    `spread` is what seeds move an arm's mean by, as `replicates` has it.
+    """
     value = crossing(budgets, [arm.estimate().mean for arm in arms], wanted.estimate().mean)
-    found = [crossing(budgets, one[1:], one[0]) for one in replicates([wanted, *arms])]
+    found = [crossing(budgets, one[1:], one[0]) for one in replicates([wanted, *arms], spread=spread)]
     return Found(value, *within(np.array(found)))
 
 

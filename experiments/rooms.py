@@ -23,31 +23,48 @@ class Room:
     document: dict[str, Any]
 
     @classmethod
-    def read(cls, experiment: Experiment, file: Path) -> Self:
-        """From its report.json; raises IncompleteError for one of an earlier version."""
+    def read(cls, experiment: Experiment, file: Path, commit: str) -> Self:
+        """From its report.json, found at a commit; raises IncompleteError for one of an earlier version."""
         report = json.loads(file.read_text(encoding="utf-8"))
         if "machine" not in report:
             raise IncompleteError(
                 f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
                 f"`python experiments/run.py {experiment.name}` makes it anew"
             )
-        return cls.of(experiment, report)
+        return cls.of(experiment, report, commit)
 
     @classmethod
-    def of(cls, experiment: Experiment, report: Mapping[str, Any]) -> Self:
-        """With what is kept of a report."""
+    def kept(cls, experiment: Experiment, document: dict[str, Any], file: Path) -> Self:
+        """From what a tables.json has kept; raises IncompleteError for what an earlier version kept."""
+        runs = document.get("runs", {}).values()
+        if not {"size", "machine", "commit"} <= document.keys() or not all("settings" in run for run in runs):
+            raise IncompleteError(
+                f"{file}: an earlier version kept {experiment.name}; delete that entry, and `python experiments/run.py "
+                f"{experiment.name}` makes its report anew"
+            )
+        return cls(experiment, document)
+
+    @classmethod
+    def of(cls, experiment: Experiment, report: Mapping[str, Any], commit: str) -> Self:
+        """With what is kept of a report, and the commit that it is of."""
         evaluation = report["evaluation"]
         of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
-        of_run = ("architecture", "settings", "parameters", "steps", "trained_on", "seconds")
+        of_run = ("architecture", "parameters", "steps", "trained_on", "seconds")
+        settings = ("max_steps", "batch")
         document = {
             "title": experiment.title,
             "about": experiment.about.strip(),
             "size": experiment.size.about,
+            "commit": commit,
             "machine": report["machine"],
             "dataset": report["dataset"],
             "evaluation": {key: evaluation[key] for key in of_all},
             "edit_seconds": report["edit_seconds"],
-            "runs": {run["name"]: {key: run[key] for key in of_run} for run in report["runs"]},
+            "runs": {
+                run["name"]: {key: run[key] for key in of_run}
+                | {"settings": {key: run["settings"][key] for key in settings}}
+                for run in report["runs"]
+            },
             "rows": {row["name"]: _compact(row) for row in evaluation["rows"]},
         }
         return cls(experiment, document)

@@ -3,10 +3,12 @@
 
     python experiments/tables.py [--size small] [--work build/experiments] [--out docs/results]
 
-Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json. Rooms
-that the tables.json in OUT has of this size, and that have no report here, stay: they may have run elsewhere. What was
-found out beyond the figures stands in experiments/findings.md, which becomes the page's last part. Exit code 0,
-3 where a report's views are not independent, or 7 where no report is there or one is of an earlier version.
+Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json, for the
+paper's size tables-paper.md and tables-paper.json. Rooms that the JSON in OUT has, and that have no report here, stay,
+and are said on stderr: they may have run elsewhere. Delete a room's entry, and it goes. What was found out beyond the
+figures stands in experiments/findings.md, which becomes the last part of the page of the small size. Exit code 0, 3
+where a report's views are not independent, or 7 where there is neither a report nor a room that stays, or one of
+either is of an earlier version.
 """
 
 from __future__ import annotations
@@ -37,8 +39,6 @@ sys.path.insert(0, str(ROOT / "bench"))
 import results  # noqa: E402
 
 T = TypeVar("T")
-
-NAME = "tables"
 
 KINDS: Mapping[str, tuple[str, Table]] = {
     "movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS),
@@ -227,11 +227,12 @@ def page(found: Sequence[Room], size: SizeName) -> str:
             parts.append(f"{order}\n\n{order_table(rooms, published)}")
             parts.append(f"### The rooms\n\n{room_table(rooms)}")
     findings = HERE / "findings.md"
-    if findings.is_file():
+    if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
     parts.append(
         f"Timed on {said(found, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
-        f"`{command(size)}`, run at commit {results.commit()}."
+        f"`{command(size)}`. Taken from their reports at commit "
+        f"{said(found, lambda room: str(room.document['commit']))}."
     )
     return "\n\n".join(parts)
 
@@ -239,6 +240,11 @@ def page(found: Sequence[Room], size: SizeName) -> str:
 def kind_of(name: str) -> str:
     """Which part of the page an experiment is in."""
     return next(kind for kind in KINDS if name.startswith(kind))
+
+
+def page_of(size: SizeName) -> str:
+    """The name of a size's page."""
+    return "tables" if size == "small" else f"tables-{size}"
 
 
 def command(size: SizeName) -> str:
@@ -301,17 +307,23 @@ def options() -> argparse.ArgumentParser:
     return parser
 
 
-def rooms_of(work: Path, size: SizeName, kept: Path) -> list[Room]:
-    """Those that have a report here, and those that an earlier page has. Raises IncompleteError where none is."""
-    earlier = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
-    documents = earlier["rooms"] if earlier.get("size") == size else {}
+def rooms_of(work: Path, size: SizeName, earlier: Path) -> list[Room]:
+    """Those that have a report here, and those that an earlier page has.
+
+    Raises IncompleteError where none is, and for what an earlier version has left.
+    """
+    try:
+        documents = json.loads(earlier.read_text(encoding="utf-8"))["rooms"] if earlier.is_file() else {}
+    except (ValueError, KeyError, TypeError) as error:
+        raise IncompleteError(f"{earlier}: holds no rooms ({error!r}); move it away, and it is made anew") from error
     found = []
     for name in names():
         experiment, report = Experiment.load(name, size), work / name / "report/report.json"
         if report.is_file():
-            found.append(Room.read(experiment, report))
+            found.append(Room.read(experiment, report, results.commit()))
         elif name in documents:
-            found.append(Room(experiment, documents[name]))
+            found.append(Room.kept(experiment, documents[name], earlier))
+            print(f"{name}: no report in {work}; its rows of {earlier} stay", file=sys.stderr)
     if not found:
         raise IncompleteError(f"{work}: holds no report; `make experiments-{size}` makes them")
     return found
@@ -321,7 +333,7 @@ def main() -> int:
     """Write the page; returns the exit code."""
     told = options().parse_args()
     try:
-        found = rooms_of(told.work / told.size, told.size, told.out / f"{NAME}.json")
+        found = rooms_of(told.work / told.size, told.size, told.out / f"{page_of(told.size)}.json")
         text = page(found, told.size)
     except PhotonfarmError as error:
         print(f"error: {error}", file=sys.stderr)
@@ -332,7 +344,7 @@ def main() -> int:
         "size": told.size,
         "rooms": {room.name: room.document for room in found},
     }
-    results.write(NAME, text, told_of, told.out)
+    results.write("tables", text, told_of, told.out, page_of(told.size))
     return 0
 
 

@@ -70,7 +70,7 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
 
 
 def room(name: str, document: dict[str, Any] | None = None) -> Room:
-    return Room.of(Experiment.load(name, "small"), document or report())
+    return Room.of(Experiment.load(name, "small"), document or report(), "1234567")
 
 
 def cells(page: str, first: str) -> list[str]:
@@ -173,7 +173,7 @@ def test_an_earlier_version_s_report_is_refused_with_what_makes_it_anew(tmp_path
     file = tmp_path / "report.json"
     file.write_text(json.dumps({key: value for key, value in report().items() if key != "machine"}))
     with pytest.raises(IncompleteError, match=r"experiments/run\.py movable-living-room` makes it anew"):
-        Room.read(Experiment.load("movable-living-room", "small"), file)
+        Room.read(Experiment.load("movable-living-room", "small"), file, "1234567")
 
 
 def test_tables_are_written_with_the_command_and_each_report_s_machine(
@@ -203,7 +203,7 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
         arguments = ["--size", size, "--work", str(tmp_path / place), "--out", str(tmp_path / "out")]
         monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
         assert tables.main() == 0
-        return json.loads((tmp_path / "out" / "tables.json").read_text())["rooms"]
+        return json.loads((tmp_path / "out" / f"{tables.page_of(size)}.json").read_text())["rooms"]
 
     first = made("here", "fixed-living-room")
     page = (tmp_path / "out" / "tables.md").read_text()
@@ -214,3 +214,13 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
     assert part in (tmp_path / "out" / "tables.md").read_text()
     assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
     assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size
+    file = tmp_path / "out" / "tables.json"
+    assert "fixed-living-room" in json.loads(file.read_text())["rooms"]  # which stays what it was
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+    assert tables.main() == 0
+    document = json.loads(file.read_text())
+    del document["rooms"]["fixed-living-room"]["machine"]
+    for damaged in (json.dumps(document), "{", "[]"):
+        file.write_text(damaged)
+        assert tables.main() == IncompleteError.exit_code
+        assert file.read_text() == damaged

@@ -44,7 +44,7 @@ MOST_PATHS = 1 << 21
 take minutes, and beyond a launch of the integrator time is proportional to samples anyway."""
 
 TALK_SECONDS = 10.0
-"""How far apart it is told at least how far the measurement is."""
+"""Least seconds between two lines of progress."""
 
 Result = TypeVar("Result")
 Talk = Callable[[str], None]
@@ -70,7 +70,7 @@ def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again:
     file = cache.file_of("costs", cache.digest_here("sample costs", spec.scene_id, str(frames)))
     if not again and (kept := _kept(file)) is not None:
         return kept
-    talk(f"measuring what samples of {spec.name} cost here, in {frames} views")
+    talk(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
     costs = measured_costs(spec, beside, frames, talk)
     try:
         cache.write_whole(file, costs.json())
@@ -101,7 +101,7 @@ def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> S
     for number in range(WARM_UPS + frames):
         measured.append(_measured(scene, cloud, number))
         if talk is not None and time.monotonic() - told > TALK_SECONDS:
-            talk(f"{number + 1} of {WARM_UPS + frames} views, of which the first {WARM_UPS} do not count")
+            talk(f"view {number + 1} of {WARM_UPS + frames}")
             told = time.monotonic()
     measured = measured[WARM_UPS:]
     noise = [frame.noise for frame in measured if frame.noise is not None]

@@ -130,11 +130,11 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert rows[0]["frame_seconds"]["render"] == 0
     assert [run["steps"] for run in report["runs"]] == [3, 3]
 
-    room = Room.read(tiny, out / "report.json")
+    room = Room.read(tiny, out / "report.json", "1234567")
     assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
     assert "| denoise_4 |" in paper_table([room], MOVABLE_LIGHTS)
     assert room_table([room]).splitlines()[-1].startswith("| tiny | A tiny room |")
-    assert room.document()["rows"]["light_transport"]["network_seconds_range"][0] > 0
+    assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
 
     before = reports(stages)
     assert stages.run() == out

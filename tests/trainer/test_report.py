@@ -109,7 +109,7 @@ def test_a_store_without_the_scene_is_not_ready(tmp_path) -> None:
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path) -> None:
-    with pytest.raises(SpecError, match="is not a training run"):
+    with pytest.raises(SpecError, match="there is no such folder"):
         write_report(tmp_path / "store", tmp_path / "run", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -205,15 +205,15 @@ At equal numbers of samples, one of `path` at {study.dearer:.3f} times the core-
 
 From {room_study.counted(len(told.seeds), "seed")} little is known of what seeds change: intervals of arms whose seeds
 differ are wide, and may pass 0. Small arms are where training is the least reliable; what follows is decided by those
-from × 1. Much of what is left there cannot be learned from what the network is given, as the pattern of Veach's floor,
-which is of metal and in no buffer ([training.md](../training.md)).
+from × 1. What is left there need not be noise: part of it may not be in what the network is given, as the pattern of a
+metal surface is in no buffer ([training.md](../training.md)).
 
 ## By what factor the core-seconds of `path` must grow
 
 {factors_table(study, targets)}
 
 **Error of networks**: the budget of `path`, over that of `bdpt` at budget 1, at which its error comes down to that of
-`bdpt` first, by lines through its arms over the logarithm of the budget; where these are as flat as here, a difference
+`bdpt` first, by lines through its arms over the logarithm of the budget; where these are flat, a difference
 within the noise of seeds moves it far. Intervals are a bootstrap's: configurations drawn
 with replacement, the same for all arms, and each arm's mean moved by a normal deviate of what seeds move it,
 pooled over all arms or over those from × 1. **Noise of targets**: the ratio of variances × that of core-seconds of a

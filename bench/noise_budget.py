@@ -109,7 +109,7 @@ def measured_costs(room: SceneSpec) -> SampleCosts:
     from photonfarm.renderer.sample_costs import measured_costs
 
     passes = measured_costs(room_study.in_passes(room, HALF_SPP), frames=TIMED_VIEWS)
-    return replace(measured_costs(room, frames=TIMED_VIEWS), relative_noise=passes.relative_noise)
+    return replace(measured_costs(room, frames=TIMED_VIEWS), relative_variance=passes.relative_variance)
 
 
 def paid(costs: SampleCosts, share: Share, budget: float) -> int:
@@ -130,7 +130,7 @@ def measured_room(number: int, plan: Planned, told: argparse.Namespace) -> Room:
     room_study.train_all([run for of_share in networks.values() for run in of_share], told.processes)
     arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
     shown = [(arm.allocation, arm.shown) for arm in arms]
-    errors = RoomErrors.of(plan.name, plan.costs.relative_noise, shown, number)
+    errors = RoomErrors.of(plan.name, plan.costs.relative_variance, shown, number)
     return Room(plan.name, plan.spec, plan.costs, references, arms, errors)
 
 
@@ -193,9 +193,11 @@ def levels(room: Room, found: Fit) -> str:
     """What of the errors the model takes for excess, which alone the shares of a budget change, in words."""
     a, b = found.levels[room.name]
     beyond = [(model - a) / model for model in found.predicted(room.errors)]
+    below = sum(arm.shown.estimate().mean < a for arm in room.arms)
     return (
-        f"By the model endless data would leave a = {a:.5f}, and b = {b:.5f}: of an arm's MSE "
-        f"{min(beyond):.0%} to {max(beyond):.0%} is excess, which is all that a budget and its shares can change."
+        f"By the model endless data would leave a = {a:.5f}, and b = {b:.5f}: of an arm's MSE, as it has it, "
+        f"{min(beyond):.0%} to {max(beyond):.0%} is excess, which is all that a budget and its shares can change. a is "
+        f"fitted, without an interval; {below} of the {len(room.arms)} arms were measured below it."
     )
 
 
@@ -208,9 +210,10 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
     bought = best_of_replicates(room, found, budget)
     return (
         f"Measured best: `{room.arms[first].share}`, the best in {of_arms[first]:.0%} of replicates. By the model the "
-        f"best of {budget:g} core-seconds is {best.modifications} configurations of {best.views} views with "
-        f"{best.spp} spp each; with one view s* = {real:.2f} ({low:.2f} … {high:.2f}). Of the replicates' κ and ρ the "
-        f"best has {shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
+        f"best of {budget:g} core-seconds is {best.modifications} configurations of "
+        f"{room_study.counted(best.views, 'view')} with {best.spp} spp each; with one view "
+        f"s* = {real:.2f} ({low:.2f} … {high:.2f}). Of the replicates' κ and ρ the best has "
+        f" {shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
     )
 
 
@@ -239,7 +242,7 @@ def room_part(room: Room, found: Fit, told: argparse.Namespace) -> str:
 
 {film.width} × {film.height}; a configuration costs {1e3 * costs.configuration_s:.0f} core-milliseconds, a view
 {1e3 * costs.view_s:.0f}, a pass {1e3 * costs.pass_s:.0f} and each sample per pixel {1e3 * costs.spp_s:.1f}; relative
-noise of one sample per pixel {costs.relative_noise:.2f}. Measured on
+variance of one sample per pixel {costs.relative_variance:.2f}. Measured on
 {room_study.counted(len(room.references.rows), "view")} of {len(set(room.references.units))} held-out configurations
 with references of {room.references.spp} spp.
 
@@ -266,9 +269,10 @@ samples per pixel (spp) of a pass. `{ARCHITECTURE}`, preset `small`, for each ar
 
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
 {2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
-charged what it would cost rendered at once, by a line through the times of two numbers of spp; the noise given below
-is that of the passes. Passes of a view are samples of their own. **MSE** is in the metric space, the
-references' noise taken out; **linear MSE** in exposed linear radiance.
+charged what it would cost rendered at once, by a line through the times of two numbers of spp; the variance given
+below, relative to squared brightness (`photonfarm.shared.sample_costs.relative_variance`), is that of the
+passes. Passes of a view are samples of their own. **MSE** is in the metric space, the references' noise taken out;
+**linear MSE** in exposed linear radiance.
 {of_intervals(len(told.seeds))}
 
 **The model** is that of `photonfarm.shared.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b of

@@ -33,10 +33,9 @@ def in_interval(found: Found) -> str:
     return f"{found.value:.2f} ({found.low:.2f} … {found.high:.2f})"
 
 
-def with_interval(found: Found, budgets: Sequence[float]) -> str:
-    """A factor and its 95 % interval."""
-    value, low, high = (in_words(factor, budgets) for factor in (found.value, found.low, found.high))
-    return f"{value} ({low} … {high})"
+def within_words(found: Found, budgets: Sequence[float]) -> str:
+    """The 95 % interval of a factor."""
+    return f"{in_words(found.low, budgets)} … {in_words(found.high, budgets)}"
 
 
 # ------------------------------------------------------------------------------------------------------------- tables
@@ -79,8 +78,7 @@ def factors_table(study: Study, targets: Targets) -> str:
         (found, by_seed), (later, _) = study.factor(metric), study.factor(metric, 1)
         seeds = " · ".join(in_words(one, study.budgets) for one in by_seed)
         intervals = [
-            f"{in_words(one.low, study.budgets)} … {in_words(one.high, study.budgets)} "
-            f"({study.spread(metric, least):.1%})"
+            f"{within_words(one, study.budgets)}; {study.spread(metric, least):.1%}"
             for one, least in ((found, 0), (later, 1))
         ]
         lines.append([f"error of networks: {name}", in_words(found.value, study.budgets), *intervals, seeds])
@@ -88,7 +86,7 @@ def factors_table(study: Study, targets: Targets) -> str:
         found = study.noise(targets, relative=relative)[2]
         lines.append([name, f"{found.value:.2f}", f"{found.low:.2f} … {found.high:.2f}", "", ""])
     header = (
-        "by", "factor of core-seconds", "95 % (spread by seeds, all arms)", "95 % (spread by seeds, arms from × 1)",
+        "by", "factor of core-seconds", "95 %; spread of seeds, all arms", "95 %; spread of seeds, arms from × 1",
         "of each seed",
     )  # fmt: skip
     return results.table(header, lines)
@@ -125,13 +123,16 @@ def verdict(study: Study, targets: Targets) -> str:
     errors = ", ".join(f"{one.shown.estimate().mean:.5f}" for one, _ in theirs)
     apart = [f"× {one.arm.share:g}" for one, _ in theirs if is_apart(one.shown.less(ours.shown))]
     linear, relative = (study.noise(targets, relative=relative)[2] for relative in (False, True))
+    by_all, by_later = (study.factor("shown", least)[0] for least in (0, 1))
     return (
         f"After {ours.arm.samples} samples of `bdpt` the held-out MSE is {ours.shown.estimate().mean:.5f}. After data "
         f"of `path` of {dearer} times the core-seconds it is {errors}; told apart from that of `bdpt`: "
-        f"{' and '.join(apart) or 'none'}. By lines through these, `path` must be given "
-        f"{with_interval(study.factor('shown', 1)[0], study.budgets)} times the core-seconds for the error of `bdpt`. "
-        f"By the variance of noise alone it is {in_interval(relative)} times, relative to brightness, and "
-        f"{in_interval(linear)} times in exposed linear radiance, where what is brightest leads."
+        f"{' and '.join(apart) or 'none'}. By lines through all arms `path` needs "
+        f"{in_words(by_later.value, study.budgets)} times the core-seconds for the error of `bdpt`, which is known as "
+        f"roughly as {within_words(by_later, study.budgets)} by the spread of seeds from × 1, and "
+        f"{within_words(by_all, study.budgets)} by that of all arms. By the variance of noise alone it needs "
+        f"{in_interval(relative)} times, relative to brightness, and {in_interval(linear)} times in exposed linear "
+        "radiance, where what is brightest leads."
     )
 
 
@@ -216,9 +217,9 @@ metal surface is in no buffer ([training.md](../training.md)).
 `bdpt` first, by lines through its arms over the logarithm of the budget; where these are flat, a difference
 within the noise of seeds moves it far. Intervals are a bootstrap's: configurations drawn
 with replacement, the same for all arms, and each arm's mean moved by a normal deviate of what seeds move it,
-pooled over all arms or over those from × 1. **Noise of targets**: the ratio of variances × that of core-seconds of a
-sample, over held-out configurations. The two need not agree: more samples of `path` are more configurations too, and
-not all of a network's error comes from noise.
+pooled over all arms or over those from × 1: the spread, a share of the mean. **Noise of targets**: the ratio of
+variances × that of core-seconds of a sample, over held-out configurations. The two need not agree: more samples of
+`path` are more configurations too, and not all of a network's error comes from noise.
 
 ## Pictures
 

@@ -64,8 +64,8 @@ def line(room: Room, budget: float) -> list[str]:
         room.name,
         f"{film.width} × {film.height}",
         *(f"{1e3 * part:.1f}" for part in parts),
-        f"{costs.relative_noise:.2f}",
-        f"{room.terms.best_spp(1):.2f}",
+        f"{costs.relative_variance:.2f}",
+        f"{room.terms.best_spp(1):.1f}",
         shared_out(found, static=not room.spec.groups),
         *dearer,
     ]
@@ -80,15 +80,16 @@ def shared_out(found: Allocation, *, static: bool) -> str:
 def page(rooms: list[Room], budget: float, views: int) -> str:
     """The table as Markdown."""
     header = (
-        "experiment", "image", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "noise ν of 1 spp", "s*",
-        f"best of {budget:g} core-s: configurations × views", *(f"excess at {spp} spp" for spp in SPP),
+        "experiment", "image", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "relative variance ν of 1 spp",
+        "s*", f"best of {budget:g} core-s: configurations × views", *(f"excess at {spp} spp" for spp in SPP),
     )  # fmt: skip
     return f"""# What samples cost, how noisy they are, and how many samples per pixel that asks for
 
-Scenes of `experiments/` in their small size; core-milliseconds, medians over {views} views. ν is the relative noise of
-one sample per pixel (`photonfarm.shared.sample_costs.relative_noise`), from halves of the scene's samples per pixel,
-which are stratified: with fewer it is somewhat more. s* is the samples per pixel, both halves together, of
-least excess error with one view of each configuration, and “best” the best of all shares with 2 spp and more
+Scenes of `experiments/` in their small size; core-milliseconds, medians over {views} views. ν is the
+variance of one sample per pixel over squared brightness (`photonfarm.shared.sample_costs.relative_variance`), from
+halves of the scene's samples per pixel, which are stratified: with fewer it is somewhat more. s* is the samples per
+pixel, both halves together, of least excess error with one view of each configuration, a guide to a factor of two
+([choosing-spp.md](../choosing-spp.md)), and “best” the best of all shares with 2 spp and more
 (`photonfarm.shared.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
 core-seconds spent on single views of so many spp, over that of the best.
 

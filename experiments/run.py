@@ -4,8 +4,9 @@
     python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments]
 
 Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
-and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 2 for wrong usage, 3 for a
-file that is wrong, 7 where an experiment did not come to its end: the others are run all the same.
+and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 2 for wrong usage, 3 for
+a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end: the others are run
+all the same.
 """
 
 from __future__ import annotations

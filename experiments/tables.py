@@ -179,7 +179,7 @@ def room_table(rooms: Sequence[Room]) -> str:
     """What each room's figures were measured on, what that cost, and whether the machine was quiet."""
     head = (
         "experiment", "title", "images trained on", "held out", "render of images, core-s", "reference passes",
-        "render of passes, core-s", "spp", "references", "noise floor", "MB in all", "edit, ms",
+        "render of passes, core-s", "spp", "references", "noise of targets, linear MSE", "MB in all", "edit, ms",
         "load average of 1, 5, 15 min", "credits",
     )  # fmt: skip
     return markdown_table(head, [_room_line(room) for room in rooms])

@@ -28,11 +28,11 @@ def room(number: int, seeds: int) -> Room:
     for share in SHARES:
         configurations = noise_budget.paid(COSTS, share, BUDGET)
         bought = Measured(share, configurations, Errors(hard[None], UNITS), Errors(hard[None], UNITS)).allocation
-        level = 0.01 + excess(COSTS.relative_noise, bought, kappa=20, rho=1)
+        level = 0.01 + excess(COSTS.relative_variance, bought, kappa=20, rho=1)
         errors = Errors(level * (hard + 0.02 * rng.normal(size=(seeds, VIEWS))), UNITS)
         arms.append(Measured(share, configurations, errors, errors))
     halves = rng.random((VIEWS, 2, SIZE, SIZE, 3), np.float32)
-    shown = RoomErrors.of(f"room {number}", COSTS.relative_noise, [(a.allocation, a.shown) for a in arms], number)
+    shown = RoomErrors.of(f"room {number}", COSTS.relative_variance, [(a.allocation, a.shown) for a in arms], number)
     spec = small_spec(film={"width": SIZE, "height": SIZE})
     return Room(f"room {number}", spec, COSTS, References(tuple(range(VIEWS)), UNITS, halves, 256), tuple(arms), shown)
 

@@ -46,7 +46,7 @@ def test_what_lies_beyond_the_arms_is_no_number() -> None:
     assert crossing(ARMS, errors, 0.5) == 0
     assert path_data_page.in_words(math.inf, ARMS) == "more than 4.00"
     assert path_data_page.in_words(0.0, ARMS) == "less than 0.25"
-    assert path_data_page.with_interval(Found(1.5, 0.0, math.inf), ARMS) == "1.50 (less than 0.25 … more than 4.00)"
+    assert path_data_page.within_words(Found(1.5, 0.0, math.inf), ARMS) == "less than 0.25 … more than 4.00"
 
 
 def test_of_errors_that_rise_again_the_first_crossing_counts() -> None:
@@ -177,7 +177,7 @@ def test_the_page_and_its_figures_and_the_picture_are_made(seeds: tuple[int, ...
     assert all(np.shape(row[metric]) == (len(seeds), VIEWS) for row in values["arms"] for metric in METRICS.values())
     assert values["factors"]["shown"]["value"] == pytest.approx(2.5, rel=0.2)
     assert values["noise"]["linear"]["ratio"]["value"] == pytest.approx(4, rel=0.1)
-    assert f"{values['factors']['shown']['value']:.2f} (" in page
+    assert f"`path` needs {values['factors']['shown']['value']:.2f} times" in page
     assert page.count("| `path` |") == 1 + len(BUDGETS["path"])
     assert f"on {VIEWS} views of\n{VIEWS} further configurations" in page
     assert path_data_page.picture(found, targets).width > 6 * SIZE

@@ -14,7 +14,7 @@ BUDGET = 200.0
 
 def room(**changes: float) -> Room:
     """A scene with movable groups; a configuration costs as much as 50 samples per pixel."""
-    parts = {"configuration_s": 0.5, "view_s": 0.05, "pass_s": 0.0, "spp_s": 0.01, "relative_noise": 40.0} | changes
+    parts = {"configuration_s": 0.5, "view_s": 0.05, "pass_s": 0.0, "spp_s": 0.01, "relative_variance": 40.0} | changes
     return Room("made-up", spec := small_spec(), SampleCosts(spec.scene_id, **parts))
 
 
@@ -25,7 +25,7 @@ def test_none_of_the_shares_is_better_than_the_best() -> None:
 
 
 def test_the_share_that_is_the_best_has_its_excess() -> None:
-    of = room(configuration_s=0.0, view_s=0.0, relative_noise=0.0)
+    of = room(configuration_s=0.0, view_s=0.0, relative_variance=0.0)
     best = of.terms.best(BUDGET)
     assert best == Allocation(best.modifications, 1, 1, 2)
     assert of.more_than_best(2, BUDGET) == pytest.approx(1, rel=0.01)
@@ -33,7 +33,7 @@ def test_the_share_that_is_the_best_has_its_excess() -> None:
 
 @pytest.mark.parametrize("noise", [0.1, 1000.0])
 def test_noisier_scenes_are_said_to_want_more_samples_per_pixel(noise: float) -> None:
-    of = room(relative_noise=noise)
+    of = room(relative_variance=noise)
     cells = line(of, BUDGET)
     assert cells[0] == "made-up"
     assert cells[1:6] == ["8 × 8", "500.0", "50.0", "0.0", "10.0"]
@@ -46,6 +46,6 @@ def test_views_of_a_static_scene_are_of_one_configuration() -> None:
 
 
 def test_the_page_has_a_line_for_each_scene() -> None:
-    text = page([room(), room(relative_noise=3.0)], BUDGET, 12)
+    text = page([room(), room(relative_variance=3.0)], BUDGET, 12)
     assert text.count("| made-up |") == 2
     assert "medians over 12 views" in text

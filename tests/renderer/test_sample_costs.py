@@ -16,7 +16,7 @@ from photonfarm.renderer.sample_costs import fewer_samples, line_through, measur
 from photonfarm.renderer.scenes import LoadedScene
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.modification import Modification, rest
-from photonfarm.shared.sample_costs import SECONDS, SampleCosts, relative_noise
+from photonfarm.shared.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
 from photonfarm.shared.view import View
 
@@ -46,7 +46,7 @@ def test_what_was_measured_of_the_room_is_positive_and_of_this_scene(room: Loade
     assert costs.configuration_s > 0
     assert costs.view_s > 0
     assert costs.pass_s + 4 * costs.spp_s > 0
-    assert 0.01 < costs.relative_noise < 100
+    assert 0.01 < costs.relative_variance < 100
 
 
 def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
@@ -90,7 +90,7 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     assert costs.view_s == pytest.approx(10 + 4096 + 8192)
     assert costs.pass_s == pytest.approx(7)
     assert costs.spp_s == pytest.approx(0.5)
-    assert costs.relative_noise == pytest.approx(2 * 2 * (2**2 / 4) / (2**2 * 1.01))
+    assert costs.relative_variance == pytest.approx(2 * 2 * (2**2 / 4) / (2**2 * 1.01))
     assert len({modification.vector.tobytes() for modification in applied}) == len(applied) == WARM_UPS + 3
     assert len({view for view, *_ in rendered}) == WARM_UPS + 3
     assert [spp for *_, spp in rendered] == [2, 8] * (WARM_UPS + 3)
@@ -132,7 +132,7 @@ def test_clean_images_are_timed_with_fewer_samples(size: int, half_spp: int, few
 def test_the_noise_is_the_variance_between_many_images(room: LoadedScene, somewhere: View) -> None:
     room.apply(rest(room.spec))
     halves = room.render_halves(somewhere, range(64)).astype(np.float64)
-    pairs = [relative_noise(a, b, 2 * 2) for a, b in zip(halves[::2], halves[1::2], strict=True)]
+    pairs = [relative_variance(a, b, 2 * 2) for a, b in zip(halves[::2], halves[1::2], strict=True)]
     variance = 2 * halves.var(axis=0, ddof=1).mean(axis=-1)  # of one sample per pixel
     grey = halves.mean(axis=(0, -1))
     around = np.kron(grey.reshape(2, 8, 3, 8).mean(axis=(1, 3)), np.ones((8, 8)))
@@ -144,13 +144,13 @@ def test_a_static_scene_is_measured_in_different_views() -> None:
     costs = measured_costs(static(), frames=2)
     assert costs.configuration_s < 0.1  # nothing moves, and there are no photons
     assert costs.view_s > 0
-    assert costs.relative_noise > 0
+    assert costs.relative_variance > 0
 
 
 def test_views_that_show_nothing_have_no_noise_to_tell_of() -> None:
     away = {"min": [0, 1, 9], "max": [0, 1, 9]}
     scene = LoadedScene.load(static(look_at=away))
-    assert sample_costs(scene, 2).relative_noise == 0
+    assert sample_costs(scene, 2).relative_variance == 0
 
 
 # ----------------------------------------------------------------------------------------------------------- the verb

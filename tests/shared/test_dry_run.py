@@ -145,8 +145,8 @@ def test_the_suggestion_costs_no_more_and_saves_what_is_said(tmp_path: Path, ver
     assert better.samples == better.modifications * better.views
     new = Allocation(better.modifications, better.views, 1, 2 * better.half_spp)
     assert seconds(COSTS, new) <= found.core_s
-    old = Allocation(100, 2, 1, 8)
-    assert found.reduction == pytest.approx(1 - excess(COSTS.relative_noise, new) / excess(COSTS.relative_noise, old))
+    after, before = (excess(COSTS.relative_variance, of) for of in (new, Allocation(100, 2, 1, 8)))
+    assert found.reduction == pytest.approx(1 - after / before)
     assert found.reduction >= 0.05
 
 
@@ -163,7 +163,7 @@ def test_what_is_best_already_is_left_as_it_is(tmp_path: Path, verb: Verb) -> No
 def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configuration_is_paid_once(
     tmp_path: Path, verb: Verb
 ) -> None:
-    costs = replace(COSTS, configuration_s=1000.0, relative_noise=STATIC_NOISE)
+    costs = replace(COSTS, configuration_s=1000.0, relative_variance=STATIC_NOISE)
     verb(costs.json())
     found = rehearsed(tmp_path, tmp_path / "none", spec=spec_file(tmp_path, objects=[]), modifications=50)
     assert found.extent == Extent(1, 1, 100)
@@ -237,13 +237,13 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
 
 
 def test_the_command_says_when_nothing_better_is_known(tmp_path: Path, verb: Verb) -> None:
-    verb(replace(COSTS, spp_s=0.0, relative_noise=0.0, configuration_s=0.0).json())
+    verb(replace(COSTS, spp_s=0.0, relative_variance=0.0, configuration_s=0.0).json())
     lines = run(spec_file(tmp_path), tmp_path / "none", "--views", "1").stdout.splitlines()
     assert lines[2] == "what is asked for is within 5 % of the best at this cost"
 
 
 def test_of_a_static_scene_the_command_speaks_of_samples_alone(tmp_path: Path, verb: Verb) -> None:
-    verb(replace(COSTS, relative_noise=STATIC_NOISE).json())
+    verb(replace(COSTS, relative_variance=STATIC_NOISE).json())
     static = run(spec_file(tmp_path, objects=[]), tmp_path / "none", "--modifications", "50").stdout.splitlines()[2]
     assert "half_spp = 32 in [transport], 20 views of one pass: " in static
 
@@ -265,7 +265,7 @@ def test_as_json_there_are_the_same_numbers_as_fields(tmp_path: Path, verb: Verb
     assert (found["planned"], found["planned_before"], found["queued"], found["dry_run"]) == (12, 0, None, True)
     assert found["core_s"] == pytest.approx(13.5)
     assert (found["wall_s"], found["cores"]) == (pytest.approx(13.5 / 4), 4)
-    assert found["costs"]["relative_noise"] == COSTS.relative_noise
+    assert found["costs"]["relative_variance"] == COSTS.relative_variance
     assert found["size_bytes"] > 0
     assert set(found["suggestion"]) == {"half_spp", "modifications", "views", "samples"}
     asked.unlink()

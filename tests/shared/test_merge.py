@@ -188,9 +188,10 @@ def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Pat
     assert_equal(Merged.read(tmp_path / "view.npz"), merged)
     with np.load(tmp_path / "view.npz") as stored:
         np.testing.assert_array_equal(stored["standard_error"], merged.standard_error)
-    (tmp_path / "other.npz").write_bytes(b"nothing")
-    with pytest.raises(StoreError, match=r"other\.npz: is not a merged view"):
-        Merged.read(tmp_path / "other.npz")
+    for content in (b"nothing", (tmp_path / "view.npz").read_bytes()[:3000]):
+        (tmp_path / "other.npz").write_bytes(content)
+        with pytest.raises(StoreError, match=r"other\.npz: holds no merged view that `photonfarm store merge` wrote"):
+            Merged.read(tmp_path / "other.npz")
 
 
 def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is(
@@ -201,6 +202,9 @@ def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is
     nothing = CliRunner().invoke(umbrella, arguments)
     assert isinstance(nothing.exception, StoreError)
     assert "no complete sample fits" in str(nothing.exception)
+    few = CliRunner().invoke(umbrella, [*arguments, "--least", "512"])
+    assert "no view that fits has 512 complete passes (--least)" in str(few.exception)
+    assert not out.exists()
 
     samples.commit(scene, 0, samples.outputs(scene, 0))
     one = CliRunner().invoke(umbrella, [*arguments, "--row", "0", "--json"], catch_exceptions=False)

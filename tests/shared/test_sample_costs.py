@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.errors import StoreError
-from photonfarm.shared.sample_costs import SECONDS, SampleCosts, relative_noise
+from photonfarm.shared.sample_costs import SECONDS, SampleCosts, relative_variance
 
 COSTS = SampleCosts("0" * 32, 0.04, 0.035, 0.0, 0.032, 0.3)
 
@@ -25,7 +25,7 @@ def test_costs_come_back_as_they_were_written() -> None:
         ({"view_s": "0.1"}, "view_s has another type"),
         ({"view_s": True}, "view_s has another type"),
         ({"view_s": -0.5}, "view_s is -0.5; finite numbers from 0 on are allowed"),
-        ({"relative_noise": float("nan")}, "relative_noise is nan"),
+        ({"relative_variance": float("nan")}, "relative_variance is nan"),
         ({"more": 1.0}, "more"),
     ],
 )
@@ -42,7 +42,7 @@ def test_what_is_no_such_document_is_refused(text: str | bytes) -> None:
 
 
 def test_numbers_that_can_be_no_costs_are_refused() -> None:
-    for name in (*SECONDS, "relative_noise"):
+    for name in (*SECONDS, "relative_variance"):
         with pytest.raises(ValueError, match=f"^{name} is -1"):
             replace(COSTS, **{name: -1.0})
 
@@ -61,8 +61,8 @@ def test_the_noise_of_one_sample_is_found_at_any_number_of_samples_and_any_expos
     wanted = 0.5**2 / (2**2 * 1.01)
     for half_spp in (1, 4, 64):
         a, b = (noisy(clean, 0.5, half_spp, seed) for seed in (1, 2))
-        assert relative_noise(a, b, 2 * half_spp) == pytest.approx(wanted, rel=0.03)
-        assert relative_noise(10 * a, 10 * b, 2 * half_spp) == pytest.approx(relative_noise(a, b, 2 * half_spp))
+        assert relative_variance(a, b, 2 * half_spp) == pytest.approx(wanted, rel=0.03)
+        assert relative_variance(10 * a, 10 * b, 2 * half_spp) == pytest.approx(relative_variance(a, b, 2 * half_spp))
 
 
 def test_noise_is_relative_to_the_brightness_around_and_in_the_dark_to_a_tenth_of_the_images() -> None:
@@ -72,12 +72,12 @@ def test_noise_is_relative_to_the_brightness_around_and_in_the_dark_to_a_tenth_o
     a, b = (noisy(clean, sigma, 1, seed) for seed in (1, 2))
     floor = 0.225**2
     wanted = sigma**2 * ((1 / (64 + floor) + 1 / (1 + floor)) / 4 + 0.5 / floor)
-    assert relative_noise(a, b, 2) == pytest.approx(wanted, rel=0.05)
+    assert relative_variance(a, b, 2) == pytest.approx(wanted, rel=0.05)
     moved = np.roll(clean, 4, axis=1)  # off the blocks, so that some hold both
-    assert relative_noise(*(noisy(moved, sigma, 1, seed) for seed in (1, 2)), 2) != pytest.approx(wanted, rel=0.05)
+    assert relative_variance(*(noisy(moved, sigma, 1, seed) for seed in (1, 2)), 2) != pytest.approx(wanted, rel=0.05)
 
 
-def test_a_black_image_has_no_relative_noise() -> None:
+def test_a_black_image_has_no_relative_variance() -> None:
     black = np.zeros((8, 8, 3), np.float32)
-    assert relative_noise(black, black, 2) is None
-    assert relative_noise(black + 1, black + 1, 2) == 0
+    assert relative_variance(black, black, 2) is None
+    assert relative_variance(black + 1, black + 1, 2) == 0

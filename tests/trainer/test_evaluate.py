@@ -143,9 +143,11 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     bare = replace(found, rows=tuple(replace(row, metrics=replace(row.metrics, inception=None)) for row in found.rows))
     assert "no weights of the Inception network are installed" in notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
-    assert notes(converged)[1].endswith("samples per pixel or more; converged")
+    assert notes(converged)[2].endswith("samples per pixel or more; converged")
     head = told(found).split("\n\n")[0]
-    assert head.startswith(f"analytic: 6 held-out samples of {found.units} configurations; noise of the targe")
+    assert head.startswith(
+        f"analytic: 6 held-out samples of {found.views} views of {found.units} configurations; noise"
+    )
 
 
 def test_the_pictures_stand_side_by_side_in_one_exposure(

@@ -7,8 +7,9 @@ that of endless data, its excess, is taken to follow
 
     excess = ρ/M + (1 + ν/(κ·P·s)) / (M·V)
 
-in units of what one noise-free view leaves: ν is the relative noise of one sample per pixel, κ how much the network
-averages it away, ρ how much configurations differ beside their views. A configuration with its views costs
+in units of what one noise-free view leaves: ν is the relative variance of one sample per pixel
+(`sample_costs.relative_variance`), κ how much the network averages it away, ρ how much configurations differ beside
+their views. A configuration with its views costs
 
     c = c_configuration + V·(c_view + P·(c_pass + c_spp·s)).
 
@@ -94,7 +95,7 @@ class Terms:
 
     def excess(self, of: Allocation) -> float:
         """The excess of its held-out error."""
-        return excess(self.costs.relative_noise, of, kappa=self.kappa, rho=self.rho)
+        return excess(self.costs.relative_variance, of, kappa=self.kappa, rho=self.rho)
 
     def best_spp(self, views: int, passes: int = 1) -> float:
         """s*: the samples per pixel of a pass with the least excess at a fixed budget, as a real number.
@@ -103,7 +104,7 @@ class Terms:
         """
         costs = self.costs
         besides = costs.configuration_s / views + costs.view_s + passes * costs.pass_s
-        gained, paid = besides * costs.relative_noise, self.kappa * costs.spp_s * (1 + self.rho * views)
+        gained, paid = besides * costs.relative_variance, self.kappa * costs.spp_s * (1 + self.rho * views)
         if not gained:
             return 0.0
         return math.sqrt(gained / paid) / passes if paid else math.inf

@@ -36,10 +36,10 @@ class SampleCosts:
     view_s: float  # a view's buffers, and which points and photons it sees
     pass_s: float  # a pass of a view, both halves, whatever its samples are
     spp_s: float  # and for each sample per pixel of the whole image, of both halves together
-    relative_noise: float  # as of `relative_noise`; 0 where every view was black
+    relative_variance: float  # as of `relative_variance`; 0 where every view was black
 
     def __post_init__(self) -> None:
-        for name in (*SECONDS, "relative_noise"):
+        for name in (*SECONDS, "relative_variance"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}; finite numbers from 0 on are allowed")
@@ -58,8 +58,8 @@ class SampleCosts:
 
     def line(self) -> str:
         """All of it in words."""
-        times = ", ".join(f"{name.removesuffix('_s')} {getattr(self, name):.4f} s" for name in SECONDS)
-        return f"{times}; relative noise of one sample per pixel {self.relative_noise:.3g}"
+        times = " + ".join(f"{name.removesuffix('_s')} {getattr(self, name):.4f} s" for name in SECONDS)
+        return f"{times} × samples per pixel; relative variance of one sample per pixel {self.relative_variance:.3g}"
 
     @classmethod
     def read(cls, text: str | bytes) -> Self:
@@ -79,7 +79,7 @@ class SampleCosts:
             ) from error
 
 
-def relative_noise(half_a: F32, half_b: F32, spp: float) -> float | None:
+def relative_variance(half_a: F32, half_b: F32, spp: float) -> float | None:
     """Variance of a pixel's mean at one sample per pixel over its squared local brightness, mean over pixels.
 
     `half_a` and `half_b` (H, W, 3) are independent, with `spp` samples per pixel together; H and W are multiples of

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.shared.errors import StoreError
+from photonfarm.shared.store import store_errors
 from photonfarm.shared.store.check import Progress as Tell
 from photonfarm.shared.store.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.find import FoundSample, Matches
@@ -136,11 +137,16 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
         click.echo(f"no sample fits{near}", err=True)
 
 
-def merged(views: Iterable[tuple[str, Merged]], folder: Path, as_json: bool) -> None:
-    """Write merged views into a folder, and tell of each; raises StoreError if there is none."""
+def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_json: bool) -> None:
+    """Write merged views, of so many passes at the least, into a folder that is made for them, and tell of each.
+
+    Raises StoreError if there is none, or where they cannot be written.
+    """
     written = []
     for key, view in views:
         file = folder / f"{key}.npz"
+        with store_errors("make the folder", folder):
+            folder.mkdir(parents=True, exist_ok=True)
         view.write(file)
         mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
         written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})
@@ -150,7 +156,8 @@ def merged(views: Iterable[tuple[str, Merged]], folder: Path, as_json: bool) -> 
     if as_json:
         click.echo(json.dumps(written, indent=2))
     if not written:
-        raise StoreError("no complete sample fits; `photonfarm store find` shows what there is")
+        what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
+        raise StoreError(f"{what}; `photonfarm store find` shows what there is")
 
 
 def _sample(sample: FoundSample, store: str | Path) -> None:

@@ -115,14 +115,12 @@ def merge(
     passes have arrived. Without conditions all views are merged.
     """
     from photonfarm.shared import show_store
-    from photonfarm.shared.store import Store, store_errors
+    from photonfarm.shared.store import Store
     from photonfarm.shared.store.find import Query, scene_named
     from photonfarm.shared.store.merge import merge_views
 
     opened = Store(store)
     query = Query.of(modification=modification, view=view, row=row)
-    with store_errors("make the folder", out):
-        out.mkdir(parents=True, exist_ok=True)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
-    show_store.merged(merged, out, as_json)
+    show_store.merged(merged, out, least, as_json)

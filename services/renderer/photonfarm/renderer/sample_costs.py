@@ -26,7 +26,7 @@ from photonfarm.shared.errors import StoreError
 from photonfarm.shared.modification import Modification, sample_modification
 from photonfarm.shared.pointcloud import rebuild
 from photonfarm.shared.records import F32, BasePointCloud, Photons
-from photonfarm.shared.sample_costs import SampleCosts, relative_noise
+from photonfarm.shared.sample_costs import SampleCosts, relative_variance
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import View, sample_view
 
@@ -125,7 +125,7 @@ def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     few_s, halves = _timed(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
     many_s, _ = _timed(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
     pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
-    noise = relative_noise(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
+    noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
     return _Frame(configuration_s, view_s, pass_s, spp_s, noise)
 
 

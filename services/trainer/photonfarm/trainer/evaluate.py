@@ -98,6 +98,7 @@ class Evaluation:
     scene_id: str
     unit: str  # what is independent: "configuration" or, of a static scene, "view"
     measured: tuple[int, ...]  # rows of the store, of which those that are complete no longer are left out
+    views: int  # that these show
     device: str  # of the networks
     threads: int  # of torch on the CPU
     references: References | None
@@ -125,6 +126,7 @@ class Evaluation:
             "scene": self.scene,
             "scene_id": self.scene_id,
             "samples": self.samples,
+            "views": self.views,
             "unit": self.unit,
             "units": self.units,
             "noise_floor": self.noise_floor,
@@ -176,6 +178,7 @@ def compare(
         scene_id=first.scene_id,
         unit="configuration" if spec.groups else "view",
         measured=tuple(samples.rows),
+        views=len(set(samples.view_keys)),
         device=described(place),
         threads=first.settings.threads,
         references=References.of(found, spec.transport.half_spp),

@@ -28,8 +28,8 @@ def notes(evaluation: Evaluation) -> list[str]:
     """What is to be known of the errors, a sentence each."""
     denoisers = any(row.kept is not None for row in evaluation.rows)
     found = [
-        "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over the "
-        f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
+        "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out",
+        f"intervals: 95 %, over the {counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}",
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
@@ -93,8 +93,8 @@ def _of_inception(metrics: ImageMetrics) -> list[str]:
 
 def _head(evaluation: Evaluation) -> str:
     return (
-        f"{evaluation.scene}: {counted(evaluation.samples, 'held-out sample')} of "
-        f"{counted(evaluation.units, evaluation.unit)}; noise of the targets {evaluation.noise_floor:.5f}"
+        f"{evaluation.scene}: {counted(evaluation.samples, 'held-out sample')} of {of_units(evaluation)}; "
+        f"noise of the targets, as linear MSE, {evaluation.noise_floor:.5f}"
     )
 
 
@@ -125,6 +125,12 @@ def _cells(row: Row, first: Row, columns: list[str]) -> list[str]:
 def _interval(estimate: Estimate) -> str:
     found = confidence_interval(estimate)
     return NOT_AVAILABLE if found is None else f"{found[0]:.5f} … {found[1]:.5f}"
+
+
+def of_units(evaluation: Evaluation) -> str:
+    """What the samples show: so many views of so many configurations, or of a static scene views alone."""
+    units = counted(evaluation.units, evaluation.unit)
+    return units if evaluation.unit == "view" else f"{counted(evaluation.views, 'view')} of {units}"
 
 
 def counted(number: int, noun: str) -> str:

@@ -24,6 +24,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.shared.archives import stored_arrays
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.records import F32
 from photonfarm.shared.store.batch import Batch
@@ -82,12 +83,9 @@ class Merged:
     @classmethod
     def read(cls, file: Path) -> Self:
         """What `write` has stored; raises StoreError for anything else."""
-        try:
-            with np.load(file, allow_pickle=False) as stored:
-                images = (np.asarray(stored[name]) for name in ("mean", "m2", "half_a", "half_b"))
-                return cls(int(stored["passes"]), *images)
-        except (OSError, ValueError, KeyError) as error:
-            raise StoreError(f"{file}: is not a merged view: {error}") from error
+        with stored_arrays(file, "merged view", "store merge") as stored:
+            images = (np.asarray(stored[name]) for name in ("mean", "m2", "half_a", "half_b"))
+            return cls(int(stored["passes"]), *images)
 
 
 class Moments:

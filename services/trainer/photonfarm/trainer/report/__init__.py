@@ -41,13 +41,15 @@ def write_report(
     not a run or what is asked for cannot be compared, StoreError without a readable checkpoint or store or if `out`
     cannot be written, IncompleteError if nothing is held out.
     """
+    loaded = [TrainedRun.load(run) for run in runs]
+    with store_errors("write the report", out):
+        out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be measured first
     contents = gathered(
-        store, [TrainedRun.load(run) for run in runs], denoisers, references=references, inception=inception, most=most,
+        store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, tell=tell, timed=timed,
     )  # fmt: skip
     text, drawn = json.dumps(contents.document(), indent=2, ensure_ascii=False), plots(contents)
     with store_errors("write the report", out):
-        out.mkdir(parents=True, exist_ok=True)
         for plot in drawn:
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
         (out / "report.json").write_text(text + "\n")

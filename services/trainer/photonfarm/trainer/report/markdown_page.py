@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from photonfarm.trainer.markdown import markdown_table
 from photonfarm.trainer.report.contents import Contents
-from photonfarm.trainer.report.plots import OF_CURVES, OF_TIME, Plot
+from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 
 def markdown(contents: Contents, drawn: list[Plot], pictures: str) -> str:
     """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
     first, *others = tables(contents)
-    images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
     card = "\n".join(f"- **{name}**: {value}" for name, value in facts(contents))
     shown = "Targets and predictions, as clip(exposure · I, 0, 1)^(1/2.2)."
     blocks = [
         f"# {contents.card.spec.name}",
         _table(first),
-        f"## Plots\n\n{OF_TIME}\n\n{OF_CURVES}\n\n{images}",
+        *(_plots(*kind) for kind in by_kind(drawn)),
         f"## Held-out views\n\n{shown}\n\n![targets and predictions]({pictures})",
         *map(_table, others),
         f"## The data\n\n{card}",
     ]
     return "\n\n".join(blocks) + "\n"
+
+
+def _plots(title: str, said: str, drawn: list[Plot]) -> str:
+    images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
+    return f"## {title}\n\n{said}\n\n{images}"
 
 
 def _table(table: Table) -> str:

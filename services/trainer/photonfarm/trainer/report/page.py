@@ -6,10 +6,11 @@ import base64
 from html import escape
 
 from photonfarm.shared.pictures import Picture, png_uri
+from photonfarm.trainer.evaluation_table import counted, of_units
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents
 from photonfarm.trainer.report.pictures import Case, cases, legend_of_cases
-from photonfarm.trainer.report.plots import OF_CURVES, OF_TIME, Plot
+from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 STYLE = """
@@ -46,14 +47,11 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
     """The report's HTML."""
     title = f"photonfarm: {contents.card.spec.name}"
     first, *others = tables(contents)
-    over_time = [plot for plot in drawn if plot.name.startswith("time-")]
-    curves = [plot for plot in drawn if plot.name.startswith("curve-")]
     parts = [
         f"<h1>{escape(title)}</h1>",
         _headline(contents),
         _table(first),
-        _plots("Metrics over the time of a frame", OF_TIME, over_time),
-        _plots("Learning", OF_CURVES, curves),
+        *(_plots(*kind) for kind in by_kind(drawn)),
         _pictures(cases(contents), contents),
         *map(_table, others),
         _facts(contents),
@@ -61,7 +59,7 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{STYLE}</style></head><body>\n'
-        + "\n".join(part for part in parts if part)
+        + "\n".join(parts)
         + "\n</body></html>\n"
     )
 
@@ -74,7 +72,7 @@ def _headline(contents: Contents) -> str:
     spread = "" if reach is None else f" (95 %: {reach[0]:.3g} … {reach[1]:.3g})"
     rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
     cells = [
-        (f"{samples.rows}", f"samples of {samples.planned} planned"),
+        (f"{samples.rows}", f"samples of {samples.planned} planned, held-out ones among them"),
         ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
         (f"{error.mean:.4g}", f"held-out error of {first.name}{spread}"),
         (f"{contents.gauges.untrained.error.mean:.4g}", f"of {first.name} before its first step"),
@@ -84,9 +82,10 @@ def _headline(contents: Contents) -> str:
     boxes = "".join(f"<div><b>{value}</b>{escape(name)}</div>" for value, name in cells)
     return (
         f'<div class="figures">{boxes}</div>\n<p>Errors are mean squared errors of linear radiance × exposure, on '
-        f"{evaluation.samples} samples of {evaluation.units} {evaluation.unit}s that were never trained on. The noise "
-        "of the targets is taken out exactly: each sample has two independent renders A and B, and (f − A)(f − B) "
-        "averages to the error against the clean image. Noise would add the last figure on top.</p>"
+        f"{counted(evaluation.samples, 'sample')}, further passes counted, of {of_units(evaluation)} that were never "
+        "trained on. The noise of the targets is taken out exactly: each sample has two independent renders A and B, "
+        "and (f − A)(f − B) averages to the error against the clean image. Noise would add the last figure on "
+        "top.</p>"
     )
 
 
@@ -101,8 +100,6 @@ def _table(table: Table) -> str:
 
 
 def _plots(title: str, said: str, drawn: list[Plot]) -> str:
-    if not drawn:
-        return ""
     images = "".join(
         f'<img alt="{escape(plot.about)}" src="data:image/svg+xml;base64,{base64.b64encode(plot.svg).decode()}">'
         for plot in drawn

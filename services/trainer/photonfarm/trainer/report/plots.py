@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.estimate import Estimate
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 FEW = 3  # places along an axis: fewer show no curve
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
 MSSIM, KID = "mssim", "kid"  # the metrics whose axes are linear
-NARROW = 20  # times the least value: axes of less have ticks at round numbers
+NARROW = 20  # times the least value: axes of less have ticks at round numbers…
+TIGHT = 2.5  # …and of less than this at equal distances
 SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; the legend's rows are in it
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
@@ -30,9 +32,12 @@ STYLE: dict[Any, Any] = {  # names of matplotlib
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.alpha": 0.3,
-    "axes.prop_cycle": "cycler('color', ['#1f5fa8', '#c2571a', '#3b8f4d', '#8a4fa3', '#8c6d31', '#777777', '#d62728', "
-    "'#17a2b8', '#e377c2', '#a6a61a', '#111111', '#8fbcff'])",
 }
+COLOURS = (
+    "#1f5fa8", "#c2571a", "#3b8f4d", "#8a4fa3", "#8c6d31", "#777777", "#d62728", "#17a2b8", "#e377c2", "#a6a61a",
+    "#111111", "#8fbcff",
+)  # fmt: skip
+"""Of the predictors, by their places in the tables: each has its own in all plots; beyond twelve they come again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +49,20 @@ class Plot:
     svg: bytes
 
 
+CURVES, TIMES = "curve-", "time-"
+"""How the names of both kinds of plots begin."""
+
 OF_CURVES = (
     "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
     "Hollow points were measured on fewer held-out samples than the last: the others had not been rendered."
 )
+
+
+def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
+    """Title, a sentence on how they are read, and plots of each kind that there are any of."""
+    kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
+    found = [(title, said, [plot for plot in drawn if plot.name.startswith(kind)]) for title, said, kind in kinds]
+    return [each for each in found if each[2]]
 
 
 def plots(contents: Contents) -> list[Plot]:
@@ -88,20 +103,22 @@ def _curves(contents: Contents) -> Iterator[Plot]:
         if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
             continue  # all was rendered before much was learned
         about = f"Held-out error over {label}"
-        yield _drawn(f"curve-{name}", about, partial(_curve, contents=contents, x=x, label=label))
+        yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
 def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float], label: str) -> None:
-    for story in contents.stories:
+    for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
         places = [(x(story, point), point.error) for point in shown]
         whole = [place for place, point in zip(places, shown, strict=True) if point.held_out == shown[-1].held_out]
-        (line,) = axes.plot(*_columns(places), linewidth=1.2, marker="o", markersize=4, markerfacecolor="white")
-        axes.plot(*_columns(whole), "o", markersize=4, color=line.get_color(), label=story.name)
+        axes.plot(*_columns(places), color=colour, linewidth=1.2, marker="o", markersize=4, markerfacecolor="white")
+        axes.plot(*_columns(whole), "o", markersize=4, color=colour, label=story.name)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
-    colour, noise = contents.gauges.mean_colour.error.mean, contents.evaluation.noise_floor
-    levels = {"mean colour": colour, "noise of the targets": noise}
+    levels = {
+        "mean colour": contents.gauges.mean_colour.error.mean,
+        "noise of the targets": contents.evaluation.noise_floor,
+    }
     for (name, value), style in zip(levels.items(), ("--", ":"), strict=True):
         if value > lowest / FAR_BELOW:
             axes.axhline(value, linestyle=style, color="#555555", linewidth=1, label=name)
@@ -153,13 +170,27 @@ def measures() -> list[Measure]:
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A predictor in a plot over the time of a frame."""
+
+    milliseconds: float
+    name: str
+    group: str  # of GROUPS
+    colour: str
+    value: Estimate
+
+
 def _over_time(contents: Contents) -> Iterator[Plot]:
-    timed = [entry for entry in contents.entries if entry.time is not None]
     for measure in measures():
-        points = [(entry, value) for entry in timed if (value := measure.of(entry)) is not None]
+        points = [
+            Placed(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
+            for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
+            if entry.time is not None and (value := measure.of(entry)) is not None
+        ]
         if len(points) > 1:
             about = f"{measure.title} over the time of a frame"
-            yield _drawn(f"time-{measure.name}", about, partial(_scatter, measure=measure, points=points))
+            yield _drawn(f"{TIMES}{measure.name}", about, partial(_scatter, measure=measure, points=points))
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
@@ -167,7 +198,8 @@ GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, n
 
 OF_TIME = (
     "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
-    "it; bars are 95 % intervals, which FID has none of. Less is better, but for MSSIM."
+    "it; bars are 95 % intervals, which FID has none of. Less is better, but for MSSIM. All axes are logarithmic but "
+    "those of MSSIM and KID; bars that would reach below half the least value end at the axis."
 )
 
 
@@ -178,23 +210,28 @@ def _group(entry: Entry) -> str:
     return untrained if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, Estimate]]) -> None:
-    logarithmic = measure.name not in (MSSIM, KID) and min(value.mean for _, value in points) > 0
-    floor = min(value.mean for _, value in points) / 2 if logarithmic else -math.inf  # bars end there
+def _scatter(axes: Axes, measure: Measure, points: Sequence[Placed]) -> None:
+    least = min(point.value.mean for point in points)
+    logarithmic = measure.name not in (MSSIM, KID) and least > 0
+    floor = least / 2 if logarithmic else -math.inf
+    lowest = math.inf
     for name, (marker, line) in GROUPS.items():
-        members = sorted(
-            ((1e3 * entry.time.total, entry.name, value) for entry, value in points
-             if entry.time and _group(entry) == name), key=lambda member: member[:2],
-        )  # fmt: skip
-        places = _columns([(x, value.mean) for x, _, value in members])
+        members = sorted((p for p in points if p.group == name), key=lambda p: (p.milliseconds, p.name))
+        places = _columns([(p.milliseconds, p.value.mean) for p in members])
         axes.plot(*places, linestyle=line or "none", color="#999999", linewidth=1)
-        for x, label, value in members:
-            low, high = confidence_interval(value) or (value.mean, value.mean)
-            reach = [[value.mean - max(low, floor)], [high - value.mean]]
-            axes.errorbar(x, value.mean, reach, fmt=marker, label=label, markersize=5, elinewidth=0.8)
+        for p in members:
+            mean = p.value.mean
+            low, high = confidence_interval(p.value) or (mean, mean)
+            lowest = min(lowest, low)
+            axes.errorbar(
+                p.milliseconds, mean, [[mean - max(low, floor)], [high - mean]],
+                fmt=marker, color=p.colour, label=p.name, markersize=5, elinewidth=0.8,
+            )  # fmt: skip
     axes.set_xscale("log")
     if logarithmic:
         axes.set_yscale("log")
+        if lowest < floor:
+            axes.set_ylim(bottom=floor)
     _plain_ticks(axes)
     axes.set_xlabel("time per frame, ms")
     axes.set_ylabel(measure.title)
@@ -205,10 +242,18 @@ def _scatter(axes: Axes, measure: Measure, points: Sequence[tuple[Entry, Estimat
 
 def _plain_ticks(axes: Axes) -> None:
     """Round numbers on logarithmic axes of so little that few powers of ten lie in them, written in full."""
-    from matplotlib.ticker import MaxNLocator, NullLocator
+    from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         if axis.get_scale() == "log" and high < NARROW * low:
-            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axis.set_major_locator(
+                MaxNLocator(5, steps=[1, 2, 5, 10]) if high < TIGHT * low else FixedLocator(_round_numbers(low, high))
+            )
             axis.set_major_formatter(lambda value, _: f"{value:g}")
             axis.set_minor_locator(NullLocator())
+
+
+def _round_numbers(low: float, high: float) -> list[float]:
+    """1, 2, 3, 5 and 7, and ten times and a tenth of these and so on, as far as they lie between."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [number for decade in decades for one in (1, 2, 3, 5, 7) if low <= (number := one * 10.0**decade) <= high]

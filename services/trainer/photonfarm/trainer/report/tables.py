@@ -125,6 +125,10 @@ def _has_references(contents: Contents) -> bool:
     return any(entry.row.metrics is not None for entry in contents.entries)
 
 
+def _has_denoisers(contents: Contents) -> bool:
+    return any(entry.row.kept is not None for entry in contents.entries)
+
+
 def _of_time(contents: Contents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
@@ -140,11 +144,15 @@ def _of_time(contents: Contents) -> str:
 
 def _of_paper(contents: Contents) -> str:
     film, unit = contents.card.spec.film, contents.measure.published
-    return (
+    said = (
         "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on another "
         "machine: orders of errors can be compared, values cannot. Of time, the networks' ratios can"
-        f"{'' if unit is None else f' ({contents.measure.architecture} took {unit.seconds:g} s there)'}. The "
-        "denoisers' cannot: their time is mostly rendering, here of "
+        f"{'' if unit is None else f' ({contents.measure.architecture} took {unit.seconds:g} s there)'}"
+    )
+    if not _has_denoisers(contents):
+        return said
+    return (
+        f"{said}. The denoisers' cannot: their time is mostly rendering, here of "
         f"{contents.card.spec.transport.half_spp} samples per pixel at {film.width} × {film.height}, where starting "
         "takes much of it, and of another number in the paper"
     )
@@ -227,11 +235,12 @@ def _frame_parts(contents: Contents) -> list[Table]:
         if entry.time
     )
     head = ("architecture", "render 1/k", "buffers", "points seen", "photons", "network", "all")
-    said = [
-        "milliseconds: the median, and the middle 80 % of the times. Denoisers are given one half-estimate of 1/k of "
-        "the pixels; as splats of light paths do not stop at these, their light paths are as many as for the whole "
-        "image (up to 64 × as many per pixel)"
-    ]
+    said = ["milliseconds: the median, and the middle 80 % of the times"]
+    if _has_denoisers(contents):
+        said.append(
+            "denoisers are given one half-estimate of 1/k of the pixels; as splats of light paths do not stop at "
+            "these, their light paths are as many as for the whole image (up to 64 × as many per pixel)"
+        )
     networks = {story.name: story.run.settings.network for story in contents.stories}
     transport = {name: of for name, of in networks.items() if of.architecture.startswith("light_transport")}
     if relative := [name for name, of in transport.items() if of.maxima == "relative"]:

@@ -133,6 +133,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     found = compare(store, runs, references=references, most=6)
     foot = told(found).split("\n\n")[-1]
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
+    assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
     assert "denoisers: up to 25.0% of a reference is the half A that they were given" in foot
     assert "which flatters them in the columns from MSSIM on; out of both MSE it is taken" in foot
@@ -143,7 +144,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     bare = replace(found, rows=tuple(replace(row, metrics=replace(row.metrics, inception=None)) for row in found.rows))
     assert "no weights of the Inception network are installed" in notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
-    assert notes(converged)[2].endswith("samples per pixel or more; converged")
+    assert notes(converged)[1].endswith("; converged")
     head = told(found).split("\n\n")[0]
     assert head.startswith(
         f"analytic: 6 held-out samples of {found.views} views of {found.units} configurations; noise"

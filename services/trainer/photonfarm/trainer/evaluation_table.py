@@ -26,15 +26,14 @@ def told(evaluation: Evaluation) -> str:
 
 def notes(evaluation: Evaluation) -> list[str]:
     """What is to be known of the errors, a sentence each."""
-    denoisers = any(row.kept is not None for row in evaluation.rows)
     found = [
-        "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out",
-        f"intervals: 95 %, over the {counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}",
+        "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
+        f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
         return [*found, "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)"]
-    return [*found, *_of_references(evaluation.references, denoisers=denoisers), *_of_inception(metrics)]
+    return [*found, *_of_references(evaluation, evaluation.references, metrics), *_of_inception(metrics)]
 
 
 def _of_few(units: int) -> str:
@@ -60,16 +59,19 @@ def _of_time(evaluation: Evaluation) -> str:
     )
 
 
-def _of_references(references: References, *, denoisers: bool) -> list[str]:
+def _of_references(evaluation: Evaluation, references: References, metrics: ImageMetrics) -> list[str]:
     converged = (
         "converged"
         if references.spp >= CONVERGED_SPP
         else f"not converged, which takes {CONVERGED_SPP}: their noise is in the columns from MSSIM on; "
         "out of MSE it is taken by their halves, but for what the display's curve makes of it"
     )
-    views = counted(references.views, "view")
-    found = [f"references: of {views}, of {references.spp} samples per pixel or more; {converged}"]
-    if denoisers:
+    units = metrics.mse.estimate.count
+    found = [
+        f"references: of {counted(references.views, 'view')}, of {references.spp} samples per pixel or more; intervals "
+        f"over their {counted(units, evaluation.unit)}{_of_few(units)}; {converged}"
+    ]
+    if any(row.kept is not None for row in evaluation.rows):
         found.append(
             f"denoisers: up to {references.half_a_share:.1%} of a reference is the half A that they were given, "
             "which flatters them in the columns from MSSIM on; out of both MSE it is taken"

@@ -125,7 +125,7 @@ def _figure(caption: str, *pictures: tuple[Picture, str]) -> str:
         f'<img alt="{escape(alt)}" src="{png_uri(picture, max(1, -(-PICTURE_WIDTH // picture.shape[1])))}">'
         for picture, alt in pictures
     )
-    return f"<figure>{images}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f"<figure>{images}<figcaption>{escape(caption).replace('_', '_<wbr>')}</figcaption></figure>"
 
 
 def _facts(contents: Contents) -> str:

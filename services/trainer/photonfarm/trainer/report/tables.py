@@ -12,7 +12,6 @@ from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Contents, Entry
 from photonfarm.trainer.report.plots import measures
-from photonfarm.trainer.waits import stated
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,13 +261,18 @@ def _runs(contents: Contents) -> Table:
     rows = []
     for story in contents.stories:
         about = story.document()
+        shares = about["waits"]
         rows.append(
             (
                 story.name, f"{about['parameters']:,}", f"{about['steps']}", f"{about['draws_per_sample']:.1f}",
-                f"{about['seconds']['train'] / 60:.1f}", stated(about["waits"], about["samples_per_used"]),
+                f"{about['seconds']['train'] / 60:.1f}", f"{shares['samples']:.1%}", f"{shares['reading']:.1%}",
+                f"{about['samples_per_used']:.2f}", about["bottleneck"],
             )
         )  # fmt: skip
-    head = ("run", "parameters", "steps", "draws per sample", "minutes of steps", "waits")
+    head = (
+        "run", "parameters", "steps", "draws per sample", "minutes of steps", "waited for samples", "for reading",
+        "samples there for each used (--ahead)", "bottleneck",
+    )  # fmt: skip
     return Table("Training", head, tuple(rows))
 
 

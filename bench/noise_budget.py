@@ -195,7 +195,7 @@ def levels(room: Room, found: Fit) -> str:
     beyond = [(model - a) / model for model in found.predicted(room.errors)]
     below = sum(arm.shown.estimate().mean < a for arm in room.arms)
     return (
-        f"By the model endless data would leave a = {a:.5f}, and b = {b:.5f}: of an arm's MSE, as it has it, "
+        f"By the model endless data would leave a = {a:.5f}, and b = {b:.5f}: of the MSE that it gives an arm "
         f"{min(beyond):.0%} to {max(beyond):.0%} is excess, which is all that a budget and its shares can change. a is "
         f"fitted, without an interval; {below} of the {len(room.arms)} arms were measured below it."
     )
@@ -213,7 +213,7 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
         f"best of {budget:g} core-seconds is {best.modifications} configurations of "
         f"{room_study.counted(best.views, 'view')} with {best.spp} spp each; with one view "
         f"s* = {real:.2f} ({low:.2f} … {high:.2f}). Of the replicates' κ and ρ the best has "
-        f" {shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
+        f"{shares([of.spp for of in bought], 'spp')}; and {shares([of.views for of in bought], 'views')}."
     )
 
 

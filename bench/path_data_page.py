@@ -95,7 +95,7 @@ def factors_table(study: Study, targets: Targets) -> str:
 def costs_table(study: Study, targets: Targets) -> str:
     header = (
         "data", "spp of a half", "core-seconds of both halves", "of a sample with all that goes with it, by the stores",
-        "noise of a target", "relative noise of a target",
+        "noise of a target", "relative to brightness",
     )  # fmt: skip
     costs = study.costs
     halves_s = (costs.bdpt_s, costs.path_fixed_s + costs.path_spp * costs.path_spp_s)
@@ -128,9 +128,9 @@ def verdict(study: Study, targets: Targets) -> str:
         f"After {ours.arm.samples} samples of `bdpt` the held-out MSE is {ours.shown.estimate().mean:.5f}. After data "
         f"of `path` of {dearer} times the core-seconds it is {errors}; told apart from that of `bdpt`: "
         f"{' and '.join(apart) or 'none'}. By lines through all arms `path` needs "
-        f"{in_words(by_later.value, study.budgets)} times the core-seconds for the error of `bdpt`, which is known as "
-        f"roughly as {within_words(by_later, study.budgets)} by the spread of seeds from × 1, and "
-        f"{within_words(by_all, study.budgets)} by that of all arms. By the variance of noise alone it needs "
+        f"{in_words(by_later.value, study.budgets)} times the core-seconds for the error of `bdpt`. The 95 % interval "
+        f"of that is wide: {within_words(by_later, study.budgets)} with the spread of seeds of the arms from × 1, and "
+        f"{within_words(by_all, study.budgets)} with that of all arms. By the variance of noise alone it needs "
         f"{in_interval(relative)} times, relative to brightness, and {in_interval(linear)} times in exposed linear "
         "radiance, where what is brightest leads."
     )

@@ -21,7 +21,7 @@ from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SceneSpec
 
 NAME = "sample_costs"
-SPP = (2, 8, 32, 128)
+SPP = (2, 4, 8, 32, 128)
 
 
 @dataclass(frozen=True, slots=True)

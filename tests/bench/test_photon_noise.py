@@ -82,7 +82,8 @@ def test_the_page_and_its_figures_say_how_much_more_error_there_is() -> None:
     text = page([room])
     assert "`light_transport`: 0.02250 (" in text
     first, second = (line.split(" | ") for line in text.splitlines() if line.startswith(("| 64 ", "| 256 ")))
-    assert (first[5].split()[0], second[5].split()[0]) == ("0.02000", "-0.01000")
+    assert (first[6].split()[0], second[6].split()[0]) == ("0.02000", "-0.01000")
+    assert (first[5], second[5].split()[0]) == ("", "0.03000")
     values = json.loads(json.dumps(photon_noise.document([room]), allow_nan=False))["made-up"]
     assert [one["paths"] for one in values["shown"]] == [64, 256]
     assert values["shown"][1]["light_transport_photons"][0] == 0.01

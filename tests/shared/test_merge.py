@@ -1,7 +1,7 @@
 """Passes merge exactly: the truth is Python's fractions, and neither order nor grouping leaves a trace."""
 
 import json
-from dataclasses import fields
+from dataclasses import asdict, fields
 from fractions import Fraction
 from pathlib import Path
 
@@ -188,10 +188,17 @@ def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Pat
     assert_equal(Merged.read(tmp_path / "view.npz"), merged)
     with np.load(tmp_path / "view.npz") as stored:
         np.testing.assert_array_equal(stored["standard_error"], merged.standard_error)
-    for content in (b"nothing", (tmp_path / "view.npz").read_bytes()[:3000]):
+    np.savez(tmp_path / "two.npz", **{**asdict(merged), "passes": [1, 2]})
+    np.save(tmp_path / "array.npy", merged.mean)
+    whole = (tmp_path / "view.npz").read_bytes()
+    others = ((tmp_path / name).read_bytes() for name in ("two.npz", "array.npy"))
+    for content in (b"nothing", whole[:3000], *others):
         (tmp_path / "other.npz").write_bytes(content)
         with pytest.raises(StoreError, match=r"other\.npz: holds no merged view that `photonfarm store merge` wrote"):
             Merged.read(tmp_path / "other.npz")
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(StoreError, match=r"folder\.npz: cannot be read: Is a directory"):
+        Merged.read(tmp_path / "folder.npz")
 
 
 def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is(

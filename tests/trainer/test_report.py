@@ -1,5 +1,6 @@
 """A run on a real store, filled while it trains, and its report."""
 
+import importlib
 import json
 import os
 import re
@@ -12,6 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.container import ErrorbarContainer
+from matplotlib.figure import Figure
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.frame_costs import PARTS, FrameCosts, Seconds
@@ -23,8 +27,11 @@ from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.loop import CHECKPOINT, SETTINGS, train
+from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report import write_report as report_of
-from photonfarm.trainer.report.frame_times import frame_time, points_used
+from photonfarm.trainer.report.contents import gathered
+from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
+from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.store_source import StoreSource
@@ -145,9 +152,17 @@ def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene,
     assert row["linear_mse"]["standard_error"] is None
     assert "NaN" not in (tmp_path / "out/report.json").read_text()
     assert "held-out error of light_transport</div>" in (tmp_path / "out/report.html").read_text(), "no interval"
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
+    make_source, tiny, run, tmp_path, monkeypatch
+) -> None:
+    train(make_source(24), tiny(max_steps=1), run)
+    monkeypatch.setattr("photonfarm.trainer.report.gathered", lambda *_, **__: pytest.fail("it was measured"))
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot write the report"):
-        write_report(store, run, tmp_path / "file")
+    for out in (tmp_path / "file", tmp_path / "file/further"):
+        with pytest.raises(StoreError, match="cannot write the report"):
+            write_report(tmp_path / "store", run, out)
 
 
 @pytest.fixture
@@ -188,6 +203,44 @@ def test_several_runs_and_denoisers_stand_beside_the_published_figures(measured,
         assert (tmp_path / "out" / name).stat().st_size > 0, "what the Markdown shows lies beside it"
     weights = rows["light_transport"]["metric_space"]["inception"]
     assert (weights is None) or (weights["sha256"] in text)
+
+
+def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_the_axis(measured, monkeypatch) -> None:
+    """The table's order is not that of the times, by which points are drawn."""
+    store, runs, references = measured
+    loaded = [TrainedRun.load(run) for run in runs]
+    contents = gathered(store, loaded, [("fill-in", 4)], references=references, inception=None, timed=False)
+    second = Seconds(1.0, 1.0, 1.0)
+    times = (FrameTime(None, Seconds(buffers, buffers, buffers), None, None, second) for buffers in (3.0, 2.0, 1.0))
+    entries = tuple(replace(entry, time=time) for entry, time in zip(contents.entries, times, strict=True))
+    drawn = {}
+
+    def kept(name: str, about: str, draw) -> Plot:
+        drawn[name] = Figure().add_subplot()
+        draw(drawn[name])
+        return Plot(name, about, b"")
+
+    module = importlib.import_module("photonfarm.trainer.report.plots")
+    monkeypatch.setattr(module, "_drawn", kept)
+    monkeypatch.setattr(module, "FEW", 1)
+    plots(replace(contents, entries=entries))
+    colours = {name: of_axes(axes) for name, axes in drawn.items()}
+    assert list(colours["time-mse"]) == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert len(set(colours["time-mse"].values())) == 3
+    assert all(found.items() <= colours["time-mse"].items() for found in colours.values())
+    assert set(colours["curve-samples"]) == {"light_transport", "denoise_4"}
+    estimates = [entry.row.metrics.mse.estimate for entry in entries]
+    assert min(confidence_interval(one)[0] for one in estimates) < min(one.mean for one in estimates) / 2
+    assert drawn["time-mse"].get_ylim()[0] == pytest.approx(min(one.mean for one in estimates) / 2)
+    assert drawn["time-mssim"].get_yscale() == "linear"
+
+
+def of_axes(axes: Axes) -> dict[str, str]:
+    """The colours of an axes' predictors, as its legend has them."""
+    handles = zip(*axes.get_legend_handles_labels(), strict=True)
+    found = {label: handle[0] if isinstance(handle, ErrorbarContainer) else handle for handle, label in handles}
+    levels = ("mean colour", "noise of the targets")
+    return {label: line.get_color() for label, line in found.items() if label not in levels}
 
 
 def test_the_dataset_s_card_says_whom_it_is_owed_to_and_how_it_was_made(measured, scene, tmp_path) -> None:

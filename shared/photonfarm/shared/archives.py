@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.store import store_errors
 
-_DAMAGED = (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
+_DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
 """What reading raises of files that are no such archive."""
 
 
@@ -31,14 +31,16 @@ def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> N
 def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
     """The arrays of a file by name, each read when it is asked for.
 
-    Raises StoreError where there is no such file or it is damaged, and where what is made of the arrays inside the
-    `with` raises KeyError, IndexError or ValueError; the message names `what` it should hold, and the `verb` that
-    writes it.
+    Raises StoreError where there is no such file, it cannot be read, or it is damaged, and where what is made of the
+    arrays inside the `with` raises KeyError, IndexError, TypeError or ValueError; the message names `what` it should
+    hold, and the `verb` that writes it.
     """
     try:
         with file.open("rb") as archive, np.load(archive, allow_pickle=False) as stored:  # it leaves damaged ones open
             yield stored
     except FileNotFoundError as error:
         raise StoreError(f"{file}: there is no such file") from error
+    except OSError as error:
+        raise StoreError(f"{file}: cannot be read: {error.strerror or error}") from error
     except _DAMAGED as error:
         raise StoreError(f"{file}: holds no {what} that `photonfarm {verb}` wrote") from error

@@ -6,6 +6,7 @@ The page holds its pictures and plots; the Markdown has them beside it.
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,8 @@ def write_report(
     """
     loaded = [TrainedRun.load(run) for run in runs]
     with store_errors("write the report", out):
-        out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be measured first
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()  # what cannot be written should not be measured first
     contents = gathered(
         store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, tell=tell, timed=timed,

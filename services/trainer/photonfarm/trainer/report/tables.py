@@ -42,7 +42,7 @@ def facts(contents: Contents) -> list[tuple[str, str]]:
         ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
         ("samples", f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
                     f"in two independent halves{_further_passes(contents)}"),
-        ("noise floor", f"{contents.evaluation.noise_floor:.4g}, of held-out targets, squared exposed radiance"),
+        ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
         ("transport", f"bdpt: paths of up to {t.max_depth} edges, {counted(t.connections, 'connection')}, light ratio "
                       f"{t.light_ratio:g}"),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),

@@ -39,7 +39,7 @@ from photonfarm.shared.store.merge import merge_view
 from photonfarm.shared.store.reader import SceneReader
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import SampleSource, rows_held_out
+from photonfarm.trainer.dataset import SampleSource, rows_held_out, units_of
 from photonfarm.trainer.evaluation import batches
 from photonfarm.trainer.evaluation_samples import Samples
 from photonfarm.trainer.feed import Feed
@@ -288,7 +288,7 @@ class References:
     """Views of held-out configurations with all their passes merged, in two halves that are independent."""
 
     rows: tuple[int, ...]  # the first sample of each view
-    units: tuple[Key, ...]  # its configuration
+    units: tuple[Key, ...]  # its configuration or, of a static scene, the view itself
     halves: F32  # (N, 2, H, W, 3) linear radiance × exposure
     spp: int  # of both halves together, of the view that has fewest
 
@@ -304,7 +304,7 @@ class References:
         halves = np.stack([np.stack([view.half_a, view.half_b]) for view in merged.values()])
         exposed = (spec.exposure * halves).astype(np.float32)
         fewest = 2 * spec.transport.half_spp * min(view.passes for view in merged.values())
-        return cls(tuple(merged), tuple(source.modification_keys(list(merged))), exposed, fewest)
+        return cls(tuple(merged), tuple(units_of(source, list(merged))), exposed, fewest)
 
     @property
     def mean(self) -> F32:

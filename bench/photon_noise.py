@@ -152,7 +152,7 @@ so that only the noise differs. The photon map is the image that the network's o
 (`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. Nothing is trained: what a network would
 reach that had learned from so many photons is not measured, and can be less. Photons seen are medians over views, and
 so are those of equal power that would make as noisy a sum, (Σ p)² / Σ p². MSE is in the metric space, the references'
-noise taken out. Intervals are over configurations, for these networks (one seed).
+noise taken out. Intervals are over configurations, of a static room over views, for these networks (one seed).
 
 {parts}
 

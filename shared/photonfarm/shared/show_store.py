@@ -15,7 +15,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.shared.errors import StoreError
-from photonfarm.shared.store import store_errors
 from photonfarm.shared.store.check import Progress as Tell
 from photonfarm.shared.store.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.find import FoundSample, Matches
@@ -145,8 +144,6 @@ def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_jso
     written = []
     for key, view in views:
         file = folder / f"{key}.npz"
-        with store_errors("make the folder", folder):
-            folder.mkdir(parents=True, exist_ok=True)
         view.write(file)
         mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
         written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})

@@ -24,7 +24,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.archives import stored_arrays
+from photonfarm.shared.archives import stored_arrays, write_arrays
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.records import F32
 from photonfarm.shared.store.batch import Batch
@@ -32,7 +32,6 @@ from photonfarm.shared.store.query import Query
 from photonfarm.shared.store.reader import SceneReader
 from photonfarm.shared.store.scene_match import SceneMatch
 from photonfarm.shared.store.scene_store import SceneStore
-from photonfarm.shared.store.storage import store_errors
 
 F64 = NDArray[np.float64]
 
@@ -68,17 +67,14 @@ class Merged:
         return np.sqrt(self.m2 / (self.count * (self.count - 1)))
 
     def write(self, file: str | Path) -> None:
-        """Store it as a NumPy archive of its fields, with `standard_error`, whole or not at all.
+        """Store it as a NumPy archive of its fields, with `standard_error`, whole or not at all; make its folder too.
 
-        Raises ValueError for a name without .npz, which NumPy would add to any other, and
-        StoreError where the disk refuses.
+        Raises ValueError for a name without .npz, which NumPy would add to any other, and StoreError where the disk
+        refuses.
         """
         if (path := Path(file)).suffix != ".npz":
             raise ValueError(f"{file}: a merged view is written as a NumPy archive; give it a name that ends in .npz")
-        part = path.with_suffix(".partial.npz")
-        with store_errors("write a merged view", path):
-            np.savez(part, **asdict(self), standard_error=self.standard_error)
-            part.replace(path)
+        write_arrays(path, asdict(self) | {"standard_error": self.standard_error}, "merged view")
 
     @classmethod
     def read(cls, file: Path) -> Self:

@@ -84,9 +84,8 @@ def _headline(contents: Contents) -> str:
     return (
         f'<div class="figures">{boxes}</div>\n<p>Errors are mean squared errors of linear radiance × exposure, on '
         f"{counted(evaluation.samples, 'sample')}{passes} of {of_units(evaluation)} that were never trained on. The "
-        "noise of the targets is taken out exactly: each sample has two independent renders A and B, "
-        "and (f − A)(f − B) averages to the error against the clean image. Noise would add the last figure on "
-        "top.</p>"
+        "noise of the targets is taken out exactly: each sample has two independent renders A and B, and "
+        "(f − A)(f − B) averages to the error against the clean image. Noise would add the last figure on top.</p>"
     )
 
 

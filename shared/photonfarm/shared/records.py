@@ -58,6 +58,28 @@ class ViewBuffers:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Guides:
+    """What is known of a view before anything is learned: means over each pixel, of a grid of rays.
+
+    Pure mirrors, glass and null surfaces are followed, along their stronger lobe, to the first surface that scatters
+    otherwise: `throughput` is the product of what they let through, and `beyond_*` describes that surface. All four are
+    zero where a pixel's first surface scatters by itself. Only `direct` is noisy; its seed is its own, so that it is
+    independent of the radiance of every sample. Zero where a ray meets nothing, but for the emission of environments.
+    """
+
+    emission: F32  # (H, W, 3) radiance emitted towards the eye, also by what is seen in mirrors and through glass
+    direct: F32  # (H, W, 3) radiance of the diffuse reflection of what lights send directly, likewise
+    specular: F32  # (H, W, 3) directional albedo of all lobes less the diffuse reflectance, at least 0
+    roughness: F32  # (H, W) microfacet α of the surface: 0 for mirrors and glass, 1 for diffuse surfaces
+    mean_depth: F32  # (H, W) along the camera's forward axis
+    mean_normal: F32  # (H, W, 3) shading normals turned to the eye, world; shorter than 1 where they differ
+    throughput: F32  # (H, W, 3)
+    beyond_albedo: F32  # (H, W, 3) diffuse reflectance
+    beyond_normal: F32  # (H, W, 3) as `mean_normal`, turned to where the path comes from
+    beyond_depth: F32  # (H, W) length of the path from the eye, scene units
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Photons:
     """Surface hits of light sub-paths in one configuration; empty slots have bounce −1 and zeros."""
 
@@ -82,7 +104,7 @@ class Visibility:
 
 
 def arrays_of(
-    record: Geometry | BasePointCloud | ViewBuffers | Photons | Visibility,
+    record: Geometry | BasePointCloud | ViewBuffers | Guides | Photons | Visibility,
 ) -> dict[str, NDArray[np.generic]]:
     """The record's arrays by name, in the order of its fields."""
     return {field.name: getattr(record, field.name) for field in fields(record)}

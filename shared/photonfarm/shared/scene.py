@@ -169,6 +169,12 @@ class PhotonSpec(Frozen):
         return self.paths * self.depth
 
 
+class GuideSpec(Frozen):
+    """What is rendered beside each view's noise-free buffers, and what it may cost; no sample depends on it."""
+
+    light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
+
+
 class Credits(Frozen):
     """Whom the scene is owed to, and under which terms: it goes with the data, into reports."""
 
@@ -190,6 +196,7 @@ class SceneSpec(Frozen):
     film: Film = Film()
     transport: Transport = Transport()
     photons: PhotonSpec = PhotonSpec()
+    guides: GuideSpec = GuideSpec()
     points: Annotated[int, Field(ge=1, le=1 << 22)] = 16384  # size of the base point cloud
     exposure: Positive = 1.0  # fixed factor on linear radiance, for losses and pictures
     content: str = ""  # digest of the scene's files; set when loaded
@@ -211,8 +218,9 @@ class SceneSpec(Frozen):
 
     @cached_property
     def scene_id(self) -> str:
-        """32 hexadecimal digits: the digest of all that a sample depends on."""
-        described = self.model_dump(mode="json", exclude={"scene": {"file"}, "name": True, "credits": True})
+        """32 hexadecimal digits: the digest of all that a sample's radiance depends on."""
+        not_of_it = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
+        described = self.model_dump(mode="json", exclude=not_of_it)
         return make_key("scene", _canonical(described)).hex()
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:

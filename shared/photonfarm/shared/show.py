@@ -303,7 +303,7 @@ def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Fai
     for name, failure in failed.items():
         job = RenderArguments.of(name)
         with contextlib.suppress(CorruptError):  # of a scene whose spec is damaged
-            if job.scene_id in scene_ids and not store.scene(job.scene_id).is_committed(job.job):
+            if job.scene_id in scene_ids and not store.scene(job.scene_id).is_done(job.job):
                 missing[name] = failure
     return missing
 

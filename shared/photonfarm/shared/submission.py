@@ -51,6 +51,7 @@ def submit(
     """
     loaded, wanted = load_spec(spec), request_of(**request)
     opened = Store(store, create=True)
+    opened.add(loaded).guides.want(loaded.guides)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
     queued = None if redis_url is None else _queue(opened, redis_url, retry)
     scenes = _folder_for_workers(loaded, spec)

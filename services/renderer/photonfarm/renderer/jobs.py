@@ -20,11 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
-from photonfarm.shared.keys import Key, seed_of
+from photonfarm.shared.keys import Key, seed_of, view_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.records import (
+    F32,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+    arrays_of,
+)
+from photonfarm.shared.scene import GuideSpec, SceneSpec, parse_spec
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 from photonfarm.shared.view import View
 
@@ -50,6 +59,9 @@ class SceneRenderer(Protocol):
 
     def buffers(self, view: View) -> ViewBuffers:
         """The image-space buffers of a view."""
+
+    def guides(self, view: View, key: Key, wanted: GuideSpec) -> Guides:
+        """What is known of a view beside its buffers, rendered as is wanted; `key` is the view's."""
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether a view sees points (N, 3) of the current configuration, (N,)."""
@@ -120,37 +132,65 @@ class ShardRenderer:
         self._scenes: dict[str, _Loaded] = {}  # last used last
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit one job; False if it was committed already, or by another worker meanwhile.
+        """Render and commit what one job lacks; False if it lacked nothing, or another worker was first meanwhile.
 
-        False too if a repair took its files meanwhile: it is missing then, and comes again.
+        That is its guides, where the scene has some, and then its samples. False too if a repair took its files
+        meanwhile: it is missing then, and comes again.
 
         Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
         the planned one, IncompleteError if renders stay non-finite or buffers are.
         """
         if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
             raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
-        if stored.is_committed(job):
+        if stored.is_done(job):
             return False
         loaded = self._scene(scene_id)
         stored = loaded.stored
-        wall, core = time.monotonic(), time.process_time()
+        guided = stored.guides.lacks_job(stored.job_rows(job)) and self._render_guides(loaded, job)
+        return self._render_samples(loaded, job) if not stored.is_committed(job) else guided
+
+    def _render_guides(self, loaded: _Loaded, job: int) -> bool:
+        """Render and commit the guides of a job's new views; False if another worker was first."""
+        stored, scene, began = loaded.stored, loaded.scene, self._now()
+        rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
+        with stored.guide_writer(job) as out:
+            for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
+                modification = rows.modifications[modification_row]
+                scene.apply(modification)
+                key = modification.key(stored.scene_id)
+                for row in sorted(rows.new_views.intersection(sample.view_row for sample in group)):
+                    view = rows.views[row]
+                    guides = scene.guides(view, view_key(key, view.vector), wanted)
+                    _check_finite(arrays_of(guides), f"view {row}")
+                    out.guides(row, guides)
+            return out.commit(self._figures(began, 0))
+
+    def _render_samples(self, loaded: _Loaded, job: int) -> bool:
+        stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
         cloud = loaded.cloud()
         with stored.job_writer(job) as out:
             redrawn = _Rendering(loaded.scene, cloud, scene_id, out).run(stored.job_rows(job))
-            figures = Figures(
-                core_s=time.process_time() - core,
-                wall_s=time.monotonic() - wall,
-                redrawn=redrawn,
-                worker=self._worker,
-                versions=versions(),
-            )
-            committed = out.commit(figures)
+            committed = out.commit(self._figures(began, redrawn))
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
             if not stored.is_committed(job):
                 what = "its files were set aside by a repair while it was committed here; it will be rendered again"
             log.warning("scene %s, job %d: %s", scene_id, job, what)
         return committed
+
+    def _now(self) -> tuple[float, float]:
+        return time.monotonic(), time.process_time()
+
+    def _figures(self, began: tuple[float, float], redrawn: int) -> Figures:
+        """What was done since `began`, for a marker."""
+        wall, core = self._now()
+        return Figures(
+            core_s=core - began[1],
+            wall_s=wall - began[0],
+            redrawn=redrawn,
+            worker=self._worker,
+            versions=versions(),
+        )
 
     def _scene(self, scene_id: str) -> _Loaded:
         if scene_id in self._scenes:
@@ -248,11 +288,7 @@ class _Rendering:
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """They know no seed, so that another try would not help."""
         buffers = self._scene.buffers(view)
-        for name, values in arrays_of(buffers).items():
-            if not np.isfinite(values).all():
-                raise IncompleteError(
-                    f"{name} of view {sample.view_row} came out non-finite (sample {sample.key.hex()})"
-                )
+        _check_finite(arrays_of(buffers), f"view {sample.view_row}", f" (sample {sample.key.hex()})")
         return buffers
 
     def _halves(self, sample: SampleRow, view: View) -> F32:
@@ -279,6 +315,13 @@ class _Rendering:
     def _throw_away(self, key: Key, purpose: str) -> None:
         self._redrawn += 1
         _tell_thrown_away(key, purpose)
+
+
+def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
+    """Raise IncompleteError unless all values of what knows no seed are finite."""
+    for name, values in arrays.items():
+        if not np.isfinite(values.astype(np.float32)).all():
+            raise IncompleteError(f"{name} of {what} came out non-finite{more}")
 
 
 def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer import backend
 from photonfarm.shared.errors import SpecError
+from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification, rest
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
-from photonfarm.shared.scene import SceneSpec, Transport, shape_ids
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
+from photonfarm.shared.scene import GuideSpec, SceneSpec, Transport, shape_ids
 from photonfarm.shared.view import View
 
 
@@ -24,7 +25,7 @@ class LoadedScene:
     """
 
     def __init__(self, spec: SceneSpec, scene: Any) -> None:
-        from photonfarm.renderer import gbuffer
+        from photonfarm.renderer import gbuffer, guides
         from photonfarm.renderer.bdpt import photons
         from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.editing import MovableGroup
@@ -36,6 +37,7 @@ class LoadedScene:
         self._sensor = AimedSensor(spec)
         self._integrator = integrator_of(spec.transport)
         self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
+        self._guide_recorder, self._roughness = Recorder(guides.trace), guides.roughness_of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
@@ -116,6 +118,12 @@ class LoadedScene:
         from photonfarm.renderer.gbuffer import view_buffers
 
         return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
+
+    def guides(self, view: View, key: Key, wanted: GuideSpec) -> Guides:
+        """What is known of a view beside its buffers; `key` is the view's, by which its direct light is sampled."""
+        from photonfarm.renderer.guides import view_guides
+
+        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, self._guide_recorder)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""

@@ -28,10 +28,11 @@ class Batch:
     rows: NDArray[np.int64]  # (B,) row of each sample, of its view and of its modification
     view_rows: NDArray[np.int64]
     modification_rows: NDArray[np.int64]
+    guides: dict[str, NDArray[Any]] = field(default_factory=dict)  # as `Guides` has them, (B, …); or none of them
     wide: dict[int, F32] = field(default_factory=dict)  # by place: (2, H, W, 3) unscaled, where float16 cannot hold it
 
     @classmethod
-    def empty(cls, spec: SceneSpec, size: int, *, buffers: bool = True) -> Batch:
+    def empty(cls, spec: SceneSpec, size: int, *, buffers: bool = True, guides: bool = False) -> Batch:
         """Memory for `size` samples of a scene; without that for buffers, what their views show is not read."""
         arrays = schema.output_arrays(spec)
         names = [name for name, array in arrays.items() if array.kind == "view" and buffers]
@@ -39,7 +40,9 @@ class Batch:
         bits = schema.bit_counts(spec)
         seen = {name: memory.pop(name) for name in bits if name in memory}
         rows = np.zeros((3, size), np.int64)
-        return cls(spec.radiance_exponent, memory.pop("radiance"), memory, seen, bits, *rows)
+        known = schema.guide_arrays(spec) if guides else {}
+        of_guides = {name: np.empty((size, *array.shape), array.dtype) for name, array in known.items()}
+        return cls(spec.radiance_exponent, memory.pop("radiance"), memory, seen, bits, *rows, guides=of_guides)
 
     def __len__(self) -> int:
         """How many samples it holds, or has memory for."""
@@ -52,7 +55,8 @@ class Batch:
         rows = {name: getattr(self, name)[:count] for name in ("rows", "view_rows", "modification_rows")}
         buffers = {name: values[:count] for name, values in self.buffers.items()}
         seen = {name: values[:count] for name, values in self.seen.items()}
-        return replace(self, radiance=self.radiance[:count], buffers=buffers, seen=seen, **rows)
+        guides = {name: values[:count] for name, values in self.guides.items()}
+        return replace(self, radiance=self.radiance[:count], buffers=buffers, guides=guides, seen=seen, **rows)
 
     def linear(self, place: int) -> F32:
         """The radiance of one sample as it was rendered, (2, H, W, 3) linear, unscaled."""

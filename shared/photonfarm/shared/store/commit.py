@@ -13,22 +13,20 @@ from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError, IncompleteError
 from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, schema
 from photonfarm.shared.store.findings import Cause, Finding
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.quarantine import Quarantine
 from photonfarm.shared.store.shards import Shard, ShardWriter, encode
-from photonfarm.shared.store.storage import discard, renew_copy, store_errors
-
-if TYPE_CHECKING:
-    from photonfarm.shared.store.scene_store import SceneStore
+from photonfarm.shared.store.storage import Storage, discard, renew_copy, store_errors
 
 WAITING_ROWS = 8
 """Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
@@ -58,21 +56,46 @@ def _utc_now() -> datetime:
     return datetime.now(UTC)
 
 
-class JobWriter:
-    """Takes a job's rows in any order, and commits them once all are there.
+class Committed(Protocol):
+    """What files are committed to: a scene, or its guides."""
+
+    @property
+    def storage(self) -> Storage:
+        """Where it lies."""
+
+    @property
+    def name(self) -> str:
+        """Of its folder, which has plans and markers."""
+
+    @property
+    def scene_id(self) -> str:
+        """The scene's id."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    def is_committed(self, job: int) -> bool:
+        """Whether a job has its marker there."""
+
+
+class RowWriter:
+    """Takes rows of a job's arrays in any order, and commits them once all are there: into a `Committed`.
 
     A context manager: leaving it without `commit` leaves nothing behind. Arrays that are given must not be changed
     afterwards. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
     StoreError once the disk has refused something.
     """
 
-    def __init__(self, scene: SceneStore, rows: JobRows, plan: StoredPlan) -> None:
-        """Begin; `SceneStore.job_writer` calls this."""
+    def __init__(
+        self, scene: Committed, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
+    ) -> None:
+        """Begin; `plan` tells in which folder the arrays lie."""
         self._scene = scene
         self._rows = rows
         self._plan = plan
         self._storage = scene.storage
-        self._arrays = schema.output_arrays(scene.spec)
+        self._arrays = arrays
         self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
         self._shards: dict[str, ShardWriter] = {}
         self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
@@ -96,28 +119,6 @@ class JobWriter:
 
     # ------------------------------------------------------------------------------------------------------------- rows
 
-    def radiance(self, row: int, halves: F32) -> None:
-        """The half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
-        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
-        self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
-
-    def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
-        """What a new view row shows: its buffers, and which points and photons it sees."""
-        self._claim("view", row, "view", self._rows.new_views)
-        for name, values in arrays_of(buffers).items():
-            self._put(row, name, values)
-        self._put_bits(row, "point_seen", visibility.points)
-        self._put_bits(row, "photon_seen", visibility.photons)
-
-    def photons(self, row: int, photons: Photons) -> None:
-        """The photons of a new modification row."""
-        self._claim("modification", row, "photons", self._photon_rows())
-        for name, values in arrays_of(photons).items():
-            self._put(row, f"photon_{name}", values)
-
-    def _photon_rows(self) -> frozenset[int]:
-        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
-
     def _claim(self, kind: schema.Kind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
         if row not in expected or row in self._given[kind]:
             raise IncompleteError(f"{what} of job {self._rows.job}: row {row} is not the job's, or is there already")
@@ -131,13 +132,6 @@ class JobWriter:
             raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
         self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
         self._raise_error()
-
-    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
-        count = schema.bit_counts(self._scene.spec)[name]
-        if seen.shape != (count,):
-            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
-        if count:
-            self._put(row, name, np.packbits(seen, bitorder="little"))
 
     def _write(self) -> None:
         """The thread: after an error it only empties the queue, so that nobody waits for it."""
@@ -284,13 +278,12 @@ class JobWriter:
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
+    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+        """What must be given of each kind of rows: what it is called, and the rows."""
+        raise NotImplementedError
+
     def _check_complete(self) -> None:
-        expected = {
-            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
-            "view": ("view", self._rows.new_views),
-            "modification": ("photons", self._photon_rows()),
-        }
-        for kind, (what, rows) in expected.items():
+        for kind, (what, rows) in self._expected().items():
             if missing := rows - self._given[kind]:
                 raise IncompleteError(f"{what} of job {self._rows.job}: row {min(missing)} is missing")
 
@@ -318,14 +311,7 @@ class JobWriter:
 
     def _check_readable(self) -> None:
         """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
-        wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
-        for name, array in self._arrays.items():
-            if array.kind != "sample":
-                self._check_rows(name, wanted[array.kind])
-        samples = {sample.row for sample in self._rows.samples}
-        if self._storage.exists(self._file("radiance")):
-            samples = self._check_rows("radiance", samples, may_be_missing=True)
-        self._check_rows("radiance_wide", samples)
+        raise NotImplementedError
 
     def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
         """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
@@ -336,6 +322,61 @@ class JobWriter:
         if missing and not may_be_missing:
             raise CorruptError(f"{self._storage.where}/{self._file(name)}: row {min(missing)} is missing")
         return missing
+
+
+class JobWriter(RowWriter):
+    """Takes what a job renders: radiance of its samples, what its new views show, photons of new modifications."""
+
+    def __init__(self, scene: Committed, rows: JobRows, plan: StoredPlan) -> None:
+        """Begin; `SceneStore.job_writer` calls this."""
+        super().__init__(scene, rows, plan, schema.output_arrays(scene.spec))
+
+    def radiance(self, row: int, halves: F32) -> None:
+        """The half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
+        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
+        self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
+
+    def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
+        """What a new view row shows: its buffers, and which points and photons it sees."""
+        self._claim("view", row, "view", self._rows.new_views)
+        for name, values in arrays_of(buffers).items():
+            self._put(row, name, values)
+        self._put_bits(row, "point_seen", visibility.points)
+        self._put_bits(row, "photon_seen", visibility.photons)
+
+    def photons(self, row: int, photons: Photons) -> None:
+        """The photons of a new modification row."""
+        self._claim("modification", row, "photons", self._photon_rows())
+        for name, values in arrays_of(photons).items():
+            self._put(row, f"photon_{name}", values)
+
+    def _photon_rows(self) -> frozenset[int]:
+        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
+
+    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
+        count = schema.bit_counts(self._scene.spec)[name]
+        if seen.shape != (count,):
+            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
+        if count:
+            self._put(row, name, np.packbits(seen, bitorder="little"))
+
+    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+        return {
+            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
+            "view": ("view", self._rows.new_views),
+            "modification": ("photons", self._photon_rows()),
+        }
+
+    def _check_readable(self) -> None:
+        """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
+        wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
+        for name, array in self._arrays.items():
+            if array.kind != "sample":
+                self._check_rows(name, wanted[array.kind])
+        samples = {sample.row for sample in self._rows.samples}
+        if self._storage.exists(self._file("radiance")):
+            samples = self._check_rows("radiance", samples, may_be_missing=True)
+        self._check_rows("radiance_wide", samples)
 
 
 def _is_told(told: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:

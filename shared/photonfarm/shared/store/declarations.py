@@ -193,6 +193,96 @@ OUTPUTS = (
 )
 """What jobs produce. The first axis names what a row belongs to."""
 
+_MEAN = "mean over the pixel"
+_FIRST = "of the first surface"
+_BEYOND = "of the surface that pure mirrors, glass and null surfaces lead to; 0: the first surface is none of these"
+
+GUIDES = (
+    Declared(
+        "emission",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f4",
+        _RADIANCE,
+        f"linear RGB emitted towards the eye, {_MEAN}, also by what mirrors and glass lead to; free of noise",
+    ),
+    Declared(
+        "direct",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f4",
+        _RADIANCE,
+        f"linear RGB, {_MEAN}: diffuse reflection of light that arrives straight from lights, also at what mirrors and "
+        "glass lead to; noisy, by a seed of its own; rounded to 8 significant bits",
+    ),
+    Declared(
+        "specular",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f2",
+        "1",
+        f"directional albedo of all lobes {_FIRST} less its diffuse reflectance, at least 0, {_MEAN}",
+    ),
+    Declared(
+        "roughness",
+        ("view", "y", "x"),
+        ("R", "H", "W"),
+        "<f2",
+        "1",
+        f"microfacet alpha {_FIRST}, {_MEAN}; 0: mirror, glass, or nothing is met; 1: diffuse",
+    ),
+    Declared(
+        "mean_depth",
+        ("view", "y", "x"),
+        ("R", "H", "W"),
+        "<f4",
+        "scene units",
+        f"along the camera's forward axis, {_FIRST}, {_MEAN} of the rays that meet one",
+    ),
+    Declared(
+        "mean_normal",
+        ("view", "y", "x", "axis"),
+        ("R", "H", "W", 3),
+        "<f2",
+        "1",
+        f"shading normal {_FIRST} turned to the eye, {_WORLD}, {_MEAN}; not of unit length",
+    ),
+    Declared(
+        "throughput",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f2",
+        "1",
+        "what pure mirrors, glass and null surfaces let through on the way to the surface they lead to, "
+        f"{_MEAN}; 0: the first surface is none of these",
+    ),
+    Declared(
+        "beyond_albedo",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f2",
+        "1",
+        f"diffuse reflectance, {_MEAN}, {_BEYOND}",
+    ),
+    Declared(
+        "beyond_normal",
+        ("view", "y", "x", "axis"),
+        ("R", "H", "W", 3),
+        "<f2",
+        "1",
+        f"shading normal turned to where the path comes from, {_WORLD}, {_MEAN}, {_BEYOND}",
+    ),
+    Declared(
+        "beyond_depth",
+        ("view", "y", "x"),
+        ("R", "H", "W"),
+        "<f4",
+        "scene units",
+        f"length of the path from the eye, {_MEAN}, {_BEYOND}",
+    ),
+)
+"""What jobs produce of their new views for a scene that has guides, in groups of their own."""
+
 PLAN_INPUTS = (
     Declared(
         "modification",

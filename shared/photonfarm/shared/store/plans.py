@@ -152,7 +152,7 @@ def build(
         group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
         for declared in declarations.PLAN_INPUTS:
             schema.create_input(group, declared, getattr(rows, declared.name))
-        schema.create_outputs(group, spec, count, shard_rows)
+        schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:

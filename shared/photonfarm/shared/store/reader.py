@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.batch import Batch
+from photonfarm.shared.store.guides import GuideStore, beside, has_guides
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import SCENES, is_there, read_base, read_spec
 from photonfarm.shared.store.shards import Shard
@@ -45,17 +46,26 @@ class Sample:
     buffers: ViewBuffers
     visibility: Visibility
     pass_: int
+    guides: Guides | None = None  # of a reader that reads them
 
 
-OPEN_SHARDS = 256
+GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
+
+OPEN_SHARDS = 400
 """Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
 
 
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
-    def __init__(self, root: str | Path, scene_id: str) -> None:
-        """Name what to follow; store, scene and plans may appear later."""
+    def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
+        """Name what to follow; store, scene and plans may appear later.
+
+        With `guides` they are read too, and a sample is complete only if its view has them.
+        """
+        self._with_guides = guides
+        self._guides: GuideStore | None = None
+        self._guided: set[int] = set()  # jobs whose guides are there
         self._storage = open_storage(root)
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
@@ -76,6 +86,9 @@ class SceneReader:
             check_format(self._storage)
             self._spec = read_spec(self._storage, self._scene_id)
             self._arrays = schema.output_arrays(self._spec)
+            if self._with_guides:
+                self._guides = GuideStore(self._storage, self._name, self._spec)
+                self._arrays |= schema.guide_arrays(self._spec)
         return self._spec
 
     @property
@@ -107,12 +120,16 @@ class SceneReader:
                 return np.zeros(0, np.int64)
         _ = self.spec
         committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
+        guided = self._guides.committed_jobs() if self._guides else set()
         self._load_plans()
-        if committed == self._committed:
+        if committed == self._committed and guided == self._guided:
             return np.zeros(0, np.int64)
         complete = plans.complete_rows(self._plans, committed)
-        if self._committed - committed:  # taken back by a repair
+        if self._with_guides:
+            complete[complete] = has_guides(self._plans, guided)[self._view_row[complete]]
+        if (self._committed - committed) | (self._guided - guided):  # taken back by a repair
             self._shards.clear()
+        self._guided = guided
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
@@ -142,7 +159,7 @@ class SceneReader:
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)
         if out is None:
-            out = Batch.empty(self.spec, len(chosen))
+            out = Batch.empty(self.spec, len(chosen), guides=self._with_guides)
         if len(chosen) > len(out):
             raise ValueError(f"rows: {len(chosen)} samples do not fit a batch of {len(out)}")
         batch = out.first(len(chosen))
@@ -152,7 +169,7 @@ class SceneReader:
         with store_errors("read samples", self._storage.where):
             for place, row in enumerate(chosen.tolist()):
                 self._read_radiance(row, place, batch)
-            for name, memory in (*batch.buffers.items(), *batch.seen.items()):
+            for name, memory in (*batch.buffers.items(), *batch.guides.items(), *batch.seen.items()):
                 for place, row in enumerate(batch.view_rows.tolist()):
                     self._read_into(name, row, memory[place])
         return batch
@@ -162,9 +179,11 @@ class SceneReader:
         batch = self.read_batch([row])
         buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
         modification, view, pass_ = self.inputs(row)
+        known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
+        guides = Guides(**known) if known else None
         seen = ViewBuffers(**buffers), batch.visibility(0)
-        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_)
-        if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values())):
+        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_, guides)
+        if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
             raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
         return sample
 
@@ -285,6 +304,8 @@ class SceneReader:
 
     def _file(self, name: str, job: int) -> str:
         plan = plans.plan_of(self._plans, job * self._plans[0].shard_rows)
+        if self._guides is not None and name in GUIDE_NAMES:
+            plan = beside(plan, self._guides.name)
         return plan.shard(name, self._arrays[name], job)
 
     def _shard(self, name: str, row: int, *, anew: bool = False) -> tuple[Shard | None, int]:

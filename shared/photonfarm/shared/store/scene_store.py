@@ -23,6 +23,7 @@ from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.shared.store import declarations, markers, plans, schema
 from photonfarm.shared.store.commit import JobWriter
+from photonfarm.shared.store.guides import GuideStore, GuideWriter
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import TopUp
@@ -60,6 +61,7 @@ class SceneStore:
         self.scene_id = scene_id
         self.name = f"{SCENES}/{scene_id}"  # of its folder
         self.spec = read_spec(storage, scene_id)
+        self.guides = GuideStore(storage, self.name, self.spec)
         self._plans: list[StoredPlan] = []
 
     @property
@@ -128,6 +130,11 @@ class SceneStore:
         rows = self.job_rows(job)
         return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
 
+    def guide_writer(self, job: int) -> GuideWriter:
+        """What takes the guides of a job's new views and commits them; raises IndexError for a job of no plan."""
+        rows = self.job_rows(job)
+        return self.guides.writer(rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
+
     def jobs(self) -> int:
         """How many jobs are planned; they are numbered from 0."""
         found = self.plans()
@@ -138,13 +145,18 @@ class SceneStore:
         return markers.jobs(self.storage, self.name)
 
     def missing_jobs(self) -> list[int]:
-        """The jobs that are planned and not committed, in order."""
+        """The jobs that are planned and not committed, or lack the guides that the scene has, in order."""
         committed = self.committed_jobs()
-        return [job for job in range(self.jobs()) if job not in committed]
+        missing = {job for job in range(self.jobs()) if job not in committed}
+        return sorted(missing.union(self.guides.lacks(self._plans)))
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
         return self.storage.exists(markers.name_of(self.name, job))
+
+    def is_done(self, job: int) -> bool:
+        """Whether a job is committed, and lacks no guides."""
+        return self.is_committed(job) and not self.guides.lacks_job(self.job_rows(job))
 
     def marker(self, job: int) -> dict[str, Any]:
         """The marker of a committed job: its files and its figures."""

@@ -9,7 +9,7 @@ in every chain, since Blosc alone lets flipped bits through.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError
 from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store.declarations import OUTPUTS, Declared
+from photonfarm.shared.store.declarations import GUIDES, OUTPUTS, Declared
 
 if TYPE_CHECKING:
     import zarr
@@ -55,19 +55,29 @@ class ArraySchema:
 
 def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     """The output arrays of a scene, by name; a scene without photons has none for them."""
+    return _arrays(OUTPUTS, spec)
+
+
+def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
+    """The arrays of a scene's guides, by name; each row belongs to a view."""
+    return _arrays(GUIDES, spec)
+
+
+def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons}
-    wanted = [declared for declared in OUTPUTS if all(lengths.get(str(n), 1) for n in declared.shape)]
-    return {declared.name: _resolved(declared, lengths, spec) for declared in wanted}
+    wanted = [each for each in declared if all(lengths.get(str(n), 1) for n in each.shape)]
+    return {each.name: _resolved(each, lengths, spec) for each in wanted}
 
 
 def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
-    """Stored bytes of one sample, one view and one modification, before compression, with their inputs."""
+    """Stored bytes of one sample, one view with its guides, and one modification, before compression, with inputs."""
     found: dict[Kind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
             found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
+    found["view"] += sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in guide_arrays(spec).values())
     return found
 
 
@@ -94,9 +104,9 @@ def _resolved(declared: Declared, lengths: Mapping[str, int], spec: SceneSpec) -
 # ------------------------------------------------------------------------------------------------ arrays through zarr
 
 
-def create_outputs(group: zarr.Group, spec: SceneSpec, rows: int, shard_rows: int) -> None:
-    """Declare every output array of a plan at its full size; nothing is ever appended or resized."""
-    for array in output_arrays(spec).values():
+def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, shard_rows: int) -> None:
+    """Declare arrays of a plan's outputs at their full size; nothing is ever appended or resized."""
+    for array in arrays:
         group.create_array(
             array.name,
             shape=(rows, *array.shape),

@@ -1,0 +1,351 @@
+"""What is known of a view before anything is learned: emission, direct light, gloss, and what mirrors and glass show.
+
+All are means over a regular grid of rays in each pixel, as albedo is. A ray that meets a surface of delta lobes alone
+(a mirror, smooth glass, a null surface) is *followed* along the lobe that takes more than half of the light, to the
+first surface that scatters otherwise. What is emitted on the way counts as seen.
+
+**Direct light** is what lights send straight to that surface and its diffuse part reflects: one sum over shadow rays,
+with lights chosen as the integrator chooses them. Its points are one low-discrepancy set in each pixel, shifted by a
+random vector of the pixel's own (Cranley and Patterson 1976), so that it is unbiased and independent of every sample's
+radiance. All else is the same whatever the seed.
+
+**Specular** is the directional albedo of the whole BSDF, by its own sampling at fixed points, less the diffuse
+reflectance. **Roughness** is α of the microfacet distribution as the material states it, the mean of a texture.
+
+Shape letters: H W image, N rays: pixel by pixel, and within a pixel row by row of its grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.arrays import floats, points
+from photonfarm.renderer.bdpt.emission import Lights, read_lights, sample_direct
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.gbuffer import GRID, RAYS, diffuse_reflectance
+from photonfarm.shared.keys import Key, Stream
+from photonfarm.shared.records import F32, Guides
+from photonfarm.shared.scene import GuideSpec, SceneSpec
+from photonfarm.shared.view import Camera, View
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.bdpt.recording import Recorder
+
+SUB_PIXELS = GRID * GRID
+
+FOLLOWED = 8
+"""Mirrors and panes of glass that are followed at most."""
+
+NO_LIMIT = 1 << 20
+"""Edges of a path where the spec sets no limit."""
+
+BSDF_SAMPLES = 2
+"""Of each ray, for the directional albedo."""
+
+PURPOSE = "direct"
+"""Of the seed of direct light, which follows from the view's key."""
+
+
+def view_guides(
+    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32,
+    recorder: Recorder | None = None,
+) -> Guides:  # fmt: skip
+    """The guides of a view in the scene's present configuration; `key` is the view's, `roughness` of `roughness_of`.
+
+    With a `recorder` of `trace` Python runs but once for all views.
+    """
+    camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
+    pixels = camera.height * camera.width
+    directions = _grid(camera)
+    shifts = Stream(key, PURPOSE).uniform(pixels, 3).astype(np.float32)
+    rows = max(1, RAYS // (SUB_PIXELS * camera.width)) * camera.width  # pixels at a time, in whole rows
+    parts = [
+        _traced(
+            scene, camera, spec, (directions[start : start + rows], shifts[start : start + rows]), roughness, recorder
+        )
+        for start in range(0, pixels, rows)
+    ]
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _guides(found, camera)
+
+
+def _grid(camera: Camera) -> F32:
+    """Unit directions through the grid of each pixel, (H·W, 16, 3)."""
+    steps = (np.arange(GRID) + 0.5) / GRID
+    within = [camera.rays(u, v).reshape(-1, 3) for v in steps for u in steps]
+    return np.stack(within, axis=1)
+
+
+def _traced(
+    scene: Any, camera: Camera, spec: SceneSpec, given: tuple[F32, F32], roughness: F32, recorder: Recorder | None
+) -> dict[str, NDArray[np.float64]]:
+    """Sums over the grids of some pixels, (pixels, channels), by name; see `trace`."""
+    directions, shifts = given[0].reshape(-1, 3), np.repeat(given[1], SUB_PIXELS, axis=0)
+    along = directions.astype(np.float64) @ camera.forward  # cosine to the forward axis
+    near, far = spec.view.near / along, spec.view.far / along
+    rays = points(camera.origin + directions * near[:, None]), mi.Vector3f(points(directions)), floats(far - near)
+    lights = read_lights(scene) if scene.emitters() else None
+    settings = Settings(
+        spec.guides.light_samples if lights is not None else 0,
+        FOLLOWED if has_pure_deltas(scene) else 0,
+        spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
+        spec.view.near,
+    )
+    tables = floats(roughness), *(floats(column) for column in _pattern(settings.light_samples).T)
+    arguments = lights, tables, *rays, floats(along), points(shifts), settings
+    kind = (len(along), settings, lights.kinds if lights else None)
+    columns = recorder(kind, scene, None, *arguments) if recorder else trace(scene, None, *arguments)
+    return {name: _rows(column).reshape(len(given[0]), SUB_PIXELS, -1).sum(1) for name, column in columns.items()}
+
+
+def _rows(column: Any) -> NDArray[np.float64]:
+    found = np.array(column, np.float64)
+    return found.T if found.ndim > 1 else found
+
+
+def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera) -> Guides:
+    """The guides of the sums over each pixel's rays."""
+
+    def image(values: NDArray[np.float64]) -> F32:
+        shaped = values.reshape(camera.height, camera.width, -1).astype(np.float32)
+        return shaped[..., 0] if shaped.shape[-1] == 1 else shaped
+
+    def of_those(name: str, count: str) -> F32:
+        return image(sums[name] / np.maximum(sums[count], 1))
+
+    mean = {name: values / SUB_PIXELS for name, values in sums.items()}
+    return Guides(
+        emission=image(mean["emission"]),
+        direct=image(mean["direct"]),
+        specular=image(np.maximum(mean["specular"], 0)),
+        roughness=image(mean["roughness"]),
+        mean_depth=of_those("depth", "hits"),
+        mean_normal=image(mean["normal"]),
+        throughput=image(mean["throughput"]),
+        beyond_albedo=of_those("beyond_albedo", "beyond"),
+        beyond_normal=of_those("beyond_normal", "beyond"),
+        beyond_depth=of_those("beyond_depth", "beyond"),
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- of the materials
+
+
+def has_pure_deltas(scene: Any) -> bool:
+    """Whether any shape of the scene has a BSDF of delta lobes alone, so that there is something to follow."""
+    return any(bool(_is_pure_delta(shape.bsdf().flags())) for shape in scene.shapes() if shape.bsdf() is not None)
+
+
+def _is_pure_delta(flags: Any) -> Any:
+    return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
+def roughness_of(scene: Any) -> F32:
+    """Roughness of every BSDF of the scene's shapes, by its number in Dr.Jit's registry."""
+    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
+    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
+    table = np.ones(max(numbers, default=0) + 1, np.float32)
+    for number, bsdf in zip(numbers, bsdfs, strict=True):
+        table[number] = _alpha(bsdf)
+    return table
+
+
+def _alpha(bsdf: Any) -> float:
+    """α of a BSDF: the mean of those that its parameters name; without any 0 of pure delta lobes, otherwise 1."""
+    found = [
+        float(np.mean(np.array(value))) ** (2 if "roughness" in key else 1)  # of `principled`: α = roughness²
+        for key, value in mi.traverse(bsdf)
+        if {"alpha", "alpha_u", "alpha_v", "roughness"} & set(key.split("."))
+        and key.rsplit(".", 1)[-1] in ("alpha", "alpha_u", "alpha_v", "roughness", "value", "data")
+    ]
+    if found:
+        return float(np.clip(np.mean(found), 0, 1))
+    return 0.0 if _is_pure_delta(bsdf.flags()) else 1.0
+
+
+# ------------------------------------------------------------------------------------------------------------- tracing
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The numbers that a kernel is made for."""
+
+    light_samples: int  # of each ray
+    followed: int  # mirrors and panes at most
+    max_depth: int  # edges of a path of the images
+    near: float  # distance of the near plane
+
+
+@dataclass(slots=True)
+class _Path:
+    """Loop variables of a path through mirrors and glass."""
+
+    active: Any  # Bool: the ray has not been traced yet
+    ray: Any  # Ray3f
+    throughput: Any  # Color3f
+    emission: Any  # Color3f: of all that was met
+    length: Any  # Float: from the eye to the ray's origin
+    followed: Any  # UInt32: surfaces left behind
+
+
+@dataclass(slots=True)
+class _Light:
+    """Loop variables of the sum over light samples."""
+
+    index: Any  # UInt32
+    total: Any  # Color3f: irradiance / π
+
+
+def trace(
+    scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
+    settings: Settings,
+) -> dict[str, Any]:  # fmt: skip
+    """Of each ray what `_guides` makes means of, by name; zeros where there is nothing.
+
+    `tables` are the roughness of BSDFs and three columns of points; rays begin on the near plane, whose distance from
+    the eye is `settings.near` / `along`.
+    """
+    roughness, *pattern = tables
+    ray = mi.Ray3f(o=o, d=d, maxt=reach, time=0, wavelengths=[])
+    first = scene.ray_intersect(ray)
+    hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
+    path = _followed(scene, ray, before, settings)
+    last = scene.ray_intersect(path.ray)
+    met, is_beyond = last.is_valid(), hit & (path.followed > 0)
+    albedo = diffuse_reflectance(last, met)
+    arrives = _irradiance(scene, lights, last, path, pattern, shift, settings, met)
+    found = {
+        "hits": dr.select(hit, mi.Float(1), 0),
+        "depth": dr.select(hit, settings.near + first.t * along, 0),
+        "normal": dr.select(hit, _turned(first.sh_frame.n, d), 0),
+        "specular": _specular(bsdf, first, hit),
+        "roughness": dr.gather(mi.Float, roughness, dr.reinterpret_array(mi.UInt32, bsdf), hit),
+        "emission": path.emission,
+        "direct": path.throughput * albedo * arrives,
+        "throughput": dr.select(is_beyond, path.throughput, 0),
+        "beyond": dr.select(is_beyond & met, mi.Float(1), 0),
+        "beyond_albedo": dr.select(is_beyond & met, albedo, 0),
+        "beyond_normal": dr.select(is_beyond & met, _turned(last.sh_frame.n, path.ray.d), 0),
+        "beyond_depth": dr.select(is_beyond & met, path.length + last.t, 0),
+    }
+    dr.eval(found)
+    return found
+
+
+def _turned(normal: Any, direction: Any) -> Any:
+    """The normal on the side that a ray along `direction` comes from."""
+    return dr.select(dr.dot(normal, direction) > 0, -normal, normal)
+
+
+def _followed(scene: Any, ray: Any, before: Any, settings: Settings) -> _Path:
+    """The path of each ray up to the one that meets the first surface which is no pure mirror, glass or null."""
+    active = dr.full(mi.Bool, True, dr.width(ray))
+    start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
+    (path,) = traced_once(
+        state=(start,),
+        cond=lambda s: s.active,
+        body=lambda s: (_follow(scene, s, settings),),
+        labels=("path",),
+        label="mirrors and glass",
+    )
+    return path
+
+
+def _follow(scene: Any, s: _Path, settings: Settings) -> _Path:
+    """One surface on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
+
+    Sampled at 1/2, glass gives the lobe that takes more than half, with its probability, which is what it takes.
+    """
+    si = scene.ray_intersect(s.ray, active=s.active)
+    emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
+    bsdf = si.bsdf()
+    leads_on = s.active & si.is_valid() & _is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), leads_on)
+    return _Path(
+        active=leads_on,
+        ray=dr.select(leads_on, si.spawn_ray(si.to_world(bs.wo)), s.ray),
+        throughput=dr.select(leads_on, s.throughput * weight * bs.pdf, s.throughput),
+        emission=s.emission + s.throughput * emitted,
+        length=dr.select(leads_on, s.length + si.t, s.length),
+        followed=dr.select(leads_on, s.followed + 1, s.followed),
+    )
+
+
+def _specular(bsdf: Any, si: Any, hit: Any) -> Any:
+    """Directional albedo less diffuse reflectance, where the BSDF has more than a diffuse lobe; may be below 0.
+
+    That of the light's power: radiance in glass is larger by the square of the refractive index.
+    """
+    flags, context = bsdf.flags(), mi.BSDFContext(mi.TransportMode.Importance)
+    other = mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy)
+    sampled = hit & other
+    total = mi.Color3f(0)
+    within = dr.arange(mi.UInt32, dr.width(hit)) % SUB_PIXELS
+    for sample in range(BSDF_SAMPLES):
+        u = [dr.fma(mi.Float(within * BSDF_SAMPLES + sample), step, 0.5) for step in STEPS]
+        u = [x - dr.floor(x) for x in u]
+        _, weight = bsdf.sample(context, si, u[0], mi.Point2f(u[1], u[2]), sampled)
+        total += dr.select(sampled, weight, 0)
+    return total / BSDF_SAMPLES - dr.select(sampled, diffuse_reflectance(si, sampled), 0)
+
+
+def _irradiance(
+    scene: Any, lights: Lights | None, si: Any, path: _Path, pattern: Any, shift: Any, settings: Settings, met: Any
+) -> Any:
+    """What lights send straight to a surface, over π: the radiance that a white diffuse one reflects (Color3f)."""
+    if lights is None or not settings.light_samples:
+        return mi.Color3f(0)
+    normal = _turned(si.sh_frame.n, path.ray.d)
+    two_sided = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
+    reflects = met & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0)) & (path.followed + 2 <= settings.max_depth)
+    reflects &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
+    within = dr.arange(mi.UInt32, dr.width(met)) % SUB_PIXELS
+
+    def body(s: _Light) -> tuple[_Light]:
+        place = s.index * SUB_PIXELS + within
+        u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
+        light = sample_direct(lights, si, _Points([x - dr.floor(x) for x in u]), reflects)
+        cosine = dr.dot(normal, light.d)
+        lit = light.valid & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, path.ray.d) < 0)
+        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+        lit &= ~scene.ray_test(shadow, lit)
+        arrives = dr.select(lit, light.radiance_over_density * cosine * dr.inv_pi, 0)
+        return (_Light(s.index + 1, s.total + arrives),)
+
+    start = _Light(dr.zeros(mi.UInt32, dr.width(met)), dr.zeros(mi.Color3f, dr.width(met)))
+    (sums,) = traced_once(
+        state=(start,), cond=lambda s: s.index < settings.light_samples, body=body, labels=("sum",), label="lights"
+    )
+    return sums.total / settings.light_samples
+
+
+class _Points:
+    """Three numbers in the place of the integrator's sampler: one to choose a light, two for a point of it."""
+
+    def __init__(self, u: list[Any]) -> None:
+        self._u = u
+
+    def next_1d(self) -> Any:
+        """The first."""
+        return self._u[0]
+
+    def next_2d(self) -> Any:
+        """The other two."""
+        return mi.Point2f(self._u[1], self._u[2])
+
+
+STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+"""Of the additive recurrence R₃, n · steps modulo 1: the powers of 1 / 1.2207…, the root of x⁴ = x + 1 [Roberts, The
+unreasonable effectiveness of quasirandom sequences, 2018]."""
+
+
+def _pattern(light_samples: int) -> F32:
+    """The points of a pixel's light samples before they are shifted, (light_samples · 16, 3)."""
+    number = np.arange(max(light_samples, 1) * SUB_PIXELS)[:, None]
+    return (number * np.array(STEPS) % 1).astype(np.float32)

@@ -219,7 +219,7 @@ class SceneSpec(Frozen):
     @cached_property
     def scene_id(self) -> str:
         """32 hexadecimal digits: the digest of all that a sample's radiance depends on."""
-        not_of_it = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
+        not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
         described = self.model_dump(mode="json", exclude=not_of_it)
         return make_key("scene", _canonical(described)).hex()
 

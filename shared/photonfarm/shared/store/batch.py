@@ -39,10 +39,11 @@ class Batch:
         memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
         bits = schema.bit_counts(spec)
         seen = {name: memory.pop(name) for name in bits if name in memory}
-        rows, modifications, views = np.zeros((3, size), np.int64)
+        rows = np.zeros((3, size), np.int64)
         known = schema.guide_arrays(spec) if guides else {}
         of_guides = {name: np.empty((size, *array.shape), array.dtype) for name, array in known.items()}
-        return cls(spec.radiance_exponent, memory.pop("radiance"), memory, seen, bits, rows, modifications, views, of_guides)
+        radiance = memory.pop("radiance")
+        return cls(spec.radiance_exponent, radiance, memory, seen, bits, rows[0], rows[1], rows[2], of_guides)
 
     def __len__(self) -> int:
         """How many samples it holds, or has memory for."""

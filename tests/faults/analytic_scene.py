@@ -19,6 +19,8 @@ from photonfarm.shared.errors import BackendError
 from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.shared.scene import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.store.guides import NOISY
+from photonfarm.shared.store.schema import guide_arrays
 from photonfarm.shared.view import View
 
 FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
@@ -72,13 +74,15 @@ class AnalyticScene:
         depth = np.full(size, self._level(view), np.float32)
         return ViewBuffers(depth, np.full((*size, 3), 0.5, np.float32), np.full((*size, 3), 0.6, np.float32))
 
-    def guides(self, view: View, key: bytes, wanted: GuideSpec) -> Guides:
-        level = np.full((self.spec.film.height, self.spec.film.width), self._level(view), np.float32)
-        colour = np.repeat(level[..., None], 3, axis=-1)
-        noise = np.random.default_rng(list(key)).gamma(1.0, 1.0, colour.shape).astype(np.float32)
-        lit = colour * noise if wanted.light_samples else 0 * colour
-        dark, none = 0 * colour, 0 * level
-        return Guides(dark, lit, dark, none + 1, level, dark, dark, dark, dark, none)
+    def guides(self, view: View, key: bytes, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
+        """All that `schema` has, of the view's level; what is noisy follows from the key."""
+        shapes = {name: array.shape for name, array in guide_arrays(self.spec).items()}
+        found = {name: np.full(shape, self._level(view), np.float32) for name, shape in shapes.items()}
+        found["point_light"] += np.abs(lit[0])
+        for number, name in enumerate(NOISY):
+            noise = np.random.default_rng([number, *key]).gamma(1.0, 1.0, shapes[name])
+            found[name] *= noise.astype(np.float32) if wanted.light_samples else 0
+        return Guides(**found)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         return np.asarray(np.floor(position @ np.array([7.1, 13.7, 29.3]) + self._level(view)) % 2 == 0)

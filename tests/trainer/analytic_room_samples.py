@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from photonfarm.shared.keys import Key, make_key
 from photonfarm.shared.modification import Modification, sample_modification
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.records import (
+    F32,
+    LIT_POINTS,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+)
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Figures, SceneStore
 from photonfarm.shared.view import View, sample_view
@@ -27,6 +36,7 @@ class AnalyticSample:
     visibility: Visibility
     pass_: int
     scale: float = 1.0
+    guides: Guides | None = None
 
 
 class AnalyticSource:
@@ -43,6 +53,8 @@ class AnalyticSource:
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         return self._base
+
+    def follow_guides(self) -> None: ...
 
     def planned(self) -> int:
         return self._samples
@@ -93,7 +105,8 @@ class AnalyticSource:
         clean, buffers = render(self.spec, modification, view)
         photons = self.read_photons(row) if self.spec.photons.paths else None
         seen = visibility(self.spec, self._base[1], modification, view, photons)
-        return AnalyticSample(row, modification, view, noisy(clean, row, self._noise), buffers, seen, 0)
+        guides = known(clean, buffers, min(LIT_POINTS, self.spec.points))
+        return AnalyticSample(row, modification, view, noisy(clean, row, self._noise), buffers, seen, 0, guides=guides)
 
     def read_batch(self, rows: Sequence[int]) -> list[AnalyticSample]:
         return [self.read(row) for row in rows]
@@ -140,6 +153,16 @@ def commit_job(scene: SceneStore, job: int) -> bool:
         for row in rows.new_modifications & photons.keys():
             out.photons(row, photons[row])
         return out.commit(Figures(core_s=0.5, wall_s=0.6, redrawn=0, worker="test", versions={"test": "1"}))
+
+
+def known(clean: F32, buffers: ViewBuffers, lit: int) -> Guides:
+    """Half of the light, which is all direct; and what a diffuse surface without mirrors has to tell."""
+    dark, none = np.zeros_like(clean), np.zeros_like(buffers.depth)
+    return Guides(
+        emission=dark, direct=clean / 2, gloss=dark, specular=dark, roughness=none + 1, mean_depth=buffers.depth,
+        mean_normal=buffers.normal, throughput=dark, beyond_albedo=dark, beyond_normal=dark, beyond_depth=none,
+        point_light=np.ones((lit, 3), np.float32),
+    )  # fmt: skip
 
 
 def noisy(clean: F32, seed: int, noise: float) -> F32:

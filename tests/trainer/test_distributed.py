@@ -21,8 +21,10 @@ from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError
 from photonfarm.shared.plan import Request
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer import distributed as processes
+from photonfarm.trainer.assist import assist
 from photonfarm.trainer.distributed import Ranks, leading, ranks
-from photonfarm.trainer.loop import CHECKPOINT, METRICS, assist, train
+from photonfarm.trainer.learner import Learner
+from photonfarm.trainer.loop import CHECKPOINT, METRICS, train
 from photonfarm.trainer.settings import NetworkSettings, TrainSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -125,6 +127,45 @@ def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source,
     assert checkpoint.load(killed / CHECKPOINT)["step"] == 8
     assert together(lambda: make_source(24), settings, killed) == [0, 0]
     assert torch.equal(weights(run), weights(killed))
+
+
+def test_all_processes_go_back_together_and_keep_the_same_average(make_source, tiny, run, tmp_path) -> None:
+    """By the loss, of which the part of rank 1 alone is not finite, and by the held-out error.
+
+    In one session, and in another that goes on from its checkpoint, with what lies beside that.
+    """
+    settings = tiny(batch=4, learning_rate=0.1, average=0.9, schedule="cosine", warm_up=0)
+
+    def make() -> Any:
+        honest, source = Learner.step, make_source(24)
+        read = source.read
+
+        def spoilt(row: int) -> Any:
+            sample = read(row)
+            if os.environ["RANK"] == "1" and len(source.reads) == 3:
+                sample.radiance[:] = np.nan
+            return sample
+
+        def step(learner: Learner, number: int, batch: Any) -> float:
+            value = honest(learner, number, batch)
+            told = [*learner.predicting.parameters(), *learner.network.parameters()]
+            sums = [weight.double().abs().sum().item() for weight in told]
+            with (tmp_path / f"{os.environ['RANK']}.jsonl").open("a") as file:
+                file.write(json.dumps([number, value, learner.rate(number), sums]) + "\n")
+            return value
+
+        Learner.step, source.read = step, spoilt  # in a process of its own
+        return source
+
+    for steps in (10, 20):
+        assert together(make, settings.model_copy(update={"max_steps": steps}), run) == [0, 0]
+    followed = [(tmp_path / f"{rank}.jsonl").read_text().splitlines() for rank in range(SIZE)]
+    assert followed[0] == followed[1]
+    assert len(followed[0]) == 20
+    records = [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
+    recovered = [(record["cause"], record["step"]) for record in records if record["kind"] == "recovered"]
+    assert [step for cause, step in recovered if cause == "loss"] == [1, 11]
+    assert "held-out error" in [cause for cause, _ in recovered]
 
 
 @pytest.mark.parametrize(("fault", "ended"), [("store", [4, 0]), ("step", [4, 7]), ("loss", [8, 8])])

@@ -312,7 +312,7 @@ def test_photons_are_fed_as_the_store_has_them(make_source, commit, tiny, tmp_pa
 
 
 def test_a_scene_without_photons_is_refused_where_they_are_needed(make_source) -> None:
-    with pytest.raises(SpecError, match=r"photons.paths = 0.*render it anew, or train 'light_transport'"):
+    with pytest.raises(SpecError, match=r"photons.paths = 0.*render it anew, or train an architecture without"):
         network(make_source(1, photons=0), PHOTONS[0])
 
 

@@ -211,7 +211,8 @@ def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_th
     loaded = [TrainedRun.load(run) for run in runs]
     contents = gathered(store, loaded, [("fill-in", 4)], references=references, inception=None, timed=False)
     second = Seconds(1.0, 1.0, 1.0)
-    times = (FrameTime(None, Seconds(buffers, buffers, buffers), None, None, second) for buffers in (3.0, 2.0, 1.0))
+    alike = [Seconds(buffers, buffers, buffers) for buffers in (3.0, 2.0, 1.0)]
+    times = (FrameTime(None, buffers, None, None, None, second) for buffers in alike)
     entries = tuple(replace(entry, time=time) for entry, time in zip(contents.entries, times, strict=True))
     drawn = {}
 
@@ -312,7 +313,7 @@ def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measure
 
 def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measured) -> None:
     _, (transport, denoiser), _ = measured
-    parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 0.2, 0.4, 0.8), strict=True)}
+    parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 1.6, 0.2, 0.4, 0.8), strict=True)}
     surface = np.zeros((1, 8, 8), np.uint8)
     kept = np.array([1, 4])
     costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, kept=kept, render_s=np.array([[5.0], [2.0]]))

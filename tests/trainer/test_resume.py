@@ -21,6 +21,7 @@ from photonfarm.shared.store import Store
 from photonfarm.trainer import checkpoint, metrics_log
 from photonfarm.trainer.following import Growth
 from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
+from photonfarm.trainer.recovery import GOOD, NEXT
 from photonfarm.trainer.sampler import RoundSampler
 from photonfarm.trainer.store_source import StoreSource
 
@@ -48,29 +49,42 @@ def die_after(draws: int) -> Callable[[int, int], None]:
     return count
 
 
-def content(run: Path) -> dict[str, torch.Tensor]:
-    """Every tensor of a run's checkpoint: weights, the optimiser's memory, what was drawn, and when it had arrived."""
-    with safe_open(run / CHECKPOINT, framework="pt") as file:
-        return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+def content(file: Path) -> dict[str, torch.Tensor]:
+    """Every tensor of a checkpoint: weights, the optimiser's memory, what was drawn, and when it had arrived."""
+    with safe_open(file, framework="pt") as tensors:
+        return {name: tensors.get_tensor(name) for name in tensors.keys()}  # noqa: SIM118 - no mapping
 
 
 def assert_same(one: Path, other: Path) -> None:
-    a, b = content(one), content(other)
-    assert a.keys() == b.keys()
-    others = [name for name in a if name != "following.growth"]  # the same by each draw, perhaps in fewer looks
-    assert [name for name in others if not torch.equal(a[name], b[name])] == []
+    for file in (CHECKPOINT, GOOD):
+        a, b = content(one / file), content(other / file)
+        assert a.keys() == b.keys()
+        others = [name for name in a if name != "following.growth"]  # the same by each draw, perhaps in fewer looks
+        assert [name for name in others if not torch.equal(a[name], b[name])] == []
     states = [checkpoint.load(run / CHECKPOINT) for run in (one, other)]
     for name in ("joined", "shuffles"):
         assert states[0]["following"]["sampler"][name] == states[1]["following"]["sampler"][name]
     assert states[0]["following"]["asked"] == states[1]["following"]["asked"]
     assert states[0]["store"] == states[1]["store"]
+    recovered = [{key: value for key, value in state["recovery"].items() if key != "best"} for state in states]
+    assert recovered[0] == recovered[1]
 
 
-@pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        {"optimiser": "adam"},
+        {"optimiser": "rmsprop"},
+        {"schedule": "cosine", "average": 0.99},
+        {"schedule": "cosine", "average": 0.99, "learning_rate": 0.3},
+    ],
+    ids=["adam", "rmsprop", "cosine, averaged", "recovering"],
+)
 def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
-    make_source, tiny, run, tmp_path, optimiser: str
+    make_source, tiny, run, tmp_path, recipe: dict[str, Any]
 ) -> None:
-    settings, killed = tiny(max_steps=24, optimiser=optimiser), tmp_path / "killed"
+    """Also one of so high a rate that it goes back to good weights again and again."""
+    settings, killed = tiny(max_steps=24, **recipe), tmp_path / "killed"
     train(make_source(24), settings, run)
     for step in sorted(random.Random(7).sample(range(1, 24), 4)):
         how = {"count": die_after(3 * step)}
@@ -79,10 +93,25 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
     assert_same(run, killed)
     logs = [[(r["kind"], r["step"]) for r in metrics_log.read(folder / METRICS)] for folder in (run, killed)]
     assert logs[0] == logs[1]
+    assert ("recovered" in [kind for kind, _ in logs[0]]) == ("learning_rate" in recipe)
+    assert not (killed / NEXT).exists()
 
 
-@pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_run_killed_while_it_writes_a_checkpoint_does_too(make_source, tiny, run, tmp_path, call: str) -> None:
+@pytest.mark.parametrize(
+    ("call", "last", "step"),
+    [
+        ("fsync", 3, None),  # an fsync of the file and one of the folder each: the good state of step 0 is written…
+        ("fsync", 5, None),  # …and the checkpoint of step 4
+        ("fsync", 7, 4),  # the good state of step 5…
+        ("fsync", 9, 4),  # …and the checkpoint of step 8
+        ("replace", 5, 4),  # the good state is there, the checkpoint is not
+        ("replace", 6, 8),  # both are, and the good state does not yet replace the one before
+        ("replace", 7, 8),
+    ],
+)
+def test_a_run_killed_while_it_writes_a_checkpoint_does_too(
+    make_source, tiny, run, tmp_path, call: str, last: int, step: int | None
+) -> None:
     """Before the rename there is the checkpoint before, after it the new one, and never half of one."""
     train(make_source(24), tiny(), run)
     killed = tmp_path / "killed"
@@ -94,7 +123,7 @@ def test_a_run_killed_while_it_writes_a_checkpoint_does_too(make_source, tiny, r
 
         def counted(*arguments: Any) -> Any:
             done.append(plain(*arguments))
-            if len(done) == (5 if call == "fsync" else 3):  # an fsync of the file and one of the folder each
+            if len(done) == last:
                 die()
             return done[-1]
 
@@ -102,7 +131,13 @@ def test_a_run_killed_while_it_writes_a_checkpoint_does_too(make_source, tiny, r
         train(make_source(24), tiny(), killed)
 
     assert ended_by(train_and_die) == -signal.SIGKILL
-    assert checkpoint.load(killed / CHECKPOINT)["step"] == (4 if call == "fsync" else 8)
+    assert (checkpoint.load(killed / CHECKPOINT)["step"] if (killed / CHECKPOINT).exists() else None) == step
+    if step is not None:
+        stop = threading.Event()
+        stop.set()
+        assert train(make_source(24), tiny(), killed, stop=stop).step == step
+        good = checkpoint.load(killed / CHECKPOINT)["recovery"]["good"]
+        assert checkpoint.load(killed / GOOD)["step"] == good == (0 if step == 4 else 5)
     train(make_source(24), tiny(), killed)
     assert_same(run, killed)
 

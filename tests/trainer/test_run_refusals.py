@@ -9,10 +9,10 @@ import pytest
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import checkpoint, cli, metrics_log, service
-from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, read_settings, train
+from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
 from photonfarm.trainer.run_folder import held
 from photonfarm.trainer.settings import NetworkSettings
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.trained import TrainedRun, read_settings
 
 
 def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:

@@ -66,6 +66,13 @@ def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tin
     assert [e.step for e in events.Images("held out/target above prediction")] == [0, 5, 10, 12, 15]
 
 
+def test_a_run_that_goes_back_shows_what_is_left_of_its_rate(make_source, tiny, run) -> None:
+    trained(make_source(48), tiny(learning_rate=0.05, max_steps=30), run)
+    halved = [r for r in metrics_log.read(run / METRICS) if r["kind"] == "recovered"]
+    found = accumulated(run).Scalars("optimiser/rate factor")
+    assert [(e.step, e.value) for e in found] == [(r["step"], r["rate_factor"]) for r in halved] != []
+
+
 def test_without_tensorboard_nothing_is_written(run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(boards, "find_spec", lambda _: None)
     with boards.event_files(run) as board:

@@ -154,8 +154,15 @@ def test_waiting_for_a_scene_ends_when_it_is_told_to(make_source, tiny, run) -> 
     assert train(source, tiny(), run, stop=stop).reason == "stopped"
 
 
-def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(make_source, tiny, run) -> None:
-    train(make_source(24), tiny(max_steps=4), run)
+@pytest.mark.parametrize("recover", [False, True])
+def test_a_loss_that_is_not_finite_ends_a_run_with_nothing_to_go_back_to_and_keeps_the_checkpoint(
+    make_source, tiny, run, recover: bool
+) -> None:
+    """Where it is told not to recover, or goes on from a checkpoint of a version that did not."""
+    train(make_source(24), tiny(max_steps=4, recover=False), run)
+    state = checkpoint.load(run / CHECKPOINT)
+    del state["recovery"]
+    checkpoint.save(run / CHECKPOINT, state)
     before = weights(run)
     source = make_source(24)
     honest = source.read
@@ -167,7 +174,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(make_so
 
     source.read = read
     with pytest.raises(DivergedError, match="step 4: the loss is nan on rows") as diverged:
-        train(source, tiny(), run)
+        train(source, tiny(recover=recover), run)
     assert diverged.value.exit_code == 8, "apart from work that a new start would finish"
     assert same(before, weights(run))
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.archives import stored_arrays, write_arrays
 
-PARTS = ("edit_s", "buffers_s", "points_s", "photons_s", "photons_seen_s")
+PARTS = ("edit_s", "buffers_s", "guides_s", "points_s", "photons_s", "photons_seen_s")
 """What a network's frame needs besides samples, in the order in which it is made."""
 
 _ARRAYS = {
@@ -68,6 +68,7 @@ class FrameCosts:
     surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
     edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
     buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal
+    guides_s: NDArray[np.float64]  # (T,) what is known of the view beside them, direct light above all
     points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first, as modified, the view sees
     photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without, as the next
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees

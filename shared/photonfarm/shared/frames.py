@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.archives import stored_arrays, write_arrays
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.view import View
 
 _OF_VIEWS = ("depth", "albedo", "normal", "point_seen", "photon_seen")
@@ -34,6 +34,7 @@ class Frames:
     point_seen: NDArray[np.bool_]  # (F, P) and (F, K), as in `Visibility`
     photon_seen: NDArray[np.bool_]  # (F, K)
     photons: Photons | None  # of the configuration; None for a scene without
+    guides: Guides | None = None  # (F, …) of all views; None for a scene without
 
     def __len__(self) -> int:
         """How many frames there are."""
@@ -47,6 +48,12 @@ class Frames:
         """What one frame sees."""
         return Visibility(self.point_seen[frame], self.photon_seen[frame])
 
+    def guides_of(self, frame: int) -> Guides | None:
+        """Those of one frame."""
+        if self.guides is None:
+            return None
+        return Guides(**{name: values[frame] for name, values in arrays_of(self.guides).items()})
+
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError where the disk refuses."""
         arrays: dict[str, NDArray[Any]] = {
@@ -57,6 +64,8 @@ class Frames:
         }
         if self.photons is not None:
             arrays |= {f"photon_{name}": array for name, array in arrays_of(self.photons).items()}
+        if self.guides is not None:
+            arrays |= {f"guide_{name}": array for name, array in arrays_of(self.guides).items()}
         write_arrays(file, arrays, "buffers")
 
     @classmethod
@@ -67,6 +76,9 @@ class Frames:
             photons = None
             if "photon_bounce" in stored:
                 photons = Photons(*(stored[f"photon_{field.name}"] for field in fields(Photons)))
+            guides = None
+            if "guide_emission" in stored:
+                guides = Guides(*(stored[f"guide_{field.name}"] for field in fields(Guides)))
             modification = Modification.from_vector(stored["modification"])
             of_views = {name: stored[name] for name in _OF_VIEWS}
-            return cls(str(stored["scene_id"]), modification, views, photons=photons, **of_views)
+            return cls(str(stored["scene_id"]), modification, views, photons=photons, guides=guides, **of_views)

@@ -1,6 +1,7 @@
 """The arrays that make up a scene and its samples, as they pass between renderer, store and trainer.
 
-Shape letters: H W image, P points of the base cloud, K photon slots, V vertices, F faces, S shapes, G movable groups.
+Shape letters: H W image, P points of the base cloud, L of them that are lit, K photon slots, V vertices, F faces,
+S shapes, G movable groups.
 Lengths are in scene units and world coordinates; radiance is linear RGB, scene-referred, never clipped.
 """
 
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 F32: TypeAlias = NDArray[np.float32]
+
+LIT_POINTS = 1024
+"""Points of the base cloud, its first, whose direct irradiance is among the guides of a view; all of a smaller one."""
 
 STATIC = -1
 """The group index of what never moves."""
@@ -63,12 +67,14 @@ class Guides:
 
     Pure mirrors, glass and null surfaces are followed, along their stronger lobe, to the first surface that scatters
     otherwise: `throughput` is the product of what they let through, and `beyond_*` describes that surface. All four are
-    zero where a pixel's first surface scatters by itself. Only `direct` is noisy; its seed is its own, so that it is
-    independent of the radiance of every sample. Zero where a ray meets nothing, but for the emission of environments.
+    zero where a pixel's first surface scatters by itself. `direct`, `gloss` and `point_light` are noisy; they have
+    seeds of their own, so that they are independent of the radiance of every sample. Zero where a ray meets nothing,
+    but for the emission of environments.
     """
 
     emission: F32  # (H, W, 3) radiance emitted towards the eye, also by what is seen in mirrors and through glass
     direct: F32  # (H, W, 3) radiance of the diffuse reflection of what lights send directly, likewise
+    gloss: F32  # (H, W, 3) … of its reflection by all other lobes; with `direct` the whole, so that it may be below 0
     specular: F32  # (H, W, 3) directional albedo of all lobes less the diffuse reflectance, at least 0
     roughness: F32  # (H, W) microfacet α of the surface: 0 for mirrors and glass, 1 for diffuse surfaces
     mean_depth: F32  # (H, W) along the camera's forward axis
@@ -77,6 +83,7 @@ class Guides:
     beyond_albedo: F32  # (H, W, 3) diffuse reflectance
     beyond_normal: F32  # (H, W, 3) as `mean_normal`, turned to where the path comes from
     beyond_depth: F32  # (H, W) length of the path from the eye, scene units
+    point_light: F32  # (L, 3) irradiance of the cloud's first points by what lights send directly, on the normal's side
 
 
 @dataclass(frozen=True, slots=True, eq=False)

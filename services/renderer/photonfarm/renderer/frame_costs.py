@@ -17,16 +17,16 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs import located, photons_of
+from photonfarm.renderer.jobs import lit_points, located, photons_of
 from photonfarm.renderer.partial_film import PartialFilm
 from photonfarm.renderer.scenes import LoadedScene
 from photonfarm.renderer.surfaces import surface_kinds
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.frame_costs import PARTS, FrameCosts
-from photonfarm.shared.keys import Key
+from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification, rest
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import BasePointCloud, arrays_of
+from photonfarm.shared.records import BasePointCloud, Guides, arrays_of
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.find import scene_named
 from photonfarm.shared.view import View
@@ -134,10 +134,11 @@ def _time_frame(
 ) -> list[float]:
     edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
     buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
+    guides_s, _ = _wall_timed(partial(_guides, scene, cloud, frame))
     points_s, _ = _wall_timed(partial(_points_seen, scene, cloud, frame))
     photons = _time_photons(scene, frame)
     render_s = [_wall_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
-    return [edit_s, buffers_s, points_s, *photons, *render_s]
+    return [edit_s, buffers_s, guides_s, points_s, *photons, *render_s]
 
 
 def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
@@ -152,6 +153,11 @@ def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
 def _edit(scene: LoadedScene, modification: Modification) -> None:
     scene.apply(modification)
     dr.sync_thread()
+
+
+def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> Guides:
+    key = view_key(frame.key, frame.view.vector)
+    return scene.guides(frame.view, key, scene.spec.guides, lit_points(cloud, frame.modification))
 
 
 def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> NDArray[np.bool_]:

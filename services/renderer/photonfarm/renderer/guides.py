@@ -9,10 +9,16 @@ with lights chosen as the integrator chooses them. Its points are one low-discre
 random vector of the pixel's own (Cranley and Patterson 1976), so that it is unbiased and independent of every sample's
 radiance. All else is the same whatever the seed.
 
+**Gloss** is the reflection of the same light by all other lobes. Lobes may be narrow, and so the shadow rays are joined
+by one ray along a sample of the BSDF, weighted by the balance heuristic [Veach and Guibas 1995]. It is the whole less
+the diffuse part, of which a coat may take some: so it may be below 0.
+
+**Point light** is the irradiance of the cloud's first points by the same light, by 16 shadow rays each.
+
 **Specular** is the directional albedo of the whole BSDF, by its own sampling at fixed points, less the diffuse
 reflectance. **Roughness** is α of the microfacet distribution as the material states it, the mean of a texture.
 
-Shape letters: H W image, N rays: pixel by pixel, and within a pixel row by row of its grid.
+Shape letters: H W image, L lit points, N rays: pixel by pixel, and within a pixel row by row of its grid.
 """
 
 from __future__ import annotations
@@ -25,8 +31,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.arrays import floats, points
-from photonfarm.renderer.bdpt.emission import Lights, read_lights, sample_direct
+from photonfarm.renderer.arrays import floats, points, rows
+from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
 from photonfarm.renderer.bdpt.loops import traced_once
 from photonfarm.renderer.gbuffer import GRID, RAYS, diffuse_reflectance
 from photonfarm.shared.keys import Key, Stream
@@ -53,26 +59,23 @@ PURPOSE = "direct"
 
 
 def view_guides(
-    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32,
+    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32, lit: tuple[F32, F32],
     recorder: Recorder | None = None,
 ) -> Guides:  # fmt: skip
     """The guides of a view in the scene's present configuration; `key` is the view's, `roughness` of `roughness_of`.
 
-    With a `recorder` of `trace` Python runs but once for all views.
+    `lit` are positions and normals (L, 3) of the points whose irradiance is wanted. With a `recorder` of `trace` Python
+    runs but once for all views.
     """
     camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
     pixels = camera.height * camera.width
     directions = _grid(camera)
     shifts = Stream(key, PURPOSE).uniform(pixels, 3).astype(np.float32)
-    rows = max(1, RAYS // (SUB_PIXELS * camera.width)) * camera.width  # pixels at a time, in whole rows
-    parts = [
-        _traced(
-            scene, camera, spec, (directions[start : start + rows], shifts[start : start + rows]), roughness, recorder
-        )
-        for start in range(0, pixels, rows)
-    ]
+    at_once = max(1, RAYS // SUB_PIXELS)  # pixels
+    blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
+    parts = [_traced(scene, camera, spec, (directions[block], shifts[block]), roughness, recorder) for block in blocks]
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _guides(found, camera)
+    return _guides(found, camera, point_light(scene, *lit, key, wanted))
 
 
 def _grid(camera: Camera) -> F32:
@@ -96,6 +99,7 @@ def _traced(
         FOLLOWED if has_pure_deltas(scene) else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
         spec.view.near,
+        has_other_lobes(scene),
     )
     tables = floats(roughness), *(floats(column) for column in _pattern(settings.light_samples).T)
     arguments = lights, tables, *rays, floats(along), points(shifts), settings
@@ -109,7 +113,7 @@ def _rows(column: Any) -> NDArray[np.float64]:
     return found.T if found.ndim > 1 else found
 
 
-def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera) -> Guides:
+def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:
     """The guides of the sums over each pixel's rays."""
 
     def image(values: NDArray[np.float64]) -> F32:
@@ -123,6 +127,7 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera) -> Guides:
     return Guides(
         emission=image(mean["emission"]),
         direct=image(mean["direct"]),
+        gloss=image(mean["gloss"]),
         specular=image(np.maximum(mean["specular"], 0)),
         roughness=image(mean["roughness"]),
         mean_depth=of_those("depth", "hits"),
@@ -131,7 +136,31 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera) -> Guides:
         beyond_albedo=of_those("beyond_albedo", "beyond"),
         beyond_normal=of_those("beyond_normal", "beyond"),
         beyond_depth=of_those("beyond_depth", "beyond"),
+        point_light=arrives,
     )
+
+
+def point_light(scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec) -> F32:
+    """Irradiance (L, 3) of points on the side of their normals by what lights send directly; 0 without light samples.
+
+    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own.
+    """
+    total = np.zeros((len(position), 3))
+    if not wanted.light_samples or not scene.emitters():
+        return total.astype(np.float32)
+    lights, shifts = read_lights(scene), Stream(key, "point light").uniform(len(position), 3)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
+    si.p, si.n, si.t = points(position), mi.Normal3f(points(normal)), dr.ones(mi.Float, len(position))
+    si.sh_frame = mi.Frame3f(si.n)
+    for step in _pattern(0):
+        u = (shifts + step) % 1
+        light = sample_direct(lights, si, _Points([floats(column) for column in u.T]), mi.Bool(True))
+        cosine = dr.dot(si.n, light.d)
+        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+        lit = light.valid & (cosine > 0)
+        lit &= ~scene.ray_test(shadow, lit)
+        total += rows(dr.select(lit, light.radiance_over_density * cosine, 0), len(position))
+    return (total / SUB_PIXELS).astype(np.float32)
 
 
 # ---------------------------------------------------------------------------------------------------- of the materials
@@ -144,6 +173,17 @@ def has_pure_deltas(scene: Any) -> bool:
 
 def _is_pure_delta(flags: Any) -> Any:
     return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
+def has_other_lobes(scene: Any) -> bool:
+    """Whether any shape of the scene has a BSDF with lobes beside a diffuse one, and not of delta lobes alone."""
+    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
+    return any(bool(_has_other_lobes(bsdf.flags())) for bsdf in bsdfs)
+
+
+def _has_other_lobes(flags: Any) -> Any:
+    smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth)
+    return smooth & (mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy))
 
 
 def roughness_of(scene: Any) -> F32:
@@ -180,6 +220,7 @@ class Settings:
     followed: int  # mirrors and panes at most
     max_depth: int  # edges of a path of the images
     near: float  # distance of the near plane
+    glossy: bool  # whether any surface has lobes that are neither diffuse nor followed
 
 
 @dataclass(slots=True)
@@ -195,11 +236,37 @@ class _Path:
 
 
 @dataclass(slots=True)
-class _Light:
-    """Loop variables of the sum over light samples."""
+class _Sum:
+    """Loop variables of the sums over light samples."""
 
     index: Any  # UInt32
-    total: Any  # Color3f: irradiance / π
+    diffuse: Any  # Color3f
+    whole: Any  # Color3f
+
+
+@dataclass(slots=True)
+class _Arrives:
+    """Reflected direct light."""
+
+    diffuse: Any  # Color3f: by a white diffuse surface
+    whole: Any  # Color3f: by the surface as it is
+
+    def __add__(self, more: _Arrives) -> _Arrives:
+        return _Arrives(self.diffuse + more.diffuse, self.whole + more.whole)
+
+
+@dataclass(frozen=True, slots=True)
+class _Surface:
+    """Where direct light is asked for."""
+
+    scene: Any
+    lights: Lights
+    si: Any  # SurfaceInteraction3f
+    normal: Any  # Normal3f: turned to where the ray comes from
+    direction: Any  # Vector3f: of that ray
+    diffuse: Any  # Bool: its diffuse lobe reflects
+    other: Any  # Bool: it has other lobes
+    settings: Settings
 
 
 def trace(
@@ -219,7 +286,7 @@ def trace(
     last = scene.ray_intersect(path.ray)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = diffuse_reflectance(last, met)
-    arrives = _irradiance(scene, lights, last, path, pattern, shift, settings, met)
+    arrives = _lit(scene, lights, last, path, pattern, shift, settings, met)
     found = {
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),
@@ -227,7 +294,8 @@ def trace(
         "specular": _specular(bsdf, first, hit),
         "roughness": dr.gather(mi.Float, roughness, dr.reinterpret_array(mi.UInt32, bsdf), hit),
         "emission": path.emission,
-        "direct": path.throughput * albedo * arrives,
+        "direct": path.throughput * albedo * arrives.diffuse,
+        "gloss": path.throughput * (arrives.whole - albedo * arrives.diffuse),
         "throughput": dr.select(is_beyond, path.throughput, 0),
         "beyond": dr.select(is_beyond & met, mi.Float(1), 0),
         "beyond_albedo": dr.select(is_beyond & met, albedo, 0),
@@ -295,34 +363,72 @@ def _specular(bsdf: Any, si: Any, hit: Any) -> Any:
     return total / BSDF_SAMPLES - dr.select(sampled, diffuse_reflectance(si, sampled), 0)
 
 
-def _irradiance(
+def _lit(
     scene: Any, lights: Lights | None, si: Any, path: _Path, pattern: Any, shift: Any, settings: Settings, met: Any
-) -> Any:
-    """What lights send straight to a surface, over π: the radiance that a white diffuse one reflects (Color3f)."""
+) -> _Arrives:
+    """What lights send straight to a surface and it reflects: as a white diffuse one, and by all of its lobes."""
+    nothing = _Arrives(mi.Color3f(0), mi.Color3f(0))
     if lights is None or not settings.light_samples:
-        return mi.Color3f(0)
-    normal = _turned(si.sh_frame.n, path.ray.d)
-    two_sided = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
-    reflects = met & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0)) & (path.followed + 2 <= settings.max_depth)
-    reflects &= mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
-    within = dr.arange(mi.UInt32, dr.width(met)) % SUB_PIXELS
+        return nothing
+    flags = si.bsdf().flags()
+    reached = met & (path.followed + 2 <= settings.max_depth)
+    two_sided = mi.has_flag(flags, mi.BSDFFlags.BackSide)
+    diffuse = reached & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0))
+    diffuse &= mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
+    other = reached & _has_other_lobes(flags) & settings.glossy
+    at = _Surface(scene, lights, si, _turned(si.sh_frame.n, path.ray.d), path.ray.d, diffuse, other, settings)
+    return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
 
-    def body(s: _Light) -> tuple[_Light]:
-        place = s.index * SUB_PIXELS + within
-        u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
-        light = sample_direct(lights, si, _Points([x - dr.floor(x) for x in u]), reflects)
-        cosine = dr.dot(normal, light.d)
-        lit = light.valid & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, path.ray.d) < 0)
+
+def _by_lights(at: _Surface, pattern: Any, shift: Any) -> _Arrives:
+    """The mean over shadow rays to points of lights; of other lobes the share that the balance heuristic leaves."""
+    count = at.settings.light_samples
+    context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
+
+    def body(s: _Sum) -> tuple[_Sum]:
+        light = sample_direct(at.lights, si, _Points(_shifted(pattern, shift, s.index)), at.diffuse | at.other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
-        lit &= ~scene.ray_test(shadow, lit)
-        arrives = dr.select(lit, light.radiance_over_density * cosine * dr.inv_pi, 0)
-        return (_Light(s.index + 1, s.total + arrives),)
+        lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
+        cosine = dr.dot(at.normal, light.d)
+        reflects = at.diffuse & lit & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, at.direction) < 0)
+        white = dr.select(reflects, light.radiance_over_density * cosine * dr.inv_pi, 0)
+        whole = mi.Color3f(0)
+        if at.settings.glossy:
+            value, density = bsdf.eval_pdf(context, si, si.to_local(light.d), at.other & lit)
+            share = dr.select(light.delta, 1, count * light.density / (count * light.density + density))
+            whole = dr.select(at.other & lit, value * light.radiance_over_density * share, 0)
+        return (_Sum(s.index + 1, s.diffuse + white, s.whole + whole),)
 
-    start = _Light(dr.zeros(mi.UInt32, dr.width(met)), dr.zeros(mi.Color3f, dr.width(met)))
+    width = dr.width(at.diffuse)
+    start = _Sum(dr.zeros(mi.UInt32, width), dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width))
     (sums,) = traced_once(
-        state=(start,), cond=lambda s: s.index < settings.light_samples, body=body, labels=("sum",), label="lights"
+        state=(start,), cond=lambda s: s.index < count, body=body, labels=("sum",), label="shadow rays"
     )
-    return sums.total / settings.light_samples
+    diffuse = sums.diffuse / count
+    of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
+    return _Arrives(diffuse, sums.whole / count + of_diffuse)
+
+
+def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> _Arrives:
+    """What one ray along a sample of the BSDF meets of lights, with the share that shadow rays leave of it."""
+    u = _shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
+    bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
+    ray = at.si.spawn_ray(at.si.to_world(bs.wo))
+    found = at.scene.ray_intersect(ray, active=at.other)
+    emitter = found.emitter(at.scene, at.other)
+    by_light, _ = hit_densities(at.scene, at.lights, emitter, found, ray.o, at.si.p, at.other)
+    is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
+    emitted = emitter.eval(found, at.other)
+    return _Arrives(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+
+
+def _shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
+    """The three numbers of a sample of each ray."""
+    within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
+    place = sample * SUB_PIXELS + within
+    u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
+    return [x - dr.floor(x) for x in u]
 
 
 class _Points:
@@ -346,6 +452,6 @@ unreasonable effectiveness of quasirandom sequences, 2018]."""
 
 
 def _pattern(light_samples: int) -> F32:
-    """The points of a pixel's light samples before they are shifted, (light_samples · 16, 3)."""
-    number = np.arange(max(light_samples, 1) * SUB_PIXELS)[:, None]
+    """The points of a pixel's samples before they are shifted: of each light sample, then of the BSDF, (…, 3)."""
+    number = np.arange((light_samples + 1) * SUB_PIXELS)[:, None]
     return (number * np.array(STEPS) % 1).astype(np.float32)

@@ -25,6 +25,7 @@ from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
 from photonfarm.shared.records import (
     F32,
+    LIT_POINTS,
     BasePointCloud,
     Geometry,
     Guides,
@@ -60,8 +61,11 @@ class SceneRenderer(Protocol):
     def buffers(self, view: View) -> ViewBuffers:
         """The image-space buffers of a view."""
 
-    def guides(self, view: View, key: Key, wanted: GuideSpec) -> Guides:
-        """What is known of a view beside its buffers, rendered as is wanted; `key` is the view's."""
+    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
+        """What is known of a view beside its buffers, rendered as is wanted; `key` is the view's.
+
+        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        """
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether a view sees points (N, 3) of the current configuration, (N,)."""
@@ -153,14 +157,15 @@ class ShardRenderer:
         """Render and commit the guides of a job's new views; False if another worker was first."""
         stored, scene, began = loaded.stored, loaded.scene, self._now()
         rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
+        cloud = loaded.cloud()
         with stored.guide_writer(job) as out:
             for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
                 modification = rows.modifications[modification_row]
                 scene.apply(modification)
-                key = modification.key(stored.scene_id)
+                key, lit = modification.key(stored.scene_id), lit_points(cloud, modification)
                 for row in sorted(rows.new_views.intersection(sample.view_row for sample in group)):
                     view = rows.views[row]
-                    guides = scene.guides(view, view_key(key, view.vector), wanted)
+                    guides = scene.guides(view, view_key(key, view.vector), wanted, lit)
                     _check_finite(arrays_of(guides), f"view {row}")
                     out.guides(row, guides)
             return out.commit(self._figures(began, 0))
@@ -235,6 +240,11 @@ def versions() -> Mapping[str, str]:
 
 
 # -------------------------------------------------------------------------------------------------------- rendering
+
+
+def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, F32]:
+    """Positions and normals (L, 3) of the points of a configuration whose irradiance is among the guides."""
+    return rebuild(cloud, modification)[0][:LIT_POINTS], cloud.normal[:LIT_POINTS]
 
 
 def visibility_of(

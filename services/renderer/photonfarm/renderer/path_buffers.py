@@ -7,15 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm.renderer.jobs import SceneLoader, load_scene, located, photons_of, visibility_of
+from photonfarm.renderer.jobs import (
+    SceneLoader,
+    SceneRenderer,
+    lit_points,
+    load_scene,
+    located,
+    photons_of,
+    visibility_of,
+)
 from photonfarm.shared.camera_path import CameraPath, orbit
 from photonfarm.shared.configuration import named_configuration
 from photonfarm.shared.errors import IncompleteError
 from photonfarm.shared.frames import Frames
+from photonfarm.shared.keys import view_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import BasePointCloud
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.records import BasePointCloud, Guides, arrays_of
+from photonfarm.shared.scene import GuideSpec, SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.find import scene_named
 from photonfarm.shared.view import View
@@ -33,7 +42,7 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     spec = located(stored.spec)
     views = orbit(spec, path) if isinstance(path, int) else path.sampled()
     cloud = stored.base()[1] if stored.has_base() else None
-    frames_of(spec, configuration, views, cloud).write(out)
+    frames_of(spec, configuration, views, cloud, guides=stored.guides.settings()).write(out)
     return len(views)
 
 
@@ -43,8 +52,11 @@ def frames_of(
     views: Sequence[View],
     cloud: BasePointCloud | None = None,
     load: SceneLoader = load_scene,
+    guides: GuideSpec | None = None,
 ) -> Frames:
     """The buffers of views of one configuration, its photons if the scene has some, and what the views see of them.
+
+    With their guides, rendered as is told; None: without.
 
     The photons are those that the store holds of the configuration, or would: their seed follows from its key. `cloud`
     is the stored base cloud; without one it is sampled, as a job would. Raises IncompleteError for values that are not
@@ -59,7 +71,19 @@ def frames_of(
     for name, values in arrays.items():
         if not np.isfinite(values).all():
             raise IncompleteError(f"{name} of these views came out non-finite; move the camera a little")
-    points = rebuild(cloud or scene.base()[1], modification)
+    cloud = cloud or scene.base()[1]
+    points = rebuild(cloud, modification)
+    known = None if guides is None else _guides(scene, modification, views, (spec.scene_id, guides, cloud))
     seen = [visibility_of(scene, view, points, photons) for view in views]
     arrays |= {"point_seen": np.stack([s.points for s in seen]), "photon_seen": np.stack([s.photons for s in seen])}
-    return Frames(spec.scene_id, modification, tuple(views), photons=photons, **arrays)
+    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=known, **arrays)
+
+
+def _guides(
+    scene: SceneRenderer, modification: Modification, views: Sequence[View], told: tuple[str, GuideSpec, BasePointCloud]
+) -> Guides:
+    """Of all views, stacked; `told` is the scene's id, how they are rendered, and its base cloud."""
+    scene_id, wanted, cloud = told
+    key, lit = modification.key(scene_id), lit_points(cloud, modification)
+    found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]
+    return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

@@ -119,11 +119,14 @@ class LoadedScene:
 
         return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
 
-    def guides(self, view: View, key: Key, wanted: GuideSpec) -> Guides:
-        """What is known of a view beside its buffers; `key` is the view's, by which its direct light is sampled."""
+    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
+        """What is known of a view beside its buffers; `key` is the view's, by which its direct light is sampled.
+
+        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        """
         from photonfarm.renderer.guides import view_guides
 
-        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, self._guide_recorder)
+        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, lit, self._guide_recorder)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""

@@ -64,18 +64,21 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
         sync(path.parent)
 
 
-def load(path: Path) -> dict[str, Any]:
-    """A checkpoint's content, on the CPU. Raises StoreError if it cannot be read; nothing in it is executed."""
-    document, tensors = _read(path)
+def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
+    """A checkpoint's content, on the CPU; nothing in it is executed.
+
+    Raises StoreError if it cannot be read; `without` says what the run does if the file is taken away.
+    """
+    document, tensors = _read(path, without)
     if (found := document.get("format")) != FORMAT:
         raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
     if document.get("sha256") != _digest(tensors):
-        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {ANEW}")
+        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {without}")
     state: dict[str, Any] = _together(document, tensors)
     return state
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What is no tensor, and the tensors by their names."""
     try:
         with safe_open(path, framework="pt") as file:
@@ -88,7 +91,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {ANEW}") from error
+        raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {without}") from error
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

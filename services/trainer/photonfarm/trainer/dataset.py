@@ -20,11 +20,21 @@ from photonfarm.shared.keys import Key, Stream, make_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.plan import sample_key
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.records import (
+    F32,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+    arrays_of,
+)
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.view import Camera, View
 from photonfarm.trainer.networks.inputs import (
     POINTS_ONLY,
+    GuideInputs,
     Inputs,
     Needs,
     NoisyColour,
@@ -66,12 +76,19 @@ class Sample(Protocol):
     def pass_(self) -> int:
         """The number of the noisy pass of this view."""
 
+    @property
+    def guides(self) -> Guides | None:
+        """What is known of the view beside its buffers; None unless guides are followed."""
+
 
 class SampleSource(Protocol):
     """The samples of one scene: the store's reader, or anything that behaves like it. Used by one thread at a time."""
 
     def ready(self) -> bool:
         """Whether spec and base are there; they come with the scene's first job."""
+
+    def follow_guides(self) -> None:
+        """Have guides read too, and samples be complete only with them; SpecError if the scene has none."""
 
     @property
     def spec(self) -> SceneSpec:
@@ -217,12 +234,33 @@ def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BaseP
     i.world_to_camera[place] = torch.from_numpy(Camera.of(sample.view, spec).world_to_camera)
     for memory, array in ((i.depth, b.depth), (i.albedo, b.albedo), (i.normal, b.normal)):
         memory[place] = torch.from_numpy(array)
+    if i.guides is not None:
+        _fill_guides(i.guides, place, sample.guides, spec.exposure)
     batch.target[place] = torch.from_numpy(sample.radiance)
     batch.target[place].mul_(spec.exposure * sample.scale)
     if i.points is not None:
         _fill_points(i.points, place, *rebuild(cloud, sample.modification), sample.visibility.points)
     if i.photons is not None:
         i.photons.seen[place] = torch.from_numpy(sample.visibility.photons)
+
+
+OF_LIGHT = ("emission", "direct", "gloss", "point_light")
+"""The guides that are in units of radiance, or of irradiance, and so exposed."""
+
+
+def _fill_guides(memory: GuideInputs, place: int, guides: Guides | None, exposure: float) -> None:
+    for name, array in arrays_of(held(guides)).items():
+        values = getattr(memory, name)
+        values[place] = torch.from_numpy(array)
+        if name in OF_LIGHT:
+            values[place].mul_(exposure)
+
+
+def held(guides: Guides | None) -> Guides:
+    """The guides of a sample whose source follows them; raises ValueError where it does not."""
+    if guides is None:
+        raise ValueError("sample: has no guides; call `follow_guides` of its source before it is read")
+    return guides
 
 
 def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:

@@ -37,10 +37,12 @@ class Feed:
         """Feed what the settings' network needs, or what other predictors do."""
         self.geometry: Geometry
         self.cloud: BasePointCloud
-        self.geometry, self.cloud = source.base()
-        self.spec = source.spec
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or ARCHITECTURES[settings.network.architecture].needs
+        if self._needs.guides:
+            source.follow_guides()
+        self.geometry, self.cloud = source.base()
+        self.spec = source.spec
         self._lock = threading.Lock()
         self._arrived: list[tuple[int, bool]] = []
         self._complete = False

@@ -19,7 +19,7 @@ import torch
 from photonfarm.shared.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.frames import Frames
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import F32, BasePointCloud, ViewBuffers, Visibility
+from photonfarm.shared.records import F32, BasePointCloud, Guides, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store, store_errors
 from photonfarm.shared.store.find import Query, find_samples
@@ -169,6 +169,11 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         )
     if run.needs.photons and frames.photons is None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
+    if run.needs.guides and frames.guides is None:
+        raise SpecError(
+            f"{run.folder}: {run.settings.network.architecture} needs guides, and the buffers have none: make them of "
+            "a store whose scene has guides, by `photonfarm buffers`"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,6 +185,7 @@ class _Unrendered:
     buffers: ViewBuffers
     visibility: Visibility
     radiance: F32  # (2, H, W, 3) black
+    guides: Guides | None
     scale: float = 1.0
     pass_: int = 0
 
@@ -192,7 +198,9 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
         fill_photons(memory.inputs.photons, 0, given(frames.photons))
     black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
     for i, view in enumerate(frames.views):
-        shown = _Unrendered(frames.modification, view, frames.buffers(i), frames.visibility(i), black)
+        shown = _Unrendered(
+            frames.modification, view, frames.buffers(i), frames.visibility(i), black, frames.guides_of(i)
+        )
         fill(memory, 0, shown, spec, cloud)
         yield memory.filled((i,), (b"",))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import signal
 import time
@@ -13,28 +12,25 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from pydantic import ValidationError
 
 from photonfarm.shared.errors import IncompleteError, SpecError
 from photonfarm.shared.processes import Stop
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import sentences
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.dataset import Batch, SampleSource
 from photonfarm.trainer.device import usable_device
-from photonfarm.trainer.distributed import ALONE, Group, Ranks
-from photonfarm.trainer.evaluation import Predictor, batches, measure, network_predictor
+from photonfarm.trainer.distributed import ALONE, Group
+from photonfarm.trainer.evaluation import batches, network_predictor
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.following import Following, Growth
 from photonfarm.trainer.learner import Learner
 from photonfarm.trainer.metrics_log import MetricsLog
-from photonfarm.trainer.optimisers import rate_at
+from photonfarm.trainer.recovery import GoodState, settle
 from photonfarm.trainer.run_folder import held
-from photonfarm.trainer.settings import KEYS, TrainSettings
+from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.validation import Best, Comparison, Show, Validation, compared, validate
 from photonfarm.trainer.waits import Stopwatch, samples_per_used, waits
 
-Show = Callable[[int, F32, F32], None]
 T = TypeVar("T")
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -103,8 +99,9 @@ def train(
     and how many samples have arrived. `waited` seconds have gone by already. Of a `group` this is rank 0. At each
     validation `show` gets the step, targets and predictions of the first held-out samples. Raises SpecError for a run
     of another network, scene or store, a device that is not there or a hold-out that leaves nothing, StoreError for a
-    folder that cannot be written or that another trainer has, DivergedError for a loss that is not finite; the last
-    checkpoint stays.
+    folder that cannot be written or that another trainer has, DivergedError where a loss is not finite, or the held-out
+    error is that or much worse than it was, and there is nothing to go back to, or it has been gone back to too often;
+    the last checkpoint stays.
     """
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
@@ -119,30 +116,6 @@ def train(
             return Session(feed, settings, around).run()
 
 
-def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
-    """Train with rank 0 until that ends; `source` makes the samples of a scene by its id.
-
-    The folder `run`, which rank 0 writes, is read where the run goes on. Raises what `train` does.
-    """
-    torch.set_num_threads(settings.threads)
-    what, told = ranks.hear()
-    if what == "end":
-        return
-    own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
-    with Feed(source(told["scene_id"]), own) as feed:
-        learner, step = Learner(feed, settings, ranks), told["step"]
-        if told["continues"]:
-            learner.restore(checkpoint.load(run / CHECKPOINT))
-        while (heard := ranks.hear())[0] != "end":
-            if heard[0] == "rows":
-                feed.ask(ranks.part(heard[1]))
-                continue
-            batch = feed.take()
-            if ranks.joined(batch.rows):
-                learner.step(step, batch)
-                step += 1
-
-
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
@@ -151,10 +124,13 @@ class Session:
         self._run, self._watch, self._stop = around.run, around.watch, around.stop
         self._log = MetricsLog(around.run / METRICS, around.listen)
         self._learner = Learner(feed, settings, around.group)
+        self._good = GoodState(self._learner)
+        self._best: Best | None = None
         self._following = Following(feed, settings, around.script, around.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
+        self._compared: Comparison | None = None  # of this session's last one, if it ended there
         self._seconds_told: dict[str, float] = {}  # by the last validation
 
     def run(self) -> Outcome:
@@ -165,12 +141,13 @@ class Session:
             due = self._step % self._settings.validate_every == 0
             if due and self._wait(self._can_validate) and self._step != self._validated:
                 self._validate()
+                self._keep_or_go_back()
             if (batch := self._wait(self._next_batch)) is not None:
                 self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
-        if reason != "stopped" and self._following.held_out and self._step != self._validated:
-            self._validate()
+        if reason != "stopped" and self._following.held_out:
+            self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
         return Outcome(self._step, reason, self._last_error)
@@ -188,6 +165,7 @@ class Session:
 
     def _start(self) -> checkpoint.Changes:
         self._tell_begin(continues=False)
+        settle(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 
@@ -196,7 +174,11 @@ class Session:
         state = checkpoint.load(path)
         changed = checkpoint.check_continues(path, state, self._identity())
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
-        self._learner.restore(state)
+        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have none
+        settle(self._run, recovery["good"])
+        self._good.restore(state, self._run, recover=self._settings.recover)
+        if recovery["best"] and self._good.step is not None:  # with nothing to go back to, a best is of no use
+            self._best = Best.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
         self._seconds_told = dict(state["seconds"])
@@ -221,10 +203,12 @@ class Session:
                 "seconds": self._watch.seconds,
                 "last_error": self._last_error,
                 "following": self._following.state(),
+                "recovery": {**self._good.state(), "best": self._best.state() if self._best else None},
                 "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
                 "versions": checkpoint.versions(),
             }
-            checkpoint.save(self._run / CHECKPOINT, state)
+            with self._good.saved_with(self._run, self._identity()):
+                checkpoint.save(self._run / CHECKPOINT, state)
 
     def _ended(self) -> str | None:
         if self._stop.is_set():
@@ -269,18 +253,27 @@ class Session:
             raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
 
     def _validate(self) -> None:
-        """Log the held-out error of the network as it is."""
+        """Log the held-out error of the network that predicts, and compare it with the best before."""
+        self._compared = None
         rows = self._following.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
             self._following.drop()
             found = batches(self._feed, rows, self._settings.batch)
             try:
-                held_out = measure(self._shown(network_predictor(self._learner.network)), found)
+                now = validate(network_predictor(self._learner.predicting), self._step, found, self._around.show)
             except IncompleteError:  # a repair has taken all of them back, for now
                 return
             finally:
                 self._following.ask_again()
-        self._last_error, self._validated = held_out.error.mean, self._step
+        self._validated = self._step
+        if self._settings.recover:
+            self._compare(now)
+        if now.is_finite or not self._settings.recover:
+            self._log_validation(now)
+
+    def _log_validation(self, now: Validation) -> None:
+        held_out = now.held_out
+        self._last_error = held_out.error.mean
         self._log.write(
             "validation",
             step=self._step,
@@ -293,18 +286,46 @@ class Session:
         )
         self._seconds_told = seconds
 
-    def _shown(self, predict: Predictor) -> Predictor:
-        """The same predictor; the first batch of a validation is shown on the way."""
-        waiting = [self._around.show] if self._around.show is not None else []
+    def _compare(self, now: Validation) -> None:
+        self._compared = compared(now, self._best)
+        if self._compared.is_best:
+            self._best = Best(now.step, now.errors)
 
-        def predict_and_show(batch: Batch) -> F32:
-            images = predict(batch)
-            for show in waiting:
-                show(self._step, batch.target.mean(dim=1).cpu().numpy(), images)
-            waiting.clear()
-            return images
+    def _keep_or_go_back(self) -> None:
+        """Do what the last validation asks for, in all processes."""
+        found = self._compared
+        if found is not None and found.is_clearly_worse:
+            told = f"step {self._step}: {found.stated}"
+            self._around.group.tell("back", told)
+            self._good.go_back(told)
+            self._log_recovered("held-out error", found)
+        elif found is not None and not found.is_worse:
+            self._around.group.tell("keep", self._step)
+            self._good.keep(self._step)
 
-        return predict_and_show
+    def _end_no_worse(self) -> None:
+        """Validate the last step, and end with the last good state if that is worse than one may be."""
+        if self._step != self._validated:
+            self._validate()
+        found = self._compared
+        if found is not None and not found.is_worse:
+            self._good.keep(self._step)
+        elif found is not None:
+            self._good.give(f"step {self._step}: {found.stated}")
+            self._log_recovered("end", found)
+            self._validate()
+
+    def _log_recovered(self, cause: str, found: Comparison | None = None) -> None:
+        self._compared = None  # the learner is another one now
+        self._log.write(
+            "recovered",
+            step=self._step,
+            cause=cause,
+            back_to=self._good.step,
+            errors=found.document() if found else None,
+            recoveries=self._good.recoveries,
+            rate_factor=self._learner.rate_factor,
+        )
 
     def _used(self) -> tuple[int, int]:
         """Draws so far, and samples that have arrived."""
@@ -322,31 +343,11 @@ class Session:
 
     def _train_step(self, batch: Batch) -> None:
         with self._watch.on("train"):
-            value = self._learner.step(self._step, batch)
+            value = self._good.step_or_go_back(self._step, batch)
+        if value is None:
+            self._log_recovered("loss")
         self._step += 1
         self._tell_count()
-        if self._step % LOG_EVERY == 0:
-            rate = rate_at(self._step - 1, self._settings)
+        if value is not None and self._step % LOG_EVERY == 0:
+            rate = self._learner.rate(self._step - 1)
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())
-
-
-def read_settings(run: Path) -> TrainSettings:
-    """The settings a run was made with. Raises SpecError if there is no run."""
-    path = run / SETTINGS
-    try:
-        document = json.loads(path.read_text())
-        settings = TrainSettings.model_validate(document)
-    except FileNotFoundError as error:
-        if not run.is_dir():
-            raise SpecError(f"{run}: there is no such folder") from error
-        raise SpecError(
-            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
-        ) from error
-    except OSError as error:
-        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        raise SpecError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
-    except ValueError as error:
-        raise SpecError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
-    checkpoint.check_of_this_version(path, document.get("network", {}))
-    return settings

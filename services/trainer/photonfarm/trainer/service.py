@@ -49,9 +49,10 @@ def run(
     Waiting for a scene, its base and its samples counts as time spent. With a Redis, workers are told what is used.
     Started by torchrun, rank 0 does all this, and the others train with it until it ends; all need the same folder.
     """
+    from photonfarm.trainer.assist import assist
     from photonfarm.trainer.device import described
     from photonfarm.trainer.distributed import ALONE, leading, ranks
-    from photonfarm.trainer.loop import assist, stop_on_signals
+    from photonfarm.trainer.loop import stop_on_signals
     from photonfarm.trainer.store_source import StoreSource
 
     settings = _settings(preset_name, changes)
@@ -157,7 +158,7 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
 
     if (size := processes()) > 1:
         raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
-    settings = _settings(preset_name, {"max_steps": STEPS, **changes})
+    settings = _settings(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
     scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
     if scene_id is None or not StoreSource(store, scene_id).ready():
         wanted = f" {spec}" if spec else ""
@@ -165,7 +166,10 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
     with stop_on_signals() as stop, _sign_of_life(folder):
         tell = partial(click.echo, err=True)
         axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
-        if (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
+        if settings.schedule == "cosine":
+            axes["decay"] = (settings.decay,)
+            tell("decay is not searched: schedule = 'cosine' has none")
+        elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
             axes["decay"] = (settings.decay,)
             tell(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
         cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
@@ -305,6 +309,8 @@ def _tell(record: dict[str, Any]) -> None:
     if record["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
         click.echo(f"goes on from step {record['step']} with {changed}", err=True)
+    if record["kind"] == "recovered":
+        click.echo(f"step {record['step']}: {_recovered(record)}", err=True)
     if record["kind"] == "validation":
         click.echo(
             f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
@@ -312,3 +318,17 @@ def _tell(record: dict[str, Any]) -> None:
             + waits.stated(record["waits"], record["samples_per_used"]),
             err=True,
         )
+
+
+def _recovered(record: dict[str, Any]) -> str:
+    """Why a run went back, and to what."""
+    errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
+    if errors is None:
+        found = "the loss is not finite"
+    elif errors["now"] is None:
+        found = "the held-out error is not finite"
+    else:
+        found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
+    if record["cause"] == "end":
+        return f"{found}; ends with {back_to}"
+    return f"{found}; goes on from {back_to}, at {record['rate_factor']:g} of the rate"

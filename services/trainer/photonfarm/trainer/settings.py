@@ -15,7 +15,8 @@ from photonfarm.trainer import biased
 
 Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
 Architecture = Literal[
-    "cnn", "feature_projection", "light_transport", "light_transport_photons",
+    "cnn", "feature_projection", "light_transport", "light_transport_photons",  # of the paper
+    "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, told what is known of a view
     "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
@@ -23,6 +24,7 @@ Maxima = Literal["absolute", "relative"]
 PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
+Schedule = Literal["epochs", "cosine"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
 Positive = Annotated[float, Field(gt=0)]
@@ -52,6 +54,7 @@ class NetworkSettings(_Frozen):
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
+    lit_points: Count = 512  # of guided_transport: points that send direct light on, at most as many as are lit
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
 
     @model_validator(mode="after")
@@ -79,6 +82,14 @@ class TrainSettings(_Frozen):
     beta2: Annotated[float, Field(ge=0, lt=1)] = 0.999  # with rare fireflies 0.9999 … 0.99999: 1 / (1 − β₂) steps
     # must see some 25 of them, or the weights that they reach stay too dark (docs/results/firefly.md)
     alpha: Annotated[float, Field(ge=0, lt=1)] = 0.99  # of RMSprop, as β₂ of Adam: with 0.99 it darkens even more
+    schedule: Schedule = "epochs"  # of the rate: × decay an epoch [S 3.1]; "cosine" (ours): up, then down to 0 at
+    # max_steps, so that a run's last steps shake its weights the least; without decay and epochs
+    warm_up: Annotated[float, Field(ge=0, lt=1)] = 0.03  # share of max_steps in which "cosine" rises: Adam's means are
+    # of few steps then, and its first steps would else be its worst
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.0  # of the weights, kept after each step, with which a run
+    # predicts: 0.999 remembers 1000 steps, over which their noise is evened out; 0: none
+    recover: bool = True  # where it gets much worse than it was, or is not finite, a run goes back to good weights,
+    # with half the rate, so that a night of training ends little worse than it once was
 
     max_steps: Count = 150_000  # [S 4]
     max_seconds: Positive | None = None  # wall time of all sessions of the run together

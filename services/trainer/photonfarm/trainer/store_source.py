@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.keys import Key
 from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.records import BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store.batch import Batch
 from photonfarm.shared.store.reader import SceneReader
@@ -30,6 +30,7 @@ class StoredSample:
     buffers: ViewBuffers
     visibility: Visibility
     pass_: int
+    guides: Guides | None = None  # where they are followed
 
 
 class StoreSource:
@@ -38,10 +39,16 @@ class StoreSource:
     def __init__(self, root: str | Path, scene_id: str) -> None:
         self._reader = SceneReader(root, scene_id)
         self._memory: Batch | None = None
+        self._has_guides = False
 
     def ready(self) -> bool:
         """Whether spec and base are there; they come with the scene's first job."""
         return self._reader.is_begun
+
+    def follow_guides(self) -> None:
+        """Read guides too; samples are complete only with them. Raises SpecError for a scene that has none."""
+        self._reader.follow_guides()
+        self._memory, self._has_guides = None, True
 
     @property
     def spec(self) -> SceneSpec:
@@ -63,7 +70,7 @@ class StoreSource:
     def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
         """Complete rows' samples, valid until the next call; CorruptError if their bytes are not what was committed."""
         if self._memory is None or len(rows) > len(self._memory):
-            self._memory = Batch.empty(self.spec, len(rows))
+            self._memory = Batch.empty(self.spec, len(rows), guides=self._has_guides)
         read = self._reader.read_batch(rows, self._memory)
         return [self._sample(read, place, row) for place, row in enumerate(rows)]
 
@@ -73,7 +80,9 @@ class StoreSource:
         if place in read.wide:
             radiance, scale = read.wide[place], 1.0
         buffers = ViewBuffers(**{name: values[place] for name, values in read.buffers.items()})
-        return StoredSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_)
+        known = {name: values[place] for name, values in read.guides.items()}
+        guides = Guides(**known) if known else None
+        return StoredSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_, guides)
 
     def read_photons(self, row: int) -> Photons:
         """The photons of a complete row's configuration; raises StoreError for a scene that has none."""

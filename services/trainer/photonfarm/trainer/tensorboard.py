@@ -19,6 +19,7 @@ SHOWN = 4  # pictures of one validation at most
 NAMES = {
     "loss": "loss/training",
     "rate": "optimiser/rate",
+    "rate_factor": "optimiser/rate factor",
     "error": "error/held out",
     "standard_error": "error/standard error",
     "noise_floor": "error/noise of the targets",
@@ -42,7 +43,8 @@ class EventFiles:
     def record(self, record: dict[str, Any]) -> None:
         """Draw the figures of a record of metrics.jsonl."""
         step = record["step"]
-        writer = self._from(step + (record["kind"] in ("changes", "end")))  # what is of that step itself still holds
+        holds = record["kind"] in ("changes", "recovered", "end")  # what was shown of that step itself
+        writer = self._from(step + holds)
         figures = {tag: record[name] for name, tag in NAMES.items() if record.get(name) is not None}
         figures |= {f"waits/{name}": share for name, share in record.get("waits", {}).items()}
         for tag, value in figures.items():

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from pydantic import ValidationError
+
+from photonfarm.shared.errors import SpecError
 from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.trainer import checkpoint
 from photonfarm.trainer.device import usable_device
 from photonfarm.trainer.evaluation import DevicePredictor, network_predictor
-from photonfarm.trainer.loop import CHECKPOINT, read_settings
+from photonfarm.trainer.loop import CHECKPOINT, SETTINGS
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.settings import KEYS, TrainSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +30,7 @@ class TrainedRun:
     folder: Path
     settings: TrainSettings
     scene_id: str
-    weights: dict[str, Any]
+    weights: dict[str, Any]  # by which it predicts: averaged over its steps, where it was trained so
 
     @classmethod
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
@@ -38,7 +42,8 @@ class TrainedRun:
         settings, state = read_settings(folder), checkpoint.load(folder / name)
         said = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
         checkpoint.check_continues(folder / name, state, said)
-        return cls(folder, settings, str(state["scene_id"]), state["network"])
+        weights = average["weights"] if (average := state.get("average")) else state["network"]
+        return cls(folder, settings, str(state["scene_id"]), weights)
 
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""
@@ -60,3 +65,25 @@ class TrainedRun:
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
         """The network's images, made on a device. SpecError where that is not usable."""
         return network_predictor(self.network(spec, base).to(usable_device(device)).eval())
+
+
+def read_settings(run: Path) -> TrainSettings:
+    """The settings a run was made with. Raises SpecError if there is no run."""
+    path = run / SETTINGS
+    try:
+        document = json.loads(path.read_text())
+        settings = TrainSettings.model_validate(document)
+    except FileNotFoundError as error:
+        if not run.is_dir():
+            raise SpecError(f"{run}: there is no such folder") from error
+        raise SpecError(
+            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
+        ) from error
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise SpecError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
+    except ValueError as error:
+        raise SpecError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
+    checkpoint.check_of_this_version(path, document.get("network", {}))
+    return settings

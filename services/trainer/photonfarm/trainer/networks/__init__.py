@@ -11,6 +11,7 @@ from photonfarm.trainer.networks.cnn import Cnn
 from photonfarm.trainer.networks.denoiser import Denoiser
 from photonfarm.trainer.networks.feature_projection import FeatureProjection
 from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.guided import Guided, GuidedPhotons, GuidedTransport, GuidedTransportPhotons
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
@@ -30,6 +31,10 @@ ARCHITECTURES: dict[Architecture, Kind] = {
     "feature_projection": Kind(FeatureProjection, Needs()),
     "light_transport": Kind(LightTransport, Needs()),
     "light_transport_photons": Kind(LightTransportPhotons, Needs(photons=True)),
+    "guided": Kind(Guided, Needs(points=False, guides=True)),
+    "guided_transport": Kind(GuidedTransport, Needs(guides=True)),
+    "guided_transport_photons": Kind(GuidedTransportPhotons, Needs(photons=True, guides=True)),
+    "guided_photons": Kind(GuidedPhotons, Needs(points=False, photons=True, guides=True)),
     "denoise_1": Kind(Denoiser, Needs(points=False, kept=1)),
     "denoise_4": Kind(Denoiser, Needs(points=False, kept=4)),
     "denoise_16": Kind(Denoiser, Needs(points=False, kept=16)),

@@ -34,6 +34,7 @@ class SceneFrame:
     photon_depth: int  # hits stored of each at most
     exposure: float  # the spec's factor on radiance
     max_depth: int  # edges of a path of the images; −1: no limit
+    area: float  # of all surfaces, scene units²
     photon_scale: float  # what makes of a photon's power over the number emitted a feature near 1
 
     @classmethod
@@ -59,5 +60,6 @@ class SceneFrame:
             photon_depth=spec.photons.depth,
             exposure=spec.exposure,
             max_depth=spec.transport.max_depth,
+            area=float(geometry.areas().sum()),
             photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
         )

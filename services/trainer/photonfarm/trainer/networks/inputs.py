@@ -1,6 +1,6 @@
 """What a predictor sees of a batch of samples: camera and buffers always, all else only if it needs it.
 
-Shape letters: B batch, P points, K photon slots, H W image.
+Shape letters: B batch, P points, L of them that are lit, K photon slots, H W image.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.store.schema import guide_arrays
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -30,6 +31,7 @@ class Needs:
 
     points: bool = True
     photons: bool = False
+    guides: bool = False
     kept: int | None = None  # one of so many pixels is seen in the noisy colour of half A; None: no colour is seen
 
 
@@ -67,6 +69,30 @@ class NoisyColour:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class GuideInputs:
+    """What is known of each view before anything is learned, as `records.Guides`; radiance × exposure."""
+
+    emission: Tensor  # (B, H, W, 3)
+    direct: Tensor  # (B, H, W, 3)
+    gloss: Tensor  # (B, H, W, 3)
+    specular: Tensor  # (B, H, W, 3)
+    roughness: Tensor  # (B, H, W)
+    mean_depth: Tensor  # (B, H, W) scene units, along the forward axis
+    mean_normal: Tensor  # (B, H, W, 3)
+    throughput: Tensor  # (B, H, W, 3)
+    beyond_albedo: Tensor  # (B, H, W, 3)
+    beyond_normal: Tensor  # (B, H, W, 3)
+    beyond_depth: Tensor  # (B, H, W) scene units, along the path
+    point_light: Tensor  # (B, L, 3) irradiance × exposure of the first points
+
+    @classmethod
+    def empty(cls, memory: Memory, spec: SceneSpec) -> GuideInputs:
+        """Guides that are still to be filled."""
+        shapes = {name: array.shape for name, array in guide_arrays(spec).items()}
+        return cls(**{f.name: memory(*shapes[f.name]) for f in fields(cls)})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
     """What a predictor sees of a batch of samples; what it does not need is None."""
 
@@ -77,6 +103,7 @@ class Inputs:
     points: PointInputs | None = None
     photons: PhotonInputs | None = None
     noisy: NoisyColour | None = None
+    guides: GuideInputs | None = None
 
     @classmethod
     def empty(cls, memory: Memory, points: int, spec: SceneSpec, needs: Needs) -> Inputs:
@@ -92,6 +119,8 @@ class Inputs:
         if needs.photons:
             vectors = memory(slots, 3), memory(slots, 3), memory(slots, 3), memory(slots, 3)
             inputs = replace(inputs, photons=PhotonInputs(*vectors, memory(slots), flags(slots), flags(slots)))
+        if needs.guides:
+            inputs = replace(inputs, guides=GuideInputs.empty(memory, spec))
         if needs.kept:
             inputs = replace(inputs, noisy=NoisyColour(memory(*film, 3), flags(*film)))
         return inputs

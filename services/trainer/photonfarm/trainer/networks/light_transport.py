@@ -5,18 +5,15 @@ Shape letters: B batch, P points, K photon slots, H W image.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from photonfarm.shared.errors import SpecError
 from photonfarm.trainer.light_transport import WIDTH, LightTransportLayer
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
-from photonfarm.trainer.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
-from photonfarm.trainer.projection import footprint
+from photonfarm.trainer.networks.photon_light import PhotonLight
+from photonfarm.trainer.photon_map import WINDOWS
 from photonfarm.trainer.settings import NetworkSettings
 
 PHOTON_NUMBERS = 10
@@ -60,15 +57,11 @@ class LightTransportPhotons(LightTransport):
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        if not frame.photon_paths:
-            raise SpecError(
-                "network.architecture = 'light_transport_photons': the scene has photons.paths = 0, and none are "
-                "stored; set photons.paths in its spec and render it anew, or train 'light_transport'"
-            )
+        photon_light = PhotonLight(frame, settings.architecture)
         transported = settings.photons == "transport"
         super().__init__(settings, frame, further=WIDTH + (WIDTH if transported else 3 * len(WINDOWS)))
-        self.photon_depth, self.photon_scale, self.exposure = frame.photon_depth, frame.photon_scale, frame.exposure
-        self.last_bounce = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # after it the eye, an edge more
+        self.photon_light = photon_light
+        self.photon_depth, self.photon_scale = frame.photon_depth, frame.photon_scale
         layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if transported else None
         self.photon_transport = layer
 
@@ -81,15 +74,8 @@ class LightTransportPhotons(LightTransport):
         return [*found, self.project(self.photon_features(photons), *where, inputs)]
 
     def gathered(self, inputs: Inputs) -> list[Tensor]:
-        """The exposed radiance of white diffuse surfaces by the photons in windows, (B, H, W, 3) each.
-
-        Of photons whose path to the eye is no longer than the paths of the images.
-        """
-        photons, view = given(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
-        on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
-        wanted = photons.present & on_side & (photons.bounce <= self.last_bounce)
-        kept = footprint(photons.position, wanted, photons.seen, *view, self.optics)
-        return gathered(photons.power * self.exposure, kept, seen_area(self.optics, *view))
+        """What `PhotonLight` tells of all photons, (B, H, W, 3) for each window."""
+        return self.photon_light(inputs)
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:
         """Albedo times what the widest window has gathered: the photon map's image of diffuse surfaces."""

@@ -75,7 +75,7 @@ def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
     appearance, base = np.zeros((points, 9), np.float32), np.zeros((points, 3), np.float32)
     optics = Optics.of(spec, settings.occlusion, settings.occlusion_tolerance)
     photons = spec.photons.paths, spec.photons.depth
-    return SceneFrame(optics, np.zeros(3, np.float32), 1.0, base, appearance, *photons, 1.0, -1, 1.0)
+    return SceneFrame(optics, np.zeros(3, np.float32), 1.0, base, appearance, *photons, 1.0, -1, 1.0, 1.0)
 
 
 def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:

@@ -30,6 +30,7 @@ class FrameTime:
 
     render: Seconds | None  # of half A, at 1/k of the pixels
     buffers: Seconds  # depth, albedo, normal
+    guides: Seconds | None  # what is known of the view beside them, direct light above all
     points: Seconds | None  # which points of the cloud the view sees
     photons: Seconds | None  # tracing them, and which the view sees
     network: Seconds
@@ -83,6 +84,7 @@ def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: Frame
     return FrameTime(
         render=costs.renders()[needs.kept] if needs.kept else None,
         buffers=parts["buffers_s"],
+        guides=parts["guides_s"] if needs.guides else None,
         points=parts["points_s"] if _sees_points(predictor) else None,
         photons=Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
         network=network,
@@ -90,4 +92,5 @@ def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: Frame
 
 
 def _sees_points(predictor: TrainedRun | Untrained) -> bool:
-    return predictor.needs.points and predictor.settings.network.occlusion == "exact"
+    projects = predictor.needs.points and not predictor.needs.guides  # lit points are summed over, seen or not
+    return projects and predictor.settings.network.occlusion == "exact"

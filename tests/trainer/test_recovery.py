@@ -1,0 +1,275 @@
+"""Runs that get much worse than they were, and go back: by their held-out error, by their loss, and at their end."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.shared.errors import StoreError
+from photonfarm.shared.estimate import Estimate, group_means
+from photonfarm.trainer import checkpoint, loop, metrics_log, service
+from photonfarm.trainer.evaluation import HeldOut
+from photonfarm.trainer.learner import DivergedError
+from photonfarm.trainer.loop import CHECKPOINT, METRICS, train
+from photonfarm.trainer.recovery import GOOD, NEXT
+from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.validation import Best, Validation, compared
+
+TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
+"""Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
+
+
+def records(run: Path, kind: str) -> list[dict[str, Any]]:
+    return [record for record in metrics_log.read(run / METRICS) if record["kind"] == kind]
+
+
+def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
+    """Of rows, of which each `views` are of one configuration."""
+    values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
+    return Validation(step, (*errors,), HeldOut(Estimate.of(group_means(values, units)), 0.0, values, units))
+
+
+def best(errors: dict[int, float]) -> Best:
+    return Best(0, errors)
+
+
+def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
+    """The source, of which the reads of these numbers hold a value that is not finite."""
+    honest = source.read
+
+    def read(row: int) -> Any:
+        sample = honest(row)
+        if reads(len(source.reads)):
+            sample.radiance[0, 3, 3, 0] = np.nan
+        return sample
+
+    source.read = read
+    return source
+
+
+def as_if(monkeypatch: pytest.MonkeyPatch, errors: dict[int, Sequence[float]]) -> None:
+    """Have validations find these errors of rows 0, 1, … at each step, whatever the network."""
+
+    def validate(predict: Any, step: int, found: Any, show: Any) -> Validation:
+        list(found)
+        return validation(dict(enumerate(errors[step])), step=step)
+
+    monkeypatch.setattr(loop, "validate", validate)
+
+
+# ---------------------------------------------------------------------------------------------------------- comparisons
+
+
+def test_a_validation_is_held_against_the_best_over_the_rows_of_both() -> None:
+    """The mean over all rows has doubled, and on those that were there before it has fallen."""
+    found = compared(validation({0: 0.9, 1: 1.9, 2: 9.0, 3: 9.0}), best({0: 1.0, 1: 2.0, 7: 0.0}))
+    assert (found.error, found.best) == pytest.approx((1.4, 1.5))
+    assert found.is_best
+    assert not found.is_worse
+
+
+def test_views_of_a_configuration_are_averaged_first() -> None:
+    """Rows 0, 1 | 2, 3 | 4: the mean over configurations, and its standard error over three pairs."""
+    before = dict.fromkeys(range(5), 1.0)
+    found = compared(validation({0: 2.0, 1: 4.0, 2: 2.0, 3: 2.0, 4: 1.0}, views=2), best(before))
+    assert (found.error, found.best) == (2.0, 1.0)
+    assert found.difference == Estimate.of(np.array([2.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("now", "worse", "clearly"),
+    [
+        ([1.09, 1.09, 1.09, 1.09], False, False),  # beyond chance, and by less than a tenth
+        ([1.11, 1.12, 1.11, 1.12], True, True),
+        ([2.0, 1.0, 1.0, 1.0], True, False),  # 0.25 ± 0.25
+        ([0.5, 0.4, 0.5, 0.4], False, False),
+        ([math.inf, 1.0, 1.0, 1.0], True, True),
+        ([math.nan, 1.0, 1.0, 1.0], True, True),
+    ],
+)
+def test_worse_is_by_more_than_a_tenth_and_clearly_so_beyond_two_standard_errors(
+    now: list[float], worse: bool, clearly: bool
+) -> None:
+    with np.errstate(invalid="ignore"):
+        found = compared(validation(dict(enumerate(now))), best(dict.fromkeys(range(4), 1.0)))
+    assert (found.is_worse, found.is_clearly_worse) == (worse, clearly)
+
+
+def test_of_a_single_configuration_nothing_is_clear_but_what_is_not_finite() -> None:
+    found = compared(validation({0: 50.0, 1: 70.0}, views=2), best({0: 1.0, 1: 1.0}))
+    assert found.is_worse
+    assert not found.is_clearly_worse
+    assert compared(validation({0: math.nan}), best({0: 1.0})).is_clearly_worse
+
+
+def test_where_no_row_of_the_best_was_measured_again_the_best_begins_anew() -> None:
+    found = compared(validation({5: 50.0, 6: 70.0}), best({0: 1.0, 1: 1.0}))
+    assert found.is_best
+    assert not found.is_worse
+    assert not compared(validation({5: math.nan}), None).is_best
+
+
+# ----------------------------------------------------------------------------------------------------------------- runs
+
+
+def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
+    make_source, tiny, run, tmp_path, capsys
+) -> None:
+    outcome = train(make_source(48), tiny(**TOO_HIGH), run, listen=service._tell)
+    without = train(make_source(48), tiny(**TOO_HIGH, recover=False), tmp_path / "without")
+    assert outcome.step == 30
+    assert outcome.last_error < 1e-3 * without.last_error
+    found, log = records(run, "recovered"), (run / METRICS).read_text()
+    assert "NaN" not in log
+    assert "Infinity" not in log
+    halved = [record for record in found if record["cause"] != "end"]
+    assert [record["recoveries"] for record in halved] == [*range(1, len(halved) + 1)]
+    assert [record["rate_factor"] for record in halved] == [0.5**n for n in range(1, len(halved) + 1)]
+    assert all(record["back_to"] <= record["step"] for record in found)
+    by_error = next(record for record in found if record["cause"] == "held-out error")
+    assert by_error["errors"]["now"] > 1.1 * by_error["errors"]["best"]
+    assert checkpoint.load(run / CHECKPOINT)["recovery"]["rate_factor"] == halved[-1]["rate_factor"]
+    said = [line for line in capsys.readouterr().err.splitlines() if "goes on from the weights" in line]
+    assert len(said) == len(halved)
+    assert f"goes on from the weights of step {halved[0]['back_to']}, at 0.5 of the rate" in said[0]
+    assert records(tmp_path / "without", "recovered") == []
+    assert not (tmp_path / "without" / GOOD).exists()
+
+
+def test_it_ends_no_more_than_a_tenth_worse_than_it_was_at_best(make_source, tiny, run) -> None:
+    train(make_source(48), tiny(**TOO_HIGH), run)
+    errors = [record["error"] for record in records(run, "validation")]
+    assert errors[-1] <= 1.1 * min(errors)
+
+
+def test_a_loss_that_is_not_finite_once_costs_a_run_what_it_learned_since_its_last_validation(
+    make_source, tiny, run, monkeypatch
+) -> None:
+    monkeypatch.setattr(loop, "LOG_EVERY", 1)
+    settings = tiny(validate_every=4, validation_samples=3)
+    assert train(spoilt(make_source(24), lambda reads: reads == 27), settings, run).reason == "steps"
+    (found,) = [record for record in records(run, "recovered") if record["cause"] == "loss"]
+    step = found.pop("step")
+    wanted = {"kind": "recovered", "cause": "loss", "errors": None, "recoveries": 1, "rate_factor": 0.5}
+    assert found == {**wanted, "back_to": 4 * (step // 4)}
+    rates = {record["step"]: record["rate"] for record in records(run, "train")}
+    assert rates == {n: 5e-4 if n <= step else 2.5e-4 for n in range(1, 13) if n != step + 1}, "no loss to tell of that"
+    assert checkpoint.load(run / CHECKPOINT)["following"]["drawn"] == 12, "the order of samples goes on"
+
+
+def test_it_gives_up_after_eight_times(make_source, tiny, run) -> None:
+    source = spoilt(make_source(24), lambda reads: reads > 20)
+    with pytest.raises(DivergedError, match=r"is nan.*, after the run has gone back 8 times; training") as diverged:
+        train(source, tiny(max_steps=40, validate_every=100), run)
+    assert diverged.value.exit_code == 8
+    assert [record["recoveries"] for record in records(run, "recovered")] == [*range(1, 9)]
+
+
+def test_the_weights_their_average_and_the_optimisers_memory_are_those_of_the_last_good_validation(
+    make_source, tiny, run, tmp_path, monkeypatch
+) -> None:
+    """Step 8 is clearly worse than step 4, so that step 9 is taken from what there was at 4, at half the rate."""
+    settings = tiny(validate_every=4, checkpoint_every=1, average=0.9)
+    train(make_source(24), settings.model_copy(update={"max_steps": 4}), tmp_path / "four")
+    as_if(monkeypatch, {0: [1.0] * 3, 4: [0.5] * 3, 8: [0.8, 0.9, 0.8]})
+
+    def stop_at_eight(record: dict[str, Any]) -> None:
+        if record["kind"] == "recovered":
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        train(make_source(24), settings, run, listen=stop_at_eight)
+    found = records(run, "recovered")
+    errors = {"now": pytest.approx(0.8333, abs=1e-4), "best": 0.5}
+    assert [(r["step"], r["back_to"], r["errors"]) for r in found] == [(8, 4, errors)]
+    kept, four = checkpoint.load(run / GOOD), checkpoint.load(tmp_path / "four" / CHECKPOINT)
+    assert kept["step"] == 4
+    for part in ("network", "average", "optimiser_state"):
+        told = [json.dumps(state[part], default=torch.Tensor.tolist) for state in (kept, four)]
+        assert told[0] == told[1]
+    assert TrainedRun.load(run, GOOD).settings == settings, "it can be looked at as a checkpoint can"
+
+
+def test_what_it_goes_back_to_is_not_trained_on_from_there(make_source, tiny, run, monkeypatch) -> None:
+    """Twice to the same step: its weights and the optimiser's memory are as they were the first time."""
+    settings = tiny(validate_every=4, checkpoint_every=1, max_steps=16)
+    as_if(monkeypatch, {0: [1.0] * 3, 4: [0.5] * 3, 8: [0.8, 0.9, 0.8], 12: [0.8, 0.9, 0.8], 16: [0.8, 0.9, 0.8]})
+    train(make_source(24), settings, run)
+    last, kept = checkpoint.load(run / CHECKPOINT), checkpoint.load(run / GOOD)
+    assert [(r["cause"], r["back_to"]) for r in records(run, "recovered")] == [
+        ("held-out error", 4),
+        ("held-out error", 4),
+        ("end", 4),
+    ]
+    assert last["recovery"]["rate_factor"] == 0.25
+    for part in ("network", "optimiser_state"):
+        told = [json.dumps(state[part], default=torch.Tensor.tolist) for state in (last, kept)]
+        assert told[0] == told[1]
+
+
+def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_says_so(
+    make_source, tiny, run, tmp_path, monkeypatch, capsys
+) -> None:
+    """By chance perhaps, as nobody sees at one validation: so it does not go back on the way."""
+    train(make_source(24), tiny(max_steps=5), tmp_path / "five")
+    noisy = [1.5, 0.1, 0.5]
+    as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
+    train(make_source(24), tiny(), run, listen=service._tell)
+    told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
+    assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
+    (found,) = records(run, "recovered")
+    assert (found["cause"], found["back_to"], found["rate_factor"], found["recoveries"]) == ("end", 5, 1.0, 0)
+    ended, five = (checkpoint.load(folder / CHECKPOINT)["network"] for folder in (run, tmp_path / "five"))
+    assert all(torch.equal(ended[name], five[name]) for name in five)
+    said = "step 12: held-out error 0.70000, and 0.50000 at best; ends with the weights of step 5"
+    assert said in capsys.readouterr().err.splitlines()
+
+
+def test_what_is_kept_is_refused_where_it_is_damaged_and_missed_by_nobody_where_it_is_gone(
+    make_source, tiny, run
+) -> None:
+    train(make_source(24), tiny(), run)
+    whole = (run / GOOD).read_bytes()
+    (run / GOOD).write_bytes(whole[:-2000])
+    with pytest.raises(StoreError, match=r"good\.safetensors: is not a readable .*; without this file the run goes on"):
+        train(make_source(24), tiny(max_steps=14), run)
+    (run / GOOD).unlink()
+    (run / NEXT).write_bytes(whole)
+    assert train(make_source(24), tiny(max_steps=14), run).step == 14
+    assert not (run / NEXT).exists()
+    (run / GOOD).unlink()
+    assert train(make_source(24), tiny(max_steps=16), run).step == 16
+
+
+@pytest.mark.parametrize("how", ["its file is gone", "it was told not to recover for a while"])
+def test_with_nothing_to_go_back_to_the_best_begins_anew_as_well(make_source, tiny, run, monkeypatch, how: str) -> None:
+    as_if(monkeypatch, {0: [0.5] * 3, 5: [0.5] * 3, 6: [0.5] * 3, 10: [0.8, 0.9, 0.8], 12: [0.8, 0.9, 0.8]})
+    train(make_source(24), tiny(max_steps=5), run)
+    if how == "its file is gone":
+        (run / GOOD).unlink()
+    else:
+        train(make_source(24), tiny(max_steps=6, recover=False), run)
+    train(make_source(24), tiny(), run)
+    assert records(run, "recovered") == []
+    assert checkpoint.load(run / GOOD)["step"] == 12
+
+
+def test_a_run_that_begins_anew_keeps_nothing_of_an_older_one(make_source, tiny, run) -> None:
+    train(make_source(24), tiny(), run)
+    (run / CHECKPOINT).unlink()
+    train(make_source(24), tiny(max_steps=2, recover=False), run)
+    assert not (run / GOOD).exists()
+
+
+def test_a_run_that_goes_on_keeps_its_rate_and_counts_on(make_source, tiny, run) -> None:
+    train(make_source(48), tiny(**TOO_HIGH), run)
+    before = checkpoint.load(run / CHECKPOINT)["recovery"]
+    train(make_source(48), tiny(**{**TOO_HIGH, "max_steps": 31}), run)
+    after = checkpoint.load(run / CHECKPOINT)["recovery"]
+    assert before["recoveries"] == after["recoveries"] > 0
+    assert before["rate_factor"] == after["rate_factor"] == 0.5 ** before["recoveries"]

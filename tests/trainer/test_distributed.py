@@ -267,7 +267,19 @@ def test_a_batch_smaller_than_the_group_is_refused(monkeypatch: pytest.MonkeyPat
 def test_torchrun_trains_a_store_with_two_processes(scene, commit, run) -> None:
     scene.plan(Request(modifications=12), shard_rows=12)
     commit(scene, 0)
-    told = ["train", "--store", str(scene.storage.root), "--run", str(run), "--steps", "3", "--redis", ""]
+    told = [
+        "train",
+        "--store",
+        str(scene.storage.root),
+        "--run",
+        str(run),
+        "--steps",
+        "3",
+        "--redis",
+        "",
+        "--architecture",
+        "cnn",
+    ]
     launched = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone", "-m"]
     command = [*launched, "--", "photonfarm.shared.cli", *told]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -204,7 +204,8 @@ def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit
         service.search(None, tmp_path / "store", run, "small", {})
     for job in scene.missing_jobs():
         commit(scene, job)
-    changes = {"optimiser": "rmsprop", "max_steps": 2, "width": 4, "hold_out": 0.4}
+    changes = {"optimiser": "rmsprop", "max_steps": 2, "width": 4, "hold_out": 0.4, "architecture": "cnn"}
+    changes |= {"schedule": "epochs"}
     found = service.search(None, tmp_path / "store", run, "small", changes)
     assert len(found.splitlines()) == 2 + 4, "a line for each rate"
     assert "| rmsprop | 0.002 | 0.99 |" in found

@@ -86,7 +86,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
 
     page = (tmp_path / "out/report.html").read_text()
     shown = min(4, figures["evaluation"]["units"])
-    assert page.count("data:image/png;base64,") == 3 * shown, "target, prediction and difference"
+    assert page.count("data:image/png;base64,") == 4 + 3 * shown, "the first row; target, prediction, difference"
     assert page.count("data:image/svg+xml;base64,") == 3, "curves over samples, rendering and everything"
     assert not re.search(r'(src|href)="(?!data:)', page), "nothing is loaded from elsewhere"
     assert not re.search(r"\bnan\b", page)

@@ -24,7 +24,8 @@ from photonfarm.shared.processes import tied
 from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.scene import SCENES_VARIABLE, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store, store_errors
-from photonfarm.shared.submission import request_of, submit
+from photonfarm.shared.submission import request_of, submit, top_up
+from photonfarm.shared.top_up import spp_per_pass
 from photonfarm.shared.verbs import command
 
 POLL_S = 0.5
@@ -44,10 +45,15 @@ def run_farm(
     train_steps: int,
     hold_out: float,
     out: Path,
+    reference_views: int = 0,
+    reference_spp: int = 256,
     shard_rows: int | None = None,
     **request: int,
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
+
+    So many of the first views that are held out get `reference_spp` samples per pixel, and the report shows and
+    measures networks against them.
 
     What the trainer would refuse is refused before anything is written: SpecError for a hold-out that leaves one side
     empty, click's UsageError for settings. Started again after any interruption it goes on where it was, as the store
@@ -65,6 +71,10 @@ def run_farm(
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        if references := train_steps > 0 and reference_views > 0:
+            where = (f"held-out={hold_out}", f"views=first:{reference_views}")
+            added = top_up(spec, store, redis.url, str(reference_spp), where=where, retry=True)
+            console.print(f"{added.planned} passes more for references, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
         console.print(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
@@ -78,7 +88,14 @@ def run_farm(
         try:
             _watch(running, _Farm(scene, run, train_steps), redis, console)
             if train_steps:
-                _call(["report", "--run", str(run), "--out", str(out)], environment)
+                beside: list[str] = []
+                if references:
+                    passes = -(-reference_spp // spp_per_pass(scene.spec))
+                    folder = str(out / "references")
+                    merge = ["--scene", planned.scene_id, "--least", str(passes), "--out", folder]
+                    _call(["store", "merge", *merge], environment)
+                    beside = ["--references", folder]
+                _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
         except IncompleteError:
             _call(preview, environment)  # what has been rendered can still be looked at
             raise

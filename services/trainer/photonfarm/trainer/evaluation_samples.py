@@ -65,6 +65,7 @@ class Target:
     image: F32  # (H, W, 3) linear radiance × exposure
     spp: int
     is_reference: bool  # or else the mean of the sample's own noisy halves
+    half_a: F32  # (H, W, 3) one noisy half-estimate of it, linear radiance × exposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,11 +97,11 @@ class Samples:
         """A sample's reference, or the mean of its halves; StoreError for one that has been taken back."""
         spec = self.source.spec
         half_spp = spec.transport.half_spp
-        if reference is not None:
-            return Target(row, reference.mean, reference.count * half_spp, is_reference=True)
         (sample,) = self.source.read_batch([row])
-        mean = sample.radiance.astype(np.float32).mean(axis=0)
-        return Target(row, np.float32(spec.exposure * sample.scale) * mean, 2 * half_spp, is_reference=False)
+        halves = np.float32(spec.exposure * sample.scale) * sample.radiance.astype(np.float32)
+        if reference is not None:
+            return Target(row, reference.mean, reference.count * half_spp, is_reference=True, half_a=halves[0])
+        return Target(row, halves.mean(axis=0), 2 * half_spp, is_reference=False, half_a=halves[0])
 
 
 def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:

@@ -65,7 +65,10 @@ class Contents:
             row["name"], row["architecture"] = entry.name, entry.architecture
             row["frame_seconds"] = None if entry.time is None else entry.time.document()
             row["published"] = None if entry.published is None else asdict(entry.published)
+        metrics = self.entries[0].row.metrics
         return {
+            "val_mse_metric": None if metrics is None else metrics.mse.estimate.mean,
+            "val_mssim": None if metrics is None else metrics.mssim.estimate.mean,
             "dataset": self.card.document(),
             "runs": [story.document() for story in self.stories],
             "mean_colour": self.gauges.mean_colour.error.mean,

@@ -9,8 +9,8 @@ from photonfarm.shared.pictures import Picture, png_uri
 from photonfarm.trainer.evaluation_table import counted, of_units
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents
-from photonfarm.trainer.report.pictures import Case, cases, legend_of_cases
-from photonfarm.trainer.report.plots import Plot, by_kind
+from photonfarm.trainer.report.pictures import Case, Panel, cases, first_row, legend_of_cases
+from photonfarm.trainer.report.plots import CURVES, Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 STYLE = """
@@ -32,6 +32,9 @@ tbody tr:nth-child(even) { background: #f7f7f7; }
 .wide td { white-space: nowrap; }
 td:first-child { position: sticky; left: 0; background: inherit; }
 tbody tr { background: #fff; }
+.row { display: grid; grid-template-columns: repeat(4, 1fr); gap: .8rem; margin: 1rem 0 1.6rem; }
+.row figure { width: auto; } .row figcaption { font-size: .85rem; }
+@media (max-width: 40rem) { .row { grid-template-columns: repeat(2, 1fr); } }
 .case { display: flex; flex-wrap: wrap; gap: .6rem; margin-bottom: 1.6rem; }
 figure { margin: 0; width: 8.5rem; }
 figure img { width: 100%; image-rendering: pixelated; display: block; margin-bottom: 2px; }
@@ -41,17 +44,21 @@ ul { padding-left: 1.2rem; font-size: .88rem; color: #444; }
 .facts td { overflow-wrap: anywhere; } .facts td:first-child { color: #555; white-space: nowrap; }
 """
 PICTURE_WIDTH = 128  # px, at least, of a picture as it is stored in the page
+LARGE_WIDTH = 256  # px, of those of the first row
 
 
 def page(contents: Contents, drawn: list[Plot]) -> str:
     """The report's HTML."""
     title = f"photonfarm: {contents.card.spec.name}"
     first, *others = tables(contents)
+    curves = [plot for plot in drawn if plot.name.startswith(CURVES)]
     parts = [
         f"<h1>{escape(title)}</h1>",
+        _first_row(first_row(contents)),
+        *(_plots(*kind) for kind in by_kind(curves)),
         _headline(contents),
         _table(first),
-        *(_plots(*kind) for kind in by_kind(drawn)),
+        *(_plots(*kind) for kind in by_kind([plot for plot in drawn if plot not in curves])),
         _pictures(cases(contents), contents),
         *map(_table, others),
         _facts(contents),
@@ -62,6 +69,12 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
         + "\n".join(parts)
         + "\n</body></html>\n"
     )
+
+
+def _first_row(panels: list[Panel]) -> str:
+    """The first thing to be seen: large pictures side by side."""
+    figures = "".join(_figure(panel.caption, (panel.picture, panel.caption), width=LARGE_WIDTH) for panel in panels)
+    return f'<div class="row">{figures}</div>'
 
 
 def _headline(contents: Contents) -> str:
@@ -119,10 +132,10 @@ def _pictures(found: list[Case], contents: Contents) -> str:
     return f"<h2>Held-out views</h2>\n{legend}\n{''.join(blocks)}"
 
 
-def _figure(caption: str, *pictures: tuple[Picture, str]) -> str:
-    """Pictures with the words that stand for them, one below the other."""
+def _figure(caption: str, *pictures: tuple[Picture, str], width: int = PICTURE_WIDTH) -> str:
+    """Pictures with the words that stand for them, one below the other, so wide at least as they are stored."""
     images = "".join(
-        f'<img alt="{escape(alt)}" src="{png_uri(picture, max(1, -(-PICTURE_WIDTH // picture.shape[1])))}">'
+        f'<img alt="{escape(alt)}" src="{png_uri(picture, max(1, -(-width // picture.shape[1])))}">'
         for picture, alt in pictures
     )
     return f"<figure>{images}<figcaption>{escape(caption).replace('_', '_<wbr>')}</figcaption></figure>"

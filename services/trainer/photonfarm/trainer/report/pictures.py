@@ -33,6 +33,36 @@ class Case:
     shown: tuple[Shown, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One picture of the report's first row."""
+
+    caption: str
+    picture: Picture
+
+
+def first_row(contents: Contents) -> list[Panel]:
+    """What went in, what came out, what is right, and the difference: of the first entry, for a view of middling error.
+
+    Of the views that are shown it is the one whose error is the median; nothing where none was measured.
+    """
+    entry = contents.entries[0]
+    images = entry.row.shown
+    there = [target for target in contents.evaluation.shown if target.row in images]
+    made = [(_shown(entry.name, images[target.row], target.image), target) for target in there]
+    if not made:
+        return []
+    shown, target = sorted(made, key=lambda each: each[0].mse)[(len(made) - 1) // 2]
+    right = f"reference, {target.spp} samples per pixel" if target.is_reference else "mean of both noisy halves"
+    half_spp = contents.card.spec.transport.half_spp
+    return [
+        Panel(f"noisy half, {half_spp} samples per pixel", display(target.half_a, 1.0)),
+        Panel(f"prediction by {entry.name}", shown.picture),
+        Panel(right, display(target.image, 1.0)),
+        Panel(f"difference, MSE {shown.mse:.4f}", shown.difference),
+    ]
+
+
 def cases(contents: Contents) -> list[Case]:
     """Some views as they come, then the worst."""
     return [_case(contents, target) for target in contents.evaluation.shown]

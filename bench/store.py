@@ -288,7 +288,7 @@ def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
 
 
 def cell(row: store_bytes.Row) -> str:
-    return f"{row.bytes_per_sample / 1e3:.0f} kB (÷{row.saving:.1f})"
+    return f"{row.bytes_per_sample / 1e3:.0f} kB (÷{row.saving:.1f}), {row.with_guides / 1e3:.0f} kB"
 
 
 def encoding_ms(speeds: list[Row]) -> float:
@@ -346,7 +346,7 @@ scene), over its samples; in brackets how many times less that is than **{whole.
 with all that it is trained on, in the same shards and codecs. That is radiance {parts["radiance"]}, buffers
 {parts["buffers"]}, the moved cloud of {spec.points} points {parts["cloud"]} (position, normal, albedo, emission,
 visibility) and {spec.photons.paths} × {spec.photons.depth} photons {parts["photons"]}. The radiance, two half-estimates
-in float16, is what no sample can share.
+in float16, is what no sample can share. Behind it: with the guides of its views, which networks may be given.
 
 {results.table(["per modification", *(f"{n} passes per view" for n in store_bytes.COUNTS)], grid)}
 

@@ -6,7 +6,7 @@ Shape letters: P points, R rows.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import SceneStore, Store, schema
 from photonfarm.shared.store.schema import ArraySchema
 from photonfarm.shared.store.shards import ShardWriter, encode
-from store_contents import Contents, Pool, commit, view_row
+from store_contents import Contents, Pool, commit, commit_guides, view_row
 
 COUNTS = (1, 2, 4, 8)
 
@@ -33,7 +33,8 @@ class Row:
     passes: int
     samples: int
     bytes_per_sample: float
-    saving: float  # how many times less than with everything in every sample
+    with_guides: float  # bytes per sample with the guides of its views
+    saving: float  # how many times less than with everything in every sample, without guides
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +60,10 @@ def measure(spec: SceneSpec, contents: Contents, modifications: int, folder: Pat
             request = Request(modifications=modifications, views_per_modification=views, passes=passes)
             scene = filled(spec, contents, request, folder / f"{views}-{passes}")
             samples = scene.progress().committed_samples
-            rows.append(Row(views, passes, samples, (size(scene.folder) - size(scene.folder / "base")) / samples, 0.0))
+            before = (size(scene.folder) - size(scene.folder / "base")) / samples
+            rows.append(Row(views, passes, samples, before, before + guided(scene, contents) / samples, 0.0))
     whole = whole_samples(scene, contents, folder / "whole")
-    rows = [Row(r.views_per_modification, r.passes, r.samples, r.bytes_per_sample, whole.total / r.bytes_per_sample)
-            for r in rows]  # fmt: skip
+    rows = [replace(row, saving=whole.total / row.bytes_per_sample) for row in rows]
     return rows, whole, size(scene.folder / "base")
 
 
@@ -80,6 +81,14 @@ def filled(spec: SceneSpec, contents: Contents | Pool, request: Request, folder:
     for job in scene.missing_jobs():
         commit(scene, job, contents)
     return scene
+
+
+def guided(scene: SceneStore, contents: Contents) -> int:
+    """Bytes of the guides of all views of a store, which are committed to it."""
+    scene.guides.want(scene.spec.guides)
+    for job in scene.missing_jobs():
+        commit_guides(scene, job, contents)
+    return size(scene.folder / "guides")
 
 
 def size(folder: Path) -> int:

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.keys import Key
+from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.shared.store.schema import Kind, output_arrays
@@ -58,6 +58,14 @@ class Contents:
     def photons(self, modification: Modification) -> Photons:
         """The photons."""
         return self._get("photons", modification, None, lambda: self._scene.photons(3))
+
+    def guides(self, modification: Modification, view: View) -> Guides:
+        """What is known of a view beside its buffers."""
+        from photonfarm.renderer.jobs import lit_points
+
+        key, lit = modification.key(self.spec.scene_id), lit_points(self.base[1], modification)
+        make = partial(self._scene.guides, view, view_key(key, view.vector), self.spec.guides, lit)
+        return self._get("guides", modification, view, make)
 
     def _get(self, what: str, modification: Modification, view: View | None, make: Any) -> Any:
         key = modification.key(self.spec.scene_id)
@@ -146,6 +154,17 @@ def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
                 out.view(row, contents.buffers(modification, view), contents.visibility(modification, view))
             elif kind == "sample":
                 out.radiance(row, contents.halves(modification, view))
+        out.commit(FIGURES)
+
+
+def commit_guides(scene: SceneStore, job: int, contents: Contents) -> None:
+    """Give a job's new views their guides."""
+    rows = scene.job_rows(job)
+    with scene.guide_writer(job) as out:
+        for kind, row, sample in in_order(rows):
+            if kind == "view":
+                modification = rows.modifications[sample.modification_row]
+                out.guides(row, contents.guides(modification, rows.views[row]))
         out.commit(FIGURES)
 
 

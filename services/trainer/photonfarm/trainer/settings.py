@@ -140,6 +140,16 @@ def paper_dynamic(**changes: object) -> TrainSettings:
     return TrainSettings.model_validate({"network": NetworkSettings(points=16384), **changes})
 
 
+def paper(**changes: object) -> TrainSettings:
+    """The supplement to the letter, as far as it says: as `paper_dynamic`, without what is ours in the network.
+
+    Positions without octaves, the projection's rule on the depth buffer [S 1.2], maxima as they are [S Fig. 1], the
+    linear loss [S 3.2], and no going back. docs/training.md lists what is left of ours, and why.
+    """
+    network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
+    return TrainSettings.model_validate({"network": network, "recover": False, **changes})
+
+
 def small(**changes: object) -> TrainSettings:
     """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2. All ours.
 
@@ -163,6 +173,7 @@ def small(**changes: object) -> TrainSettings:
 
 PRESETS: dict[str, Callable[..., TrainSettings]] = {
     "small": small,
+    "paper": paper,
     "paper-static": paper_static,
     "paper-dynamic": paper_dynamic,
 }

@@ -18,6 +18,7 @@ from photonfarm.trainer.evaluate import Tell
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.markdown_page import markdown
 from photonfarm.trainer.report.page import page
+from photonfarm.trainer.report.pictures import OVERVIEW, overview
 from photonfarm.trainer.report.plots import plots
 from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
 from photonfarm.trainer.trained import TrainedRun
@@ -58,5 +59,7 @@ def write_report(
         (out / "report.md").write_text(markdown(contents, drawn, COMPARISON))
         (out / "report.html").write_text(page(contents, drawn))
     write_png(comparison(contents.evaluation), out / COMPARISON)
+    if contents.evaluation.shown:
+        write_png(overview(contents), out / OVERVIEW)
     document: dict[str, Any] = json.loads(text)
     return document

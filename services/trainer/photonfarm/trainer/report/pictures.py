@@ -11,6 +11,10 @@ from photonfarm.shared.records import F32
 from photonfarm.trainer.evaluation_samples import Target
 from photonfarm.trainer.report.contents import Contents
 
+OVERVIEW = "overview.png"
+OVERVIEW_WIDTH = 192  # px, at least, of each picture of it
+GAP = 8  # px between them
+
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
 
@@ -41,23 +45,42 @@ class Panel:
     picture: Picture
 
 
-def first_row(contents: Contents) -> list[Panel]:
-    """What went in, what came out, what is right, and the difference: of the first entry, for a view of middling error.
-
-    Of the views that are shown it is the one whose error is the median; nothing where none was measured.
-    """
+def rows(contents: Contents) -> list[list[Panel]]:
+    """What went in, what came out, what is right, and the difference: of the first entry, by view, best first."""
     entry = contents.entries[0]
-    images = entry.row.shown
-    there = [target for target in contents.evaluation.shown if target.row in images]
-    made = [(_shown(entry.name, images[target.row], target.image), target) for target in there]
-    if not made:
-        return []
-    shown, target = sorted(made, key=lambda each: each[0].mse)[(len(made) - 1) // 2]
+    there = [target for target in contents.evaluation.shown if target.row in entry.row.shown]
+    made = [(_shown(entry.name, entry.row.shown[target.row], target.image), target) for target in there]
+    made.sort(key=lambda each: each[0].mse)
+    return [_panels(contents, shown, target) for shown, target in made]
+
+
+def first_row(contents: Contents) -> list[Panel]:
+    """The panels of the view whose error is the median of those that are shown; none where none was measured."""
+    found = rows(contents)
+    return found[(len(found) - 1) // 2] if found else []
+
+
+def overview(contents: Contents) -> Picture:
+    """All rows as one picture without words, each pixel drawn as several."""
+    lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in rows(contents)]
+    sheet: Picture = np.concatenate(lines)
+    return sheet[:-GAP, :-GAP]
+
+
+def _framed(picture: Picture) -> Picture:
+    """The picture at a size to be looked at, with a white margin to the right and below."""
+    scale = max(1, -(-OVERVIEW_WIDTH // picture.shape[1]))
+    large = picture.repeat(scale, axis=0).repeat(scale, axis=1)
+    framed: Picture = np.pad(large, ((0, GAP), (0, GAP), (0, 0)), constant_values=255)
+    return framed
+
+
+def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
     right = f"reference, {target.spp} samples per pixel" if target.is_reference else "mean of both noisy halves"
     half_spp = contents.card.spec.transport.half_spp
     return [
         Panel(f"noisy half, {half_spp} samples per pixel", display(target.half_a, 1.0)),
-        Panel(f"prediction by {entry.name}", shown.picture),
+        Panel(f"prediction by {shown.name}", shown.picture),
         Panel(right, display(target.image, 1.0)),
         Panel(f"difference, MSE {shown.mse:.4f}", shown.difference),
     ]

@@ -1,0 +1,224 @@
+"""What each part of the guided networks is worth, at equal processor time, room by room.
+
+Every candidate is trained by the recipe of the preset `small` for as many steps as fit the same seconds: what a step
+costs is timed by turns before. Errors are in the metric space against references, the references' noise taken out;
+intervals are over held-out configurations, the seeds' mean of each.
+
+    PHOTONFARM_SCENES=… python bench/guided_networks.py --rooms room scenes/dining-room-night.toml
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import results
+import room_study
+from photonfarm.shared.estimate import Estimate, group_means
+from photonfarm.shared.plan import Request
+from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.store import Store
+from photonfarm.shared.top_up import TopUp
+from photonfarm.trainer.evaluation import by_turns
+from photonfarm.trainer.feed import Feed
+from photonfarm.trainer.learner import Learner
+from photonfarm.trainer.metrics import confidence_interval, mssim
+from photonfarm.trainer.metrics.metric_space import metric_space
+from photonfarm.trainer.settings import TrainSettings, preset
+from photonfarm.trainer.store_source import StoreSource
+
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "cnn": {"architecture": "cnn"},
+    "light_transport": {"architecture": "light_transport"},
+    "light_transport_photons": {"architecture": "light_transport_photons"},
+    "guided": {"architecture": "guided"},
+    "guided_transport": {"architecture": "guided_transport"},
+    "guided_photons": {"architecture": "guided_photons"},
+    "guided_transport_photons": {"architecture": "guided_transport_photons"},
+}
+WITHOUT = {
+    "guided": "cnn",
+    "guided_transport": "guided",
+    "guided_photons": "guided",
+    "guided_transport_photons": "guided_photons",
+}
+"""What each is compared with: itself without the part that it adds."""
+
+HOLD_OUT = 1 / 8
+TIMED_STEPS = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """A candidate in a room."""
+
+    name: str
+    step_s: float
+    steps: int
+    frame_s: float
+    errors: NDArray[np.float64]  # (seeds, views) in the metric space
+    mssim: float
+
+
+def main() -> None:
+    """Render, train and measure; write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", nargs="+", default=["room"], help="specs (%(default)s)")
+    parser.add_argument("--candidates", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
+    parser.add_argument("--modifications", type=int, default=320)
+    parser.add_argument("--references", type=int, default=24, help="held-out views (%(default)s)")
+    parser.add_argument("--reference-spp", type=int, default=256)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of processor time, for each run (%(default)s)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--work", type=Path, default=room_study.ROOT / "build/guided_networks")
+    results.add_options(parser)
+    told = parser.parse_args()
+    found = {name: measured(name, told) for name in told.rooms}
+    text = page(found, told)
+    figures = {room: [_document(result) for result in each] for room, each in found.items()}
+    results.write("guided_networks", text, {"seconds": told.seconds, "rooms": figures}, told.out)
+
+
+def small(name: str) -> SceneSpec:
+    """The room at 64², 8 samples per pixel."""
+    spec = load_spec(name)
+    film = spec.film.model_copy(update={"width": 64, "height": 64})
+    return spec.model_copy(update={"film": film, "transport": spec.transport.model_copy(update={"half_spp": 4})})
+
+
+def measured(name: str, told: argparse.Namespace) -> list[Result]:
+    """All candidates in one room."""
+    spec = small(name)
+    store = Store(told.work / spec.name, create=True)
+    store.add(spec).guides.want(spec.guides)
+    where = [f"held-out={HOLD_OUT}", f"views=first:{told.references}"]
+    requests = [Request(modifications=told.modifications), TopUp.of(str(told.reference_spp), where)]
+    room_study.render(spec, store, requests, told.processes)
+    steps = step_seconds(store, spec, told.candidates)
+    runs = {
+        (candidate, seed): room_study.Run(
+            functools.partial(StoreSource, store.root, spec.scene_id),
+            settings_of(candidate, seed, max(1, round(told.seconds / steps[candidate]))),
+            told.work,
+            f"{spec.name}-{candidate}",
+        )
+        for candidate in told.candidates
+        for seed in told.seeds
+    }
+    room_study.train_all(list(runs.values()), told.processes)
+    references = room_study.References.of(store, spec, told.reference_spp, HOLD_OUT)
+    source = functools.partial(StoreSource, store.root, spec.scene_id)
+    frames = frame_seconds({name: runs[name, told.seeds[0]] for name in told.candidates}, source, references.rows)
+    found = []
+    for candidate in told.candidates:
+        made = [room_study.images(runs[candidate, seed].trained(), source(), references.rows) for seed in told.seeds]
+        of_view = [mssim(metric_space(image), metric_space(references.mean)) for image in made]
+        found.append(
+            Result(
+                candidate, steps[candidate], runs[candidate, told.seeds[0]].settings.max_steps, frames[candidate],
+                np.stack([_by_configuration(references.shown_errors(image), references) for image in made]),
+                float(np.mean(of_view)),
+            )
+        )  # fmt: skip
+    return found
+
+
+def settings_of(candidate: str, seed: int, steps: int) -> TrainSettings:
+    """The preset `small` with the candidate's network."""
+    return preset(
+        "small", network=CANDIDATES[candidate], seed=seed, max_steps=steps, hold_out=HOLD_OUT,
+        validate_every=max(1, steps // 4), validation_samples=24,
+    )  # fmt: skip
+
+
+def step_seconds(store: Store, spec: SceneSpec, candidates: Sequence[str]) -> dict[str, float]:
+    """Wall seconds of a step of each, the median of some, taken by turns on samples that are there."""
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for name in candidates:
+        settings = settings_of(name, 0, 1000)
+        with Feed(StoreSource(store.root, spec.scene_id), settings) as feed:
+            rows = [row for row, held in feed.arrivals()[0] if not held][: 2 * settings.batch]
+            learner = Learner(feed, settings)
+            for number in range(TIMED_STEPS):
+                feed.ask(rows[: settings.batch])
+                batch = feed.take()
+                times[name].append(_timed(functools.partial(learner.step, number, batch)))
+    return {name: float(np.median(found[2:])) for name, found in times.items()}
+
+
+def _timed(work: Any) -> float:
+    import time
+
+    began = time.process_time()
+    work()
+    return time.process_time() - began
+
+
+def frame_seconds(
+    runs: dict[str, room_study.Run], source: Callable[[], StoreSource], rows: Sequence[int]
+) -> dict[str, float]:
+    """Wall seconds of one image of each network, by turns."""
+    calls = []
+    for run in runs.values():
+        trained = run.trained()
+        with Feed(source(), trained.settings, needs=trained.needs) as feed:
+            predict = trained.predictor(feed.spec, (feed.geometry, feed.cloud), "cpu")
+            feed.ask(rows[:1])
+            calls.append((predict, predict.of_its_own(feed.take().inputs)))
+    return {name: seconds.median for name, seconds in zip(runs, by_turns(calls), strict=True)}
+
+
+def _by_configuration(errors: NDArray[np.float64], references: room_study.References) -> NDArray[np.float64]:
+    return np.array(group_means(errors, references.units))
+
+
+def page(found: dict[str, list[Result]], told: argparse.Namespace) -> str:
+    """The tables as Markdown."""
+    lines = [
+        "# What the parts of guided networks are worth",
+        "",
+        f"Made by `{results.command('guided_networks')}` at {results.commit()}. {told.modifications} samples of 64², 8 "
+        f"samples per pixel, {told.references} held-out references of {told.reference_spp}; {told.seconds:g} s of one "
+        f"core for each run, seeds {', '.join(map(str, told.seeds))}. MSE and MSSIM in the metric space. “Without” is "
+        "the change against the same network without the part that it adds, with its 95 % interval over held-out "
+        "configurations.",
+    ]
+    for room, each in found.items():
+        lines += ["", f"## {room}", "", "| network | MSE | MSSIM | ms a step | steps | ms a frame | without |"]
+        lines += ["|---|---|---|---|---|---|---|"]
+        by_name = {result.name: result for result in each}
+        lines += [_line(result, by_name.get(WITHOUT.get(result.name, ""))) for result in each]
+    return "\n".join(lines)
+
+
+def _line(result: Result, without: Result | None) -> str:
+    mean = result.errors.mean()
+    change = "–"
+    if without is not None:
+        pairs = Estimate.of(result.errors.mean(0) - without.errors.mean(0))
+        low, high = confidence_interval(pairs) or (np.nan, np.nan)
+        base = without.errors.mean()
+        change = f"{pairs.mean / base:+.0%} ({low / base:+.0%} … {high / base:+.0%}) of {without.name}"
+    return (
+        f"| {result.name} | {mean:.5f} | {result.mssim:.3f} | {1e3 * result.step_s:.0f} | {result.steps} | "
+        f"{1e3 * result.frame_s:.0f} | {change} |"
+    )
+
+
+def _document(result: Result) -> dict[str, Any]:
+    return {
+        "name": result.name, "step_s": result.step_s, "steps": result.steps, "frame_s": result.frame_s,
+        "mssim": result.mssim, "errors": result.errors.tolist(),
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

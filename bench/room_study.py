@@ -202,8 +202,9 @@ def settings_of(architecture: str, seed: int, told: argparse.Namespace, hold_out
         "occlusion": "exact",
     }  # fmt: skip
     return preset(
-        "small", schedule="epochs", average=0.0, decay=told.decay, network=network, seed=seed, loss=told.loss, batch=told.batch, learning_rate=told.rate,
-        max_steps=told.steps, hold_out=hold_out, validate_every=told.steps, validation_samples=1,
+        "small", network=network, seed=seed, loss=told.loss, batch=told.batch, learning_rate=told.rate,
+        schedule="epochs", average=0.0, decay=told.decay, max_steps=told.steps, hold_out=hold_out,
+        validate_every=told.steps, validation_samples=1,
         minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
 

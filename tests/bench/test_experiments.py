@@ -14,7 +14,7 @@ import experiment
 import run
 from experiment import Experiment, SizeName, merged, names
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import SCENES_VARIABLE
+from photonfarm.shared.scene import SCENES_VARIABLE, Emitters
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from rooms import Room
 from stages import PREVIEW, StageError, Stages, _is_done
@@ -22,10 +22,11 @@ from tables import paper_table, room_table
 
 ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
 EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]
+EXPECTED += ["night-dining-room", "night-living-room", "night-living-room-2"]
 EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen"]
 
 
-def test_the_paper_s_experiments_are_all_there() -> None:
+def test_the_experiments_are_all_there() -> None:
     assert names() == EXPECTED
 
 
@@ -44,7 +45,8 @@ def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) 
 def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
     spec, paper = (Experiment.load(name, size).spec() for size in ("small", "paper"))
     assert spec.credits is not None
-    assert bool(spec.lights) == name.startswith("movable")
+    assert bool(spec.lights) == name.startswith(("movable", "night"))
+    assert (spec.emitters == Emitters(all=0)) == name.startswith("night")
     assert bool(spec.objects) != name.startswith("static")
     size = 128 if name == "static-ablation" else 256
     assert (paper.film.width, paper.film.height) == (size, size)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene import SceneSpec, parse_spec
 from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
+from photonfarm.shared.store.schema import guide_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
 
@@ -112,3 +113,21 @@ def commit_all(scene: SceneStore) -> None:
     """Commit every job that is missing."""
     for job in scene.missing_jobs():
         assert commit(scene, job, outputs(scene, job))
+
+
+def guides(spec: SceneSpec, row: int) -> Guides:
+    """Guides that their types hold exactly, a function of the row of their view; of all that `schema` has."""
+    found = {}
+    for i, (name, array) in enumerate(guide_arrays(spec).items()):
+        found[name] = values(100 * row + i, array.shape)
+        if array.dtype.itemsize == 4:
+            found[name] += np.float32(1 / 3)  # what is rounded to fewer bits shows it
+    return Guides(**found)
+
+
+def commit_guides(scene: SceneStore, job: int, figures: Figures = FIGURES) -> bool:
+    """Hand the guides of a job's new views to the store, and commit them."""
+    with scene.guide_writer(job) as out:
+        for row in sorted(scene.job_rows(job).new_views):
+            out.guides(row, guides(scene.spec, row))
+        return out.commit(figures)

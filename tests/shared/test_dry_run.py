@@ -71,6 +71,7 @@ def test_the_size_counts_each_view_and_each_configuration_once() -> None:
     spec = samples.small_spec()  # 8 × 8 pixels, 16 points, 8 photon slots
     radiance = 2 * 64 * 3 * 2
     view = 64 * (4 + 3 * 2 + 3 * 2) + 16 // 8 + 8 // 8 + 6 * 4
+    view += 64 * (3 * 12 + 5 * 6 + 2 + 2 * 4) + 16 * 12  # guides: in colour or axes, of one number, and of points
     of = bytes_of_rows(spec)
     assert (of["sample"], of["view"]) == (radiance, view)
     assert of["modification"] == 8 * (12 + 6 + 6 + 12 + 1) + 16
@@ -183,7 +184,7 @@ def test_without_the_renderer_the_size_is_said_all_the_same(tmp_path: Path, monk
     monkeypatch.setattr(dry_run, "is_installed", lambda _: False)
     result = run(spec_file(tmp_path), tmp_path / "none")
     assert result.exit_code == 0
-    assert "12 samples would be planned, 0 are already\nat most 0.0 MB before compression\n" in result.stdout
+    assert "12 samples would be planned, 0 are already\nat most 0.1 MB before compression\n" in result.stdout
     reason = "the renderer, which measures them, is not installed here"
     assert result.stderr == f"cost and time are not known: {reason}\n"
 
@@ -230,7 +231,7 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
     verb()
     first, second, third = run(spec_file(tmp_path), tmp_path / "none").stdout.splitlines()
     assert first.endswith(": 12 samples would be planned, 0 are already")
-    assert second == "at most 0.0 MB before compression; 14 core-seconds: 3.4 s on the 4 cores here"
+    assert second == "at most 0.1 MB before compression; 14 core-seconds: 3.4 s on the 4 cores here"
     assert third.startswith("suggested at this cost: half_spp = ")
     assert third.endswith("% less excess error predicted")
     assert not (tmp_path / "none").exists()

@@ -4,11 +4,12 @@ from pathlib import Path
 import pytest
 
 from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import BUILTIN_ROOMS, SCENES_VARIABLE, Light, load_spec
+from photonfarm.shared.scene import BUILTIN_ROOMS, SCENES_VARIABLE, Emitters, Light, load_spec
 
 ROOT = Path(__file__).parents[2]
 READY = sorted((ROOT / "scenes").glob("*.toml"))
 STATIC = {"bathroom", "kitchen"}
+NIGHT = {"living-room-night", "living-room-2-night", "dining-room-night"}
 
 
 @pytest.fixture
@@ -20,7 +21,8 @@ def real_rooms(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_all_ready_specs_are_there() -> None:
-    assert {path.stem for path in READY} == STATIC | {"living-room", "living-room-2", "dining-room", "veach-ajar"}
+    moving = {"living-room", "living-room-2", "dining-room", "veach-ajar"}
+    assert {path.stem for path in READY} == STATIC | moving | NIGHT
 
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
@@ -38,12 +40,23 @@ def test_a_real_room_has_movable_lights_that_its_spec_adds(real_rooms: None) -> 
     assert all(isinstance(light, Light) and light.rectangle for light in lights)
 
 
+@pytest.mark.parametrize("name", sorted(NIGHT))
+def test_a_room_at_night_is_the_room_with_its_own_lights_off_and_lamps_that_move(name: str, real_rooms: None) -> None:
+    night, day = (load_spec(ROOT / f"scenes/{stem}.toml") for stem in (name, name.removesuffix("-night")))
+    assert night.emitters == Emitters(all=0)
+    assert len(night.lights) == 2
+    assert night.lights == (day.lights or night.lights)
+    same = {"emitters", "exposure", "lights", "name", "photons", "transport"}
+    assert night.model_dump(exclude=same) == day.model_dump(exclude=same)
+
+
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
 def test_without_the_folder_of_scenes_the_message_says_what_to_set(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(SCENES_VARIABLE, str(tmp_path))
-    with pytest.raises(SpecError, match=rf"scene.file = '{path.stem}/scene.xml' is not there .*set {SCENES_VARIABLE}"):
+    room = path.stem.removesuffix("-night")
+    with pytest.raises(SpecError, match=rf"scene.file = '{room}/scene.xml' is not there .*set {SCENES_VARIABLE}"):
         load_spec(path)
 
 

@@ -9,7 +9,7 @@ import pytest
 from photonfarm.shared.errors import StoreError
 from photonfarm.shared.sample_costs import SECONDS, SampleCosts, relative_variance
 
-COSTS = SampleCosts("0" * 32, 0.04, 0.035, 0.0, 0.032, 0.3)
+COSTS = SampleCosts("0" * 32, 0.04, 0.035, 0.0, 0.032, 0.3, 0.01)
 
 
 def test_costs_come_back_as_they_were_written() -> None:
@@ -42,7 +42,7 @@ def test_what_is_no_such_document_is_refused(text: str | bytes) -> None:
 
 
 def test_numbers_that_can_be_no_costs_are_refused() -> None:
-    for name in (*SECONDS, "relative_variance"):
+    for name in (*SECONDS, "relative_variance", "guides_s"):
         with pytest.raises(ValueError, match=f"^{name} is -1"):
             replace(COSTS, **{name: -1.0})
 

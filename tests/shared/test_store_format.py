@@ -14,6 +14,8 @@ import zarr
 
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
+from photonfarm.shared.records import LIT_POINTS, arrays_of
+from photonfarm.shared.scene import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, declarations, markers, schema, store_status
 from photonfarm.shared.store.local import LocalStorage
 
@@ -22,11 +24,13 @@ DOCUMENT = Path(__file__).parents[2] / "docs/store-format.md"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
-    """Two jobs of 4 samples and 1; base and job 0 are there. Not to be changed."""
+    """Two jobs of 4 samples and 1; base and job 0 are there, and its guides. Not to be changed."""
     store = Store(tmp_path_factory.mktemp("format") / "store", create=True)
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=5), shard_rows=4).scene_id)
     scene.write_base(*samples.base())
     samples.commit(scene, 0, samples.outputs(scene, 0))
+    scene.guides.want(scene.spec.guides)
+    samples.commit_guides(scene, 0)
     return scene
 
 
@@ -47,7 +51,12 @@ BASE = "\n".join(
     table(declared, f"{group}/") if group == "geometry" else table(declared, f"{group}/").split("\n", 2)[2]
     for group, declared in declarations.BASE.items()
 )
-TABLES = {"inputs": table(declarations.PLAN_INPUTS), "outputs": table(declarations.OUTPUTS), "base": BASE}
+TABLES = {
+    "inputs": table(declarations.PLAN_INPUTS),
+    "outputs": table(declarations.OUTPUTS),
+    "base": BASE,
+    "guides": table(declarations.GUIDES),
+}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -61,11 +70,14 @@ def test_the_document_is_of_this_version_and_names_the_constants() -> None:
     assert text.startswith(f"# The store's format, version {declarations.VERSION}\n")
     assert json.dumps({**declarations.stamp(), "id": "…"}, ensure_ascii=False) in text
     assert f"One chunk is {schema.INPUT_ROWS_PER_CHUNK} rows" in text
+    assert f"L is {LIT_POINTS}, or P if that is less" in text
+    assert all(f"| `{setting}` |" in text for setting in GuideSpec.model_fields)
 
 
 def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) -> None:
-    plan = scene.folder / "plans/000000"
+    plan, guides = scene.folder / "plans/000000", scene.folder / "guides/plans/000000"
     declared = {plan / array.name: array for array in (*declarations.PLAN_INPUTS, *declarations.OUTPUTS)}
+    declared |= {guides / array.name: array for array in declarations.GUIDES}
     declared |= {
         scene.folder / "base" / group / a.name: a for group, arrays in declarations.BASE.items() for a in arrays
     }
@@ -83,10 +95,10 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         assert len(about["shape"]) == len(array.shape)
         assert about["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "."}}
         rows = {"R": 8, "P": 3, "V": 3, "F": 1, "S": 1}[str(array.shape[0])]
-        lengths = {"G": 1, "H": 8, "W": 8, "K": 8, "⌈P/8⌉": 2, "⌈K/8⌉": 1}
+        lengths = {"G": 1, "H": 8, "W": 8, "K": 8, "L": 16, "⌈P/8⌉": 2, "⌈K/8⌉": 1}
         inner = [n if isinstance(n, int) else lengths[n] for n in array.shape[1:]]
         assert about["shape"] == [rows, *inner]
-        is_output = array in declarations.OUTPUTS
+        is_output = array in (*declarations.OUTPUTS, *declarations.GUIDES)
         assert about["chunk_grid"]["configuration"]["chunk_shape"] == [4 if is_output else rows, *inner]
 
 
@@ -114,7 +126,7 @@ def test_every_chain_of_codecs_is_the_documents(scene: SceneStore) -> None:
 def test_the_store_and_every_group_state_format_and_version(scene: SceneStore) -> None:
     documents = [json.loads(path.read_text()) for path in scene.folder.rglob("zarr.json")]
     groups = [about["attributes"] for about in documents if about["node_type"] == "group"]
-    assert len(groups) == 4
+    assert len(groups) == 5
     for stated in [*groups, json.loads(scene.storage.read("photonfarm.json"))]:
         assert (stated["format"], stated["version"]) == ("photonfarm store", 4)
 
@@ -204,9 +216,11 @@ def change(path: Path, **additions: Any) -> None:
 
 def add_everywhere(scene: SceneStore) -> None:
     """Files, folders, arrays, attributes and keys that this version does not know, wherever there may be some."""
-    root, plan = scene.folder.parents[1], scene.folder / "plans/000000"
-    marker_file = scene.folder / "committed/000000000000.json"
-    for folder in (root, root / "scenes", scene.folder, scene.folder / "plans", plan, scene.folder / "committed"):
+    root, plan, guides = scene.folder.parents[1], scene.folder / "plans/000000", scene.folder / "guides"
+    of_guides = guides, guides / "plans", guides / "plans/000000", guides / "committed"
+    for folder in (
+        root, root / "scenes", scene.folder, scene.folder / "plans", plan, scene.folder / "committed", *of_guides
+    ):  # fmt: skip
         for name in ("notes.txt", "notes.json", ".hidden"):
             (folder / name).write_text("someone's")
         (folder / "more").mkdir()
@@ -214,17 +228,20 @@ def add_everywhere(scene: SceneStore) -> None:
     (scene.folder / "committed/1.json").write_text("{}")
     (scene.folder / "committed/000000000001.json.bak").write_text("{}")
     change(root / "photonfarm.json", made_by="another")
-    marker = json.loads(marker_file.read_text())
-    marker["figures"]["joules"] = 3
-    marker["files"]["plans/000000/variance/c.0.0"] = {"size": 3, "crc32c": "00000000", "storage": "cold"}
-    marker_file.write_text(json.dumps({**marker, "signature": "…"}))
-    for path in (plan, plan / "radiance", scene.folder / "base", scene.folder / "base/cloud/position"):
+    change(guides / "settings.json", bounces=2)
+    for marker_file in (scene.folder / "committed/000000000000.json", guides / "committed/000000000000.json"):
+        marker = json.loads(marker_file.read_text())
+        marker["figures"]["joules"] = 3
+        marker["files"]["plans/000000/variance/c.0.0"] = {"size": 3, "crc32c": "00000000", "storage": "cold"}
+        marker_file.write_text(json.dumps({**marker, "signature": "…"}))
+    base = scene.folder / "base"
+    for path in (plan, plan / "radiance", base, base / "cloud/position", guides / "plans/000000"):
         about = json.loads((path / "zarr.json").read_text())
         change(path / "zarr.json", attributes={**about["attributes"], "colour": "green", "codec": {"a": 1}})
     about = json.loads((plan / "zarr.json").read_text())
     about["attributes"]["request"]["tilt"] = 3
     (plan / "zarr.json").write_text(json.dumps(about))
-    for path in (plan, scene.folder / "base", scene.folder / "base/cloud"):
+    for path in (plan, base, base / "cloud", guides / "plans/000000"):
         group = zarr.open_group(str(path), mode="r+")
         group.create_array("variance", data=np.ones((3, 2)))
         group.create_group("appendix")
@@ -248,10 +265,12 @@ def test_unknown_files_arrays_attributes_and_keys_are_ignored(scene: SceneStore,
 
 def read_all(scene: SceneStore) -> list[bytes]:
     """Something of every kind that a reader reads, as bytes."""
-    reader = SceneReader(scene.folder.parents[1], scene.scene_id)
+    reader = SceneReader(scene.folder.parents[1], scene.scene_id, guides=True)
     found = []
     for row in reader.refresh().tolist():
-        found += [reader.read(row).radiance.tobytes(), reader.read_photons(row).power.tobytes()]
+        sample = reader.read(row)
+        found += [sample.radiance.tobytes(), reader.read_photons(row).power.tobytes()]
+        found += [values.tobytes() for values in arrays_of(sample.guides).values()]
     geometry, cloud = reader.base()
     return [*found, geometry.vertices.tobytes(), cloud.position.tobytes()]
 

@@ -151,9 +151,12 @@ def scene() -> None:
 def scene_show(spec: str, as_json: bool) -> None:
     """Check SPEC (a scene.toml, or the name of a ready one) and show what it says."""
     from photonfarm.shared import show
-    from photonfarm.shared.scene import load_spec
+    from photonfarm.shared.scene import Emitters, load_spec
 
-    show.scene(load_spec(spec), as_json)
+    loaded = load_spec(spec)
+    show.scene(loaded, as_json)
+    if not as_json and loaded.emitters != Emitters():
+        click.echo(f"\nthe scene's own lights: {loaded.emitters}")
 
 
 @click.command()
@@ -263,6 +266,10 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     show_default=True,
     help="Share of the configurations never trained on; a small plan needs a large one.",
 )
+@click.option("--reference-views", type=click.IntRange(0), default=0, show_default=True,
+              help="Held-out views that get references, for the report; 0: none.")  # fmt: skip
+@click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
+              help="Samples per pixel of each reference.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
 def up(spec: str, store: str | Path, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.

@@ -33,13 +33,14 @@ class SampleCosts:
 
     scene_id: str
     configuration_s: float  # bringing the scene into a new configuration: its points moved, its photons traced
-    view_s: float  # a view's buffers, and which points and photons it sees
+    view_s: float  # a view's buffers and guides, and which points and photons it sees
     pass_s: float  # a pass of a view, both halves, whatever its samples are
     spp_s: float  # and for each sample per pixel of the whole image, of both halves together
     relative_variance: float  # as of `relative_variance`; 0 where every view was black
+    guides_s: float = 0.0  # the guides' part of `view_s`
 
     def __post_init__(self) -> None:
-        for name in (*SECONDS, "relative_variance"):
+        for name in (*SECONDS, "relative_variance", "guides_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} is {value}; finite numbers from 0 on are allowed")
@@ -59,7 +60,8 @@ class SampleCosts:
     def line(self) -> str:
         """All of it in words."""
         times = " + ".join(f"{name.removesuffix('_s')} {getattr(self, name):.4f} s" for name in SECONDS)
-        return f"{times} × samples per pixel; relative variance of one sample per pixel {self.relative_variance:.3g}"
+        noise = f"relative variance of one sample per pixel {self.relative_variance:.3g}"
+        return f"{times} × samples per pixel; guides {self.guides_s:.4f} s of a view; {noise}"
 
     @classmethod
     def read(cls, text: str | bytes) -> Self:

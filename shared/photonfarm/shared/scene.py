@@ -26,11 +26,14 @@ Vector = tuple[float, float, float]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 BUILTIN_ROOMS = ("cornell", "room")
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
 INPUT_SHOWN = 100
 """Characters of a wrong value that a message repeats: it may be a whole file."""
+FEW = 3
+"""So many lights are all named, where one of another name is asked for."""
 
 
 class Frozen(BaseModel):
@@ -175,6 +178,30 @@ class GuideSpec(Frozen):
     light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
 
 
+class Emitters(Frozen):
+    """Factors on the radiance of the scene's own lights: those of its file or built-in room that no `Light` moves."""
+
+    all: Factor = 1.0  # of each: 0 switches it off
+    by_id: dict[str, Factor] = {}  # of some instead, by the id of their shape; "environment": of what surrounds all
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_ids_in_their_place(cls, said: Any) -> Any:
+        beside = [key for key in said if key not in cls.model_fields] if isinstance(said, Mapping) else []
+        if beside:
+            raise ValueError(f"has the key {beside[0]!r}; factors of single lights go under by_id = {{ id = factor }}")
+        return said
+
+    def factor(self, name: str) -> float:
+        """Of one light, by its id."""
+        return self.by_id.get(name, self.all)
+
+    def __str__(self) -> str:
+        """All factors in words."""
+        named = [f"{name} × {factor:g}" for name, factor in self.by_id.items()]
+        return ", ".join([*named, f"{'all others' if named else 'all'} × {self.all:g}"])
+
+
 class Credits(Frozen):
     """Whom the scene is owed to, and under which terms: it goes with the data, into reports."""
 
@@ -192,6 +219,7 @@ class SceneSpec(Frozen):
     scene: Source
     objects: tuple[Movable, ...] = ()
     lights: tuple[Light, ...] = ()
+    emitters: Emitters = Field(default=Emitters(), exclude_if=lambda said: said == Emitters())  # not in ids then either
     view: ViewSpec
     film: Film = Film()
     transport: Transport = Transport()
@@ -274,12 +302,15 @@ def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = N
     spec = _validate({**described, "content": ""}, where)
     if spec.scene.file is None:
         content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
-        _check_shapes(spec, scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)], where)
+        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
+        _check_shapes(spec, known, where)
+        _check_emitters(spec, scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)], known, where)
     else:
         scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
         content = scene.digest
         _check_shapes(spec, scene.shape_ids, where)
         _check_lights(spec, scene.emitting, where)
+        _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
     return spec.model_copy(update={"content": content})
 
 
@@ -334,6 +365,20 @@ def _check_lights(spec: SceneSpec, emitting: frozenset[str], where: str) -> None
                 f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
                 "moves belongs under [[objects]]"
             )
+
+
+def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset[str], where: str) -> None:
+    moved = {shape: light for light in spec.lights for shape in light.shape_ids}
+    for name in spec.emitters.by_id:
+        if name in moved:
+            remedy = "its rectangle has a radiance" if moved[name].rectangle else "to dim it, take it out of [[lights]]"
+            fault = f"is of the movable light {moved[name].name!r}, and factors are of lights that no [[lights]] moves"
+            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; {remedy}")
+        if name not in emitting:
+            fault = "is a shape that emits no light" if name in shapes else "is no light of the scene"
+            own = emitting - set(moved)
+            near = ", ".join(sorted(own)) if 0 < len(own) <= FEW else scene_files.nearest(name, own)
+            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; nearest light: {near}")
 
 
 def find_scene(file: str, where: str, beside: Path | None = None) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Set
+from collections.abc import Iterable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,17 @@ _ROOM = """
 
 BUILTIN_SHAPES = {"cornell": frozenset(_CORNELL.split()), "room": frozenset(_ROOM.split())}
 """The shape ids of the built-in rooms, said here so that a spec can be checked without Mitsuba."""
+
+BUILTIN_EMITTING = {
+    "cornell": frozenset({"ceiling-light"}),
+    "room": frozenset({"lamp-shade", "ceiling-light-1", "ceiling-light-2"}),
+}
+"""Those of them that are lights."""
+
+ENVIRONMENT = "environment"
+"""The name of the light that comes from all around; a scene has one at most."""
+
+_ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 
 _UNSUPPORTED = {
     "medium": "participating media are not supported; only surfaces are",
@@ -47,6 +58,7 @@ class SceneFile:
     path: Path
     shape_ids: frozenset[str]
     emitting: frozenset[str]  # ids of the shapes that are lights
+    shapeless: frozenset[str]  # of the lights that are no shapes: ENVIRONMENT, and the ids of others that have one
     digest: str  # of the file and of every file it names
 
     @classmethod
@@ -57,11 +69,20 @@ class SceneFile:
         shapes = {node.get("id", ""): node for node in root.iter("shape") if node.get("id")}
         lights = {node.get("id") for node in root.iter("emitter")} - {None}
         emitting = {name for name, node in shapes.items() if _emits(node, lights)}
-        return cls(path, frozenset(shapes), frozenset(emitting), _digest(path, _named_files(root, path)))
+        digest = _digest(path, _named_files(root, path))
+        return cls(path, frozenset(shapes), frozenset(emitting), frozenset(_shapeless(root)), digest)
 
 
 def _emits(shape: ElementTree.Element, lights: Set[str | None]) -> bool:
     return any(part.tag == "emitter" or (part.tag == "ref" and part.get("id") in lights) for part in shape)
+
+
+def _shapeless(root: ElementTree.Element) -> Iterator[str]:
+    for node in root.findall("emitter"):
+        if node.get("type") in _ENVIRONMENTS:
+            yield ENVIRONMENT
+        elif node.get("type") != "area" and node.get("id"):  # one of type area is for a shape to refer to
+            yield node.get("id", "")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -200,7 +200,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
 def _unread_markers(scene: Mapping[str, Any]) -> str:
     """What is said of a scene with markers that cannot be read."""
     return (
-        f"{scene['markers_unreadable']} of {scene['jobs_committed']} markers cannot be read, and size, core time and "
+        f"{scene['markers_unreadable']} of {_markers(scene)} markers cannot be read, and size, core time and "
         f"redrawn leave them out: {scene['marker_error']}; `photonfarm store check` names each"
     )
 
@@ -208,9 +208,14 @@ def _unread_markers(scene: Mapping[str, Any]) -> str:
 def _lost_plan(scene: Mapping[str, Any]) -> str:
     """What is said of a scene with markers of jobs that no plan has."""
     return (
-        f"{scene['markers_without_plan']} of {scene['jobs_committed']} markers are of jobs that no plan has; "
+        f"{scene['markers_without_plan']} of {_markers(scene)} markers are of jobs that no plan has; "
         "`photonfarm store check` tells whether the last plan is missing"
     )
+
+
+def _markers(scene: Mapping[str, Any]) -> int:
+    """How many markers a scene has, those of guides with them."""
+    return int(scene["jobs_committed"] + scene["guide_jobs"])
 
 
 def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json: bool) -> None:
@@ -242,18 +247,19 @@ def _queue_status(opened: Store, redis_url: str) -> tuple[QueueStatus | None, st
         return None, str(error)
 
 
-def _scenes(scenes: Iterable[Mapping[str, Any]]) -> None:
+def _scenes(scenes: Sequence[Mapping[str, Any]]) -> None:
+    with_guides = any(s["views_guided"] is not None for s in scenes)
     _table(
         (
             (
                 s["name"], s["scene_id"], f"{s['samples_complete']}/{s['samples_planned']}",
-                f"{s['jobs_committed']}/{s['jobs_planned']}", f"{s['size_bytes'] / 1e6:.1f} MB", f"{s['core_s']:.0f} s",
-                str(s["redrawn"]),
+                f"{s['jobs_committed']}/{s['jobs_planned']}", *([_guided(s)] if with_guides else []),
+                f"{s['size_bytes'] / 1e6:.1f} MB", f"{s['core_s']:.0f} s", str(s["redrawn"]),
             )
             for s in scenes
             if not s["error"]
         ),
-        ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
+        ("scene", "id", "samples", "jobs", *(["guides"] if with_guides else []), "size", "core time", "redrawn"),
     )  # fmt: skip
     for s in scenes:
         if s["error"]:
@@ -263,6 +269,13 @@ def _scenes(scenes: Iterable[Mapping[str, Any]]) -> None:
         if s["markers_without_plan"]:
             click.echo(f"{s['name']} {s['scene_id']}: {_lost_plan(s)}")
     click.echo()
+
+
+def _guided(scene: Mapping[str, Any]) -> str:
+    """How many views of a scene have guides, of how many."""
+    if scene["views_guided"] is None:
+        return "none"
+    return f"{scene['views_guided']}/{scene['views_planned']} views"
 
 
 def _queue(opened: Store, found: QueueStatus, names: Mapping[str, str]) -> None:

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -20,6 +20,9 @@ from photonfarm.shared.store.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.find import FoundSample, Matches
 from photonfarm.shared.store.findings import Finding, Group, Remedy
 from photonfarm.shared.store.merge import Merged
+
+if TYPE_CHECKING:
+    from photonfarm.shared.upgrade import SceneUpgrade, Upgrade
 
 
 @contextlib.contextmanager
@@ -77,7 +80,8 @@ def _wrong(scene: SceneReport) -> int:
 
 
 def _scene(scene: SceneReport) -> None:
-    read = f"{scene.jobs} jobs, {scene.samples} samples, {scene.size_bytes / 1e6:,.1f} MB"
+    guides = f", guides of {scene.guide_jobs} jobs" if scene.guide_jobs else ""
+    read = f"{scene.jobs} jobs, {scene.samples} samples{guides}, {scene.size_bytes / 1e6:,.1f} MB"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {said(scene.halves)}")
@@ -94,7 +98,8 @@ def _scene(scene: SceneReport) -> None:
 
 
 def _named(finding: Finding) -> str:
-    job, row = (f"{what} {n}" if n is not None else "" for what, n in (("job", finding.job), ("row", finding.row)))
+    of = "guides of job" if finding.guides else "job"
+    job, row = (f"{what} {n}" if n is not None else "" for what, n in ((of, finding.job), ("row", finding.row)))
     return ", ".join(part for part in (job, row, finding.file or "") if part) + f": {finding.detail}"
 
 
@@ -111,7 +116,7 @@ def _document(report: StoreReport) -> dict[str, Any]:
 
 def _group(group: Group) -> dict[str, Any]:
     first = [
-        {"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
+        {"job": f.job, "guides": f.guides, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
     ]  # fmt: skip
     cause = group.cause
     return {"cause": cause.label, "means": cause.sentence, "remedy": cause.remedy.value, "count": group.count,
@@ -188,3 +193,40 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
             listed[f"render job {job}"] = shlex.join(words)
     return listed
+
+
+# -------------------------------------------------------------------------------------------------------------- upgrade
+
+
+def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
+    """What became of an upgrade, scene by scene, and how it goes on.
+
+    Raises StoreError at the end if a scene cannot be upgraded.
+    """
+    if as_json:
+        click.echo(json.dumps(asdict(result), indent=2))
+    else:
+        for scene in result.scenes:
+            _upgraded(scene, dry_run=result.dry_run)
+        if any(scene.jobs_lacking for scene in result.scenes) and not result.dry_run:
+            queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
+            command = shlex.join(["photonfarm", "work", "--until-complete", "--store", str(store)])
+            click.echo(f"{queued}; go on with: {command}")
+    if result.failed:
+        raise StoreError("; ".join(f"scene {scene_id}: {error}" for scene_id, error in result.failed.items()))
+
+
+def _upgraded(scene: SceneUpgrade, *, dry_run: bool) -> None:
+    asked = "guides are asked for already"
+    if scene.asked:
+        asked = "guides would be asked for" if dry_run else "guides are asked for"
+    click.echo(f"{scene.name} {scene.scene_id}: {asked}, with {scene.light_samples} light samples")
+    jobs = "1 job" if scene.jobs_lacking == 1 else f"{scene.jobs_lacking} jobs"
+    click.echo(f"  {scene.views_lacking} of {scene.views} views lack them: {jobs} to render")
+    most = scene.guide_bytes_per_sample / 1e3
+    if scene.bytes_per_sample is None:
+        click.echo(f"  no sample is complete; guides take at most {most:,.1f} kB per sample")
+    else:
+        before = scene.bytes_per_sample / 1e3
+        sizes = f"{before:,.1f} kB per sample without guides, at most {before + most:,.1f} kB with them"
+        click.echo(f"  {sizes} (less once compressed)")

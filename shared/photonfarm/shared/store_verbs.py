@@ -1,4 +1,4 @@
-"""The verbs `photonfarm store …`: looking into a store, without Mitsuba, torch or Redis."""
+"""The verbs `photonfarm store …`: looking into a store, without Mitsuba or torch; `upgrade` alone talks to Redis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from photonfarm.shared.cli import json_option, store_option
+from photonfarm.shared.cli import json_option, redis_option, store_option
 
 
 def scene_option(command: click.decorators.FC) -> click.decorators.FC:
@@ -124,3 +124,39 @@ def merge(
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
     show_store.merged(merged, out, least, as_json)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--light-samples", type=click.IntRange(0, 64), default=None, metavar="N",
+              help="Shadow rays of each of a pixel's 16 sub-pixels, 0: none, for scenes that have no guides yet.  "
+              "[default: 3]")  # fmt: skip
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only ask for guides; idle workers find them by themselves.")
+@click.option("--dry-run", is_flag=True, help="Say what would be rendered and stored; write and queue nothing.")
+@json_option
+def upgrade(
+    store: str | Path,
+    scene: str | None,
+    light_samples: int | None,
+    redis_url: str,
+    no_queue: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Add guides to scenes that an older photonfarm has rendered; no sample is rendered again.
+
+    Guides are what is known of each view before anything is learned: noise-free buffers, and direct light. Networks may
+    be given them. Workers render them, job by job, and readers see them arrive; all else in the store stays as it is.
+    A scene that has guides, or has been asked for some, keeps its settings. It may be stopped and repeated at any time.
+
+    Exit codes: 0 asked for, also before; 4 the store or one of its scenes cannot be read, and the others are done; 5
+    Redis does not answer, and workers find by themselves what is to be rendered.
+    """
+    from photonfarm.shared import show_store
+    from photonfarm.shared.upgrade import upgrade as upgraded
+
+    url = None if no_queue else redis_url
+    result = upgraded(store, url, scene=scene, light_samples=light_samples, dry_run=dry_run)
+    show_store.upgrade(result, store, as_json)

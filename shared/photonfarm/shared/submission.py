@@ -53,7 +53,7 @@ def submit(
     opened = Store(store, create=True)
     opened.add(loaded).guides.want(loaded.guides)
     planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
-    queued = None if redis_url is None else _queue(opened, redis_url, retry)
+    queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
     scenes = _folder_for_workers(loaded, spec)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=scenes)
 
@@ -80,7 +80,7 @@ def top_up(
             "plans the first ones"
         )
     planned = opened.scene(loaded.scene_id).plan(wanted, dry_run=dry_run)
-    queued = None if redis_url is None or dry_run else _queue(opened, redis_url, retry)
+    queued = None if redis_url is None or dry_run else queue_missing(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
         planned.plan,
@@ -93,15 +93,28 @@ def top_up(
     )
 
 
-def _queue(store: Store, redis_url: str, retry: bool) -> int:
+def queue_missing(
+    store: Store,
+    redis_url: str,
+    *,
+    scene_id: str | None = None,
+    retry: bool = False,
+    stored: str = "The plan is stored",
+    verb: str = "submits",
+) -> int:
+    """Queue all that is missing of a store, or of one scene; how many jobs that were.
+
+    Jobs that have failed are tried again; those that were set aside as well with `retry`. Raises QueueError, which says
+    what is `stored` nevertheless, and what --no-queue {verb} without Redis.
+    """
     try:
-        return queue.reconcile(store, queue.connect(redis_url), retry_failed=True, retry_set_aside=retry)
+        connection = queue.connect(redis_url)
+        return queue.reconcile(store, connection, scene_id=scene_id, retry_failed=True, retry_set_aside=retry)
     except queue.OtherStoreError as error:
-        raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
+        raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
     except QueueError as error:
         raise QueueError(
-            f"{str(error).rstrip('.')}. The plan is stored, and idle workers will find it; --no-queue submits "
-            "without Redis"
+            f"{str(error).rstrip('.')}. {stored}, and idle workers will find it; --no-queue {verb} without Redis"
         ) from error
 
 

@@ -53,6 +53,11 @@ def matrix(values: NDArray[np.float64]) -> Any:
     return mi.Matrix4f(*(dr.opaque(mi.Float, float(entry)) for entry in values.ravel()))
 
 
+def zeros_like(value: Any) -> Any:
+    """A parameter of Mitsuba's, array, tensor or number, with all its entries 0."""
+    return dr.zeros(type(value), dr.shape(value)) if dr.is_array_v(value) else type(value)(0)
+
+
 def rows(values: Any, *shape: int) -> F32:
     """Vectors of Dr.Jit as rows of numpy, (*shape, 3)."""
     return np.ascontiguousarray(np.array(values, np.float32).T).reshape(*shape, 3)

@@ -70,7 +70,8 @@ def is_full(error: BaseException) -> bool:
 class TrainerPace:
     """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
 
-    Each scene by itself: a trainer uses the samples of one.
+    Each scene by itself: a trainer uses the samples of one. Samples that lack guides do not count in a scene that is to
+    have them: a trainer that needs these cannot use them yet, and would wait for workers that wait for it.
     """
 
     def __init__(
@@ -106,9 +107,9 @@ class TrainerPace:
 
     def _look(self) -> dict[str, str]:
         committed = {
-            scene_id: progress.committed_samples
+            scene_id: progress.usable_samples
             for scene_id, progress in self._progress().items()
-            if AHEAD_MINIMUM < progress.committed_samples < progress.planned_samples
+            if progress.usable_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
         }
         used = queue.consumed_samples(self._connection, list(committed))
         return {

@@ -1,4 +1,4 @@
-"""Verbs of the render service: buffers, doctor, measure-frames, preview, report stability, scene cost/plan, work."""
+"""Verbs of the render service: buffers, doctor, measure-frames, preview, report, scene cost/exposure/plan, work."""
 
 from __future__ import annotations
 
@@ -226,6 +226,30 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
     talk = partial(click.echo, err=True)
     costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, talk=talk)
     click.echo(costs.json() if as_json else costs.line())
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--target", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.45, show_default=True,
+              help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
+@click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
+              help="Random configurations to render, a view of each.")  # fmt: skip
+@json_option
+def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
+    """Propose an exposure for SPEC, from a quick render of random views; nothing is written.
+
+    How far views differ in brightness decides how well it is known; more of them help.
+    """
+    from photonfarm.renderer import backend
+    from photonfarm.shared.scene import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.exposure import propose
+
+    talk = partial(click.echo, err=True)
+    found = propose(loaded, find_spec(spec).parent, talk, target=target, frames=frames)
+    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 
 @click.command()

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.arrays import floats, matrix
+from photonfarm.renderer.arrays import floats, matrix, zeros_like
 from photonfarm.shared.records import F32
 
 PARKED_SCALE = 1e-4
@@ -82,7 +82,7 @@ class Shine:
         self._parameters = mi.traverse(emitter)
         keys = [key for key in self._parameters.keys() if key.startswith("radiance.")]  # noqa: SIM118 - no mapping
         self._lit = {key: _copied(self._parameters[key]) for key in keys if not key.endswith("to_uv")}
-        self._dark = {key: _zero(value) for key, value in self._lit.items()}
+        self._dark = {key: zeros_like(value) for key, value in self._lit.items()}
 
     def switch(self, on: bool) -> None:
         """Give the light its radiance, or radiance 0."""
@@ -94,10 +94,6 @@ class Shine:
 
 def _copied(value: Any) -> Any:
     return type(value)(value)  # a parameter is a reference, which changes with the scene
-
-
-def _zero(value: Any) -> Any:
-    return dr.zeros(type(value), dr.shape(value)) if dr.is_array_v(value) else type(value)(0)
 
 
 def _shifted(offset: NDArray[np.float64]) -> NDArray[np.float64]:

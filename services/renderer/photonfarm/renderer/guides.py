@@ -23,6 +23,7 @@ Shape letters: H W image, L lit points, N rays: pixel by pixel, and within a pix
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -59,13 +60,12 @@ PURPOSE = "direct"
 
 
 def view_guides(
-    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32, lit: tuple[F32, F32],
+    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32, arrives: F32,
     recorder: Recorder | None = None,
 ) -> Guides:  # fmt: skip
     """The guides of a view in the scene's present configuration; `key` is the view's, `roughness` of `roughness_of`.
 
-    `lit` are positions and normals (L, 3) of the points whose irradiance is wanted. With a `recorder` of `trace` Python
-    runs but once for all views.
+    `arrives` is what `point_light` gives. With a `recorder` of `trace` Python runs but once for all views.
     """
     camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
     pixels = camera.height * camera.width
@@ -75,7 +75,7 @@ def view_guides(
     blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
     parts = [_traced(scene, camera, spec, (directions[block], shifts[block]), roughness, recorder) for block in blocks]
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _guides(found, camera, point_light(scene, *lit, key, wanted))
+    return _guides(found, camera, arrives)
 
 
 def _grid(camera: Camera) -> F32:
@@ -140,27 +140,40 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) 
     )
 
 
-def point_light(scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec) -> F32:
+def point_light(
+    scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec, recorder: Recorder | None = None
+) -> F32:
     """Irradiance (L, 3) of points on the side of their normals by what lights send directly; 0 without light samples.
 
-    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own.
+    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
+    `recorder` of `irradiance` Python runs but once.
     """
-    total = np.zeros((len(position), 3))
     if not wanted.light_samples or not scene.emitters():
-        return total.astype(np.float32)
-    lights, shifts = read_lights(scene), Stream(key, "point light").uniform(len(position), 3)
-    si = dr.zeros(mi.SurfaceInteraction3f, len(position))
-    si.p, si.n, si.t = points(position), mi.Normal3f(points(normal)), dr.ones(mi.Float, len(position))
+        return np.zeros_like(position)
+    lights, pattern = read_lights(scene), _pattern(0)
+    u = (Stream(key, "point light").uniform(len(position), 1, 3) + pattern) % 1
+    at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
+    arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
+    traced = functools.partial(recorder, (len(at), lights.kinds)) if recorder else irradiance
+    found = traced(scene, None, *arguments)
+    mean: F32 = rows(found, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
+    return mean
+
+
+def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u: list[Any]) -> Any:
+    """What one sample of the lights brings to each point, on the side of its normal (Color3f)."""
+    count = dr.width(position)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
     si.sh_frame = mi.Frame3f(si.n)
-    for step in _pattern(0):
-        u = (shifts + step) % 1
-        light = sample_direct(lights, si, _Points([floats(column) for column in u.T]), mi.Bool(True))
-        cosine = dr.dot(si.n, light.d)
-        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
-        lit = light.valid & (cosine > 0)
-        lit &= ~scene.ray_test(shadow, lit)
-        total += rows(dr.select(lit, light.radiance_over_density * cosine, 0), len(position))
-    return (total / SUB_PIXELS).astype(np.float32)
+    light = sample_direct(lights, si, _Points(u), dr.full(mi.Bool, True, count))
+    cosine = dr.dot(si.n, light.d)
+    shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+    lit = light.valid & (cosine > 0)
+    lit &= ~scene.ray_test(shadow, lit)
+    found = dr.select(lit, light.radiance_over_density * cosine, 0)
+    dr.eval(found)
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------- of the materials

@@ -14,6 +14,7 @@ import numpy as np
 from photonfarm.renderer import rooms
 from photonfarm.renderer.bdpt.emission import is_flat
 from photonfarm.renderer.bdpt.scenes import check_scene
+from photonfarm.renderer.dimming import dim, factor_of
 from photonfarm.renderer.rooms.shapes import rectangle_light
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.scene import SceneSpec, find_scene
@@ -47,7 +48,9 @@ def _check_lights(spec: SceneSpec, scene: Any) -> None:
 
 def _builtin(spec: SceneSpec) -> Any:
     shapes = rooms.describe(str(spec.scene.builtin))
-    return mi.load_dict({"type": "scene", **shapes, **_added_lights(spec)}, optimize=False)
+    scene = mi.load_dict({"type": "scene", **shapes, **_added_lights(spec)}, optimize=False)
+    dim(scene, spec)
+    return scene
 
 
 def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
@@ -61,8 +64,13 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
             scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
     except (RuntimeError, ValueError) as error:
         raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
+    dim(scene, spec)
+    free = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    shining = [emitter for emitter in free if factor_of(emitter, spec) > 0]
     added = _added_lights(spec)
-    return mi.load_dict({"type": "scene", **_parts(scene), **added}, optimize=False) if added else scene
+    if len(shining) == len(free) and not added:
+        return scene
+    return _joined([*scene.shapes(), *shining], added)
 
 
 @contextmanager
@@ -76,11 +84,14 @@ def _threads_to_read_with() -> Iterator[None]:
         dr.set_thread_count(count)
 
 
-def _parts(scene: Any) -> dict[str, Any]:
-    """The loaded shapes of a scene, and its lights that are no shapes."""
-    shapes = {shape.id(): shape for shape in scene.shapes()}
-    lights = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-    return {**shapes, **{f"light-without-shape-{i}": light for i, light in enumerate(lights)}}
+def _joined(parts: list[Any], added: dict[str, Any]) -> Any:
+    """A scene of loaded parts, which keep their ids, and of others to load."""
+    ids = [part.id() for part in parts]
+    keys = [f"_part_{i}" for i in range(len(parts))]  # ids need not be there, and may have dots, which no key may
+    scene = mi.load_dict({"type": "scene", **dict(zip(keys, parts, strict=True)), **added}, optimize=False)
+    for part, name in zip(parts, ids, strict=True):
+        part.set_id(name)
+    return scene
 
 
 def _added_lights(spec: SceneSpec) -> dict[str, Any]:

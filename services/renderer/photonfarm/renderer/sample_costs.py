@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer import backend
 from photonfarm.renderer.frame_costs import WARM_UPS
-from photonfarm.renderer.jobs import photons_of, visibility_of
+from photonfarm.renderer.jobs import lit_points, photons_of, visibility_of
 from photonfarm.renderer.scenes import LoadedScene
 from photonfarm.renderer.strategy import cache
 from photonfarm.shared.errors import StoreError
+from photonfarm.shared.keys import view_key
 from photonfarm.shared.modification import Modification, sample_modification
 from photonfarm.shared.pointcloud import rebuild
 from photonfarm.shared.records import F32, BasePointCloud, Photons
@@ -56,7 +57,8 @@ class _Frame:
     """What was measured of one view, named as in `SampleCosts`."""
 
     configuration_s: float
-    view_s: float
+    view_s: float  # with guides
+    guides_s: float
     pass_s: float
     spp_s: float
     noise: float | None  # None where nothing is seen, or not all of it is finite
@@ -67,7 +69,7 @@ def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again:
 
     The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
     """
-    file = cache.file_of("costs", cache.digest_here("sample costs", spec.scene_id, str(frames)))
+    file = cache.file_of("costs", cache.digest_here("sample costs with guides", spec.scene_id, str(frames)))
     if not again and (kept := _kept(file)) is not None:
         return kept
     talk(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
@@ -112,6 +114,7 @@ def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> S
         _median([frame.pass_s for frame in measured]),
         _median([frame.spp_s for frame in measured]),
         _median(noise) if noise else 0.0,
+        _median([frame.guides_s for frame in measured]),
     )
 
 
@@ -121,12 +124,13 @@ def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     view = sample_view(spec, modification.key(spec.scene_id), SEED, number)
     configuration_s, (points, photons) = _timed(partial(_configure, scene, cloud, modification))
     view_s, _ = _timed(partial(_look, scene, view, points, photons))
+    guides_s, _ = _timed(partial(_guide, scene, view, cloud, modification))
     few = fewer_samples(spec)
     few_s, halves = _timed(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
     many_s, _ = _timed(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
     pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
     noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
-    return _Frame(configuration_s, view_s, pass_s, spp_s, noise)
+    return _Frame(configuration_s, view_s + guides_s, guides_s, pass_s, spp_s, noise)
 
 
 def fewer_samples(spec: SceneSpec) -> int:
@@ -152,6 +156,11 @@ def _configure(
 def _look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
     scene.buffers(view)
     visibility_of(scene, view, points, photons)
+
+
+def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
+    key = view_key(modification.key(scene.spec.scene_id), view.vector)
+    scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
 
 
 def _timed(work: Callable[[], Result]) -> tuple[float, Result]:

@@ -37,7 +37,8 @@ class LoadedScene:
         self._sensor = AimedSensor(spec)
         self._integrator = integrator_of(spec.transport)
         self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
-        self._guide_recorder, self._roughness = Recorder(guides.trace), guides.roughness_of(scene)
+        self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
+        self._roughness = guides.roughness_of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
@@ -124,9 +125,10 @@ class LoadedScene:
 
         `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
         """
-        from photonfarm.renderer.guides import view_guides
+        from photonfarm.renderer.guides import point_light, view_guides
 
-        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, lit, self._guide_recorder)
+        arrives = point_light(self.scene, *lit, key, wanted, self._point_recorder)
+        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, arrives, self._guide_recorder)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""

@@ -15,7 +15,9 @@ from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans
 from photonfarm.shared.store.content_check import Tally
-from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, Remedy
+from photonfarm.shared.store.findings import Cause, Finding, Findings, Group, JobPart, Remedy
+from photonfarm.shared.store.guide_check import GuideCheck
+from photonfarm.shared.store.guides import GUIDES
 from photonfarm.shared.store.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.job_check import Checked
 from photonfarm.shared.store.job_pool import JobPool
@@ -43,12 +45,13 @@ class SceneReport:
     scene_id: str
     name: str | None  # None if its spec cannot be read
     jobs: int  # committed ones that were checked
+    guide_jobs: int  # those of them whose guides were checked
     samples: int
     size_bytes: int
     back_facing_share: float | None  # of the pixels that meet something; None if none does
     halves: HalvesResult | None
     groups: tuple[Group, ...]
-    set_aside: tuple[str, ...]  # "job 12", "base", "spec"
+    set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +114,10 @@ class _SceneChecking:
         self._name = f"{SCENES}/{scene_id}"
         self._tell = tell
         self._findings = Findings()
-        self._markers: dict[int, bytes] = {}  # of jobs with findings
+        self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they came out the same when they were rendered again
         self._scenes = scenes
-        self._tally = Tally(HalvesTest(scenes))
+        self._tally, self._guide_tally = Tally(HalvesTest(scenes)), Tally(HalvesTest(scenes))
 
     def run(self, quarantine: Quarantine | None) -> SceneReport:
         """Check everything; set aside what is damaged, unless `quarantine` is None."""
@@ -125,17 +128,18 @@ class _SceneChecking:
             self._add([Finding(Cause.SPEC, detail, self._scene_id, file=f"{self._name}/spec.json")])
             aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
-        committed = sorted(markers.jobs(self._storage, self._name))
-        inputs, rewritten = self._plans(spec, quarantine)
-        self._add(inputs.check_base(set(committed)))
+        committed = markers.jobs(self._storage, self._name)
+        guided = markers.jobs(self._storage, f"{self._name}/{GUIDES}")
+        inputs, done = self._plans(spec, quarantine)
+        self._add(inputs.check_base(committed))
         scene = None
         if inputs.shard_rows is not None:
             scene = Checked(
                 self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
-            self._jobs(scene, committed)
-            self._add(strangers(scene))
-        return self._report(spec.name, [*rewritten, *(self._repair(scene, quarantine) if quarantine else [])])
+            self._jobs(scene, sorted(committed))
+            done += self._guides(scene.of_guides(), guided, quarantine)
+        return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
         """The plans once they are checked, and which were written again; before the jobs, which need them."""
@@ -160,20 +164,35 @@ class _SceneChecking:
         return check, rewritten
 
     def _jobs(self, scene: Checked, committed: list[int]) -> None:
-        with JobPool(scene, self._scenes) as pool:
-            for done in range(0, len(committed), AT_ONCE):
-                jobs = committed[done : done + AT_ONCE]
-                self._tell(scene.spec.name, done, len(committed), pool.size_bytes)
-                for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
-                    if found:
-                        self._markers[job] = marker
-                        self._add(self._again(found))
-            for tally in pool.tallies:
-                self._tally.add(tally)
-        self._tell(scene.spec.name, len(committed), len(committed), self._tally.size_bytes)
+        self._read(scene, committed, self._tally, scene.spec.name)
         self._add(self._again(equal_samples(scene, self._tally)))
         if (halves := self._tally.halves.result()) is not None and not halves.passed:
             self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+
+    def _guides(self, guides: Checked, committed: set[int], quarantine: Quarantine | None) -> list[str]:
+        """Check the scene's guides, if it has some; what of their settings and declarations has been mended."""
+        if not self._storage.names(guides.name):
+            return []
+        check = GuideCheck(guides, committed)
+        found = list(check.run())
+        self._add(found)
+        self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
+        return check.repair(quarantine, found) if quarantine else []
+
+    def _read(self, scene: Checked, committed: list[int], total: Tally, called: str) -> None:
+        """Read all that committed jobs have stored there, and look for what they have not."""
+        with JobPool(scene, self._scenes) as pool:
+            for done in range(0, len(committed), AT_ONCE):
+                jobs = committed[done : done + AT_ONCE]
+                self._tell(called, done, len(committed), pool.size_bytes)
+                for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
+                    if found:
+                        self._markers[scene.guides, job] = marker
+                        self._add(self._again(found))
+            for tally in pool.tallies:
+                total.add(tally)
+        self._tell(called, len(committed), len(committed), total.size_bytes)
+        self._add(strangers(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
         """Findings; equal halves that came out equal when they were rendered again are not set aside once more."""
@@ -186,35 +205,36 @@ class _SceneChecking:
         if job not in self._same:
             self._same[job] = False
             with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or a finding of its own
-                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker(job))
+                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker((False, job)))
         return self._same[job]
 
-    def _marker(self, job: int) -> bytes:
+    def _marker(self, part: JobPart) -> bytes:
         """The marker that findings of a job are about; raises FileNotFoundError if it is set aside in the meantime."""
-        if job not in self._markers:  # found when all samples were looked at
-            self._markers[job] = self._storage.read(markers.name_of(self._name, job))
-        return self._markers[job]
+        if part not in self._markers:  # found when all samples were looked at
+            self._markers[part] = self._storage.read(markers.name_of(self._name, part[1]))
+        return self._markers[part]
 
     def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
         self._findings.add(found)
 
     def _report(self, name: str | None, set_aside: list[str]) -> SceneReport:
-        tally = self._tally
+        tally, guides = self._tally, self._guide_tally
         share = tally.back_facing_pixels / tally.hit_pixels if tally.hit_pixels else None
         return SceneReport(
-            self._scene_id, name, tally.jobs, tally.samples, tally.size_bytes, share, tally.halves.result(),
-            self._findings.groups(), tuple(set_aside),
+            self._scene_id, name, tally.jobs, guides.jobs, tally.samples, tally.size_bytes + guides.size_bytes, share,
+            tally.halves.result(), self._findings.groups(), tuple(set_aside),
         )  # fmt: skip
 
     # ----------------------------------------------------------------------------------------------------------- repair
 
     def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
         aside = []
-        for job, why in sorted(self._findings.jobs.items()):
+        for (guides, job), why in sorted(self._findings.jobs.items(), key=lambda found: found[0]):
             if scene is None or scene.plans is None:
-                self._add([Finding(Cause.LEFT, "stays until the plans are whole", self._scene_id, job)])
-            elif self._set_aside(scene, quarantine, job, why):
-                aside.append(f"job {job}")
+                detail = "stays until the plans are whole"
+                self._add([Finding(Cause.LEFT, detail, self._scene_id, job, guides=guides)])
+            elif self._set_aside(scene.of_guides() if guides else scene, quarantine, job, why):
+                aside.append(f"guides of job {job}" if guides else f"job {job}")
         if why := self._findings.of(Cause.BASE):
             if quarantine.base(self._name, why):
                 aside.append("base")
@@ -230,10 +250,10 @@ class _SceneChecking:
     def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
         files = set(scene.files_of(job).values())
         try:
-            marker = self._marker(job)
-            files.update(markers.files(marker, self._name, job))
+            marker = self._marker((scene.guides, job))
+            files.update(markers.files(marker, scene.name, job))
         except FileNotFoundError:  # another repair has been here
             return False
         except CorruptError:
             pass
-        return quarantine.job(self._name, job, marker, sorted(files), why)
+        return quarantine.job(scene.name, job, marker, sorted(files), why)

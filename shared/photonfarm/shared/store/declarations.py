@@ -2,8 +2,8 @@
 
 docs/store-format.md tells readers the same; a test compares the two, and every array carries it in its attributes.
 
-Shape letters: R rows of a plan, H W image, K photon slots, G movable groups; of the base: P points, V vertices,
-F triangles, S shapes.
+Shape letters: R rows of a plan, H W image, K photon slots, L lit points, G movable groups; of the base: P points,
+V vertices, F triangles, S shapes.
 """
 
 from __future__ import annotations
@@ -216,6 +216,14 @@ GUIDES = (
         "glass lead to; noisy, by a seed of its own; rounded to 8 significant bits",
     ),
     Declared(
+        "gloss",
+        ("view", "y", "x", "channel"),
+        ("R", "H", "W", 3),
+        "<f4",
+        _RADIANCE,
+        f"as direct, reflected by all other lobes, {_MEAN}; may be below 0, as both together are the whole",
+    ),
+    Declared(
         "specular",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -279,6 +287,15 @@ GUIDES = (
         "<f4",
         "scene units",
         f"length of the path from the eye, {_MEAN}, {_BEYOND}",
+    ),
+    Declared(
+        "point_light",
+        ("view", "point", "channel"),
+        ("R", "L", 3),
+        "<f4",
+        "radiance × sr",
+        "irradiance, linear RGB, of the cloud's first L points as the view's modification has them, on the side of the "
+        "normal, by light that arrives straight from lights; noisy and rounded as direct",
     ),
 )
 """What jobs produce of their new views for a scene that has guides, in groups of their own."""

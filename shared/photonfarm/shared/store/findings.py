@@ -14,6 +14,10 @@ REASONS = 20
 """Findings of one job that its quarantine record tells."""
 
 
+JobPart = tuple[bool, int]
+"""What is set aside as one: whether it is a job's guides and not its samples, and the job."""
+
+
 class Remedy(Enum):
     """What helps against a cause."""
 
@@ -21,6 +25,7 @@ class Remedy(Enum):
     BASE = "write the base again"  # it is set aside, and the next job writes it
     SUBMIT = "submit the spec again"  # it is set aside, and written by the next submission
     REWRITE = "write it again from the plan's request"  # by --repair, at once; what was there is set aside
+    UPGRADE = "ask for guides again"  # it is set aside, and written by `photonfarm store upgrade`
     REPORT = "cannot be repaired here"
     LOOK = "may be right: worth a look"  # no error, and no exit code
 
@@ -76,6 +81,11 @@ class Cause(Enum):
         "an input of a plan, or the declaration of an output, is not what was stored",
         Remedy.REWRITE,
     )
+    GUIDE_SETTINGS = (
+        "guide-settings",
+        "what a scene's guides are rendered with is missing or not what was stored",
+        Remedy.UPGRADE,
+    )
     BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
     BASE_TO_COME = (
         "base-to-come",
@@ -114,6 +124,7 @@ class Finding:
     job: int | None = None
     row: int | None = None  # of the scene
     file: str | None = None  # its name in the store
+    guides: bool = False  # of a job's guides, not of its samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +142,7 @@ class Findings:
     def __init__(self) -> None:
         self._count: Counter[Cause] = Counter()
         self._first: dict[Cause, list[Finding]] = {}
-        self.jobs: dict[int, list[Finding]] = {}  # jobs to render again, each with its first reasons
+        self.jobs: dict[JobPart, list[Finding]] = {}  # what is to be rendered again, each with its first reasons
 
     def add(self, found: Iterable[Finding]) -> None:
         """Take more findings in."""
@@ -139,7 +150,7 @@ class Findings:
             self._count[finding.cause] += 1
             _keep(self._first.setdefault(finding.cause, []), finding, NAMED)
             if finding.job is not None and finding.cause.remedy is Remedy.RENDER:
-                _keep(self.jobs.setdefault(finding.job, []), finding, REASONS)
+                _keep(self.jobs.setdefault((finding.guides, finding.job), []), finding, REASONS)
 
     def of(self, cause: Cause) -> list[Finding]:
         """The first findings of a cause."""

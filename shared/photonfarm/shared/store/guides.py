@@ -14,6 +14,7 @@ import json
 import shutil
 from collections.abc import Sequence, Set
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,12 @@ GUIDES = "guides"
 """The folder of a scene's guides, in the scene's."""
 
 SETTINGS = "settings.json"
+
+NOISY = ("direct", "gloss", "point_light")
+"""The guides that are sampled, by seeds of their own; they are rounded."""
+
+RESTORE = "`photonfarm store check --repair` sets it aside, and `photonfarm store upgrade` writes it anew"
+"""What helps settings that are damaged."""
 
 
 class GuideStore:
@@ -56,8 +63,7 @@ class GuideStore:
 
         Raises SpecError where the scene has guides that are rendered with other settings.
         """
-        with store_errors("ask for guides", self.storage.where):
-            new = put_json(self.storage, wanted.model_dump(mode="json"), f"{self.name}/{SETTINGS}")
+        new = self.ask(wanted)
         found = self.settings()
         if found != wanted:
             raise SpecError(
@@ -65,6 +71,11 @@ class GuideStore:
                 f"{found.model_dump() if found else None}, fixed when they were first asked for; ask for these"
             )
         return new
+
+    def ask(self, wanted: GuideSpec) -> bool:
+        """Have guides rendered for all views as `want` does; False if they are already, with whatever settings."""
+        with store_errors("ask for guides", self.storage.where):
+            return put_json(self.storage, wanted.model_dump(mode="json"), f"{self.name}/{SETTINGS}")
 
     def committed_jobs(self) -> set[int]:
         """The jobs whose guides are there, by their markers."""
@@ -74,10 +85,16 @@ class GuideStore:
         """Whether a job's guides are there."""
         return self.storage.exists(markers.name_of(self.name, job))
 
+    def marker(self, job: int) -> dict[str, Any]:
+        """The marker of a job whose guides are there; raises as `SceneStore.marker` does."""
+        return markers.read(self.storage, self.name, job)
+
     def lacks(self, found: Sequence[StoredPlan]) -> list[int]:
         """The jobs of these plans that have new views without guides, in order; none if the scene has no guides."""
-        if self.settings() is None:
-            return []
+        return self.without(found) if self.settings() is not None else []
+
+    def without(self, found: Sequence[StoredPlan]) -> list[int]:
+        """The jobs of these plans that have new views without guides, in order, whether the scene has guides or not."""
         done = self.committed_jobs()
         return [job for plan in found for job in jobs_with_views(plan) if job not in done]
 
@@ -93,23 +110,28 @@ class GuideStore:
 
     def _declare(self, plan: StoredPlan) -> None:
         """Declare the arrays of the guides of a plan, unless they are."""
-        import zarr
-
-        from photonfarm.shared.store.building import group_in
-
         if self.storage.exists(f"{plan.folder}/zarr.json"):
             return
-        attributes: Any = {**declarations.stamp(), "scene": self.scene_id, "first_job": plan.first_job}
         with store_errors("declare the guides of a plan", self.storage.where):
             part = self.storage.part()
             try:
-                with group_in(part) as store:
-                    group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
-                    arrays = schema.guide_arrays(self.spec).values()
-                    schema.create_outputs(group, arrays, plan.jobs * plan.shard_rows, plan.shard_rows)
+                build(part, self.spec, plan)
                 self.storage.adopt_folder(part, plan.folder)
             finally:
                 shutil.rmtree(part, ignore_errors=True)
+
+
+def build(part: Path, spec: SceneSpec, plan: StoredPlan) -> None:
+    """Declare the arrays of the guides of a plan at full size, in a new folder."""
+    import zarr
+
+    from photonfarm.shared.store.building import group_in
+
+    attributes: Any = {**declarations.stamp(), "scene": spec.scene_id, "first_job": plan.first_job}
+    with group_in(part) as store:
+        group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+        arrays = schema.guide_arrays(spec).values()
+        schema.create_outputs(group, arrays, plan.jobs * plan.shard_rows, plan.shard_rows)
 
 
 def beside(plan: StoredPlan, guides: str) -> StoredPlan:
@@ -119,7 +141,7 @@ def beside(plan: StoredPlan, guides: str) -> StoredPlan:
 
 def jobs_with_views(plan: StoredPlan) -> list[int]:
     """The jobs of a plan that have new views, in order."""
-    used = np.flatnonzero(~np.isnan(plan.rows.view[:, 0]))
+    used = np.flatnonzero(used_views([plan]))
     jobs: list[int] = (plan.first_job + np.unique(used // plan.shard_rows)).tolist()
     return jobs
 
@@ -133,8 +155,14 @@ def has_guides(found: Sequence[StoredPlan], done: Set[int]) -> NDArray[np.bool_]
     return np.repeat(jobs, found[0].shard_rows)
 
 
+def used_views(found: Sequence[StoredPlan]) -> NDArray[np.bool_]:
+    """Whether each row of the scene has a view, (rows of all plans,)."""
+    return np.concatenate([np.zeros(0, np.bool_), *(~np.isnan(plan.rows.view[:, 0]) for plan in found)])
+
+
 def _read_settings(storage: Storage, guides: str) -> GuideSpec | None:
     name = f"{guides}/{SETTINGS}"
+    where = f"{storage.where}/{name}"
     with store_errors("read the settings of the guides", storage.where):
         if not storage.exists(name):
             return None
@@ -142,9 +170,9 @@ def _read_settings(storage: Storage, guides: str) -> GuideSpec | None:
     try:
         return GuideSpec.model_validate(json.loads(content), extra="ignore")  # of a later program
     except ValidationError as error:
-        raise CorruptError(f"{storage.where}/{name}: {'; '.join(sentences(error))}") from error
-    except ValueError as error:
-        raise CorruptError(f"{storage.where}/{name}: is not JSON: {error}") from error
+        raise CorruptError(f"{where}: {'; '.join(sentences(error))}; {RESTORE}") from error
+    except (ValueError, RecursionError) as error:
+        raise CorruptError(f"{where}: is not JSON: {error}; {RESTORE}") from error
 
 
 class GuideWriter(RowWriter):
@@ -158,7 +186,7 @@ class GuideWriter(RowWriter):
         """The guides of a new view row."""
         self._claim("view", row, "guides", self._rows.new_views)
         for name, values in arrays_of(guides).items():
-            self._put(row, name, rounded(values) if name == "direct" else values)
+            self._put(row, name, rounded(values) if name in NOISY else values)
 
     def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
         return {"view": ("guides", self._rows.new_views)}

@@ -1,10 +1,13 @@
-"""Reads everything that one committed job has stored: its marker, its files, each of their rows."""
+"""Reads everything that one committed job has stored: its marker, its files, each of their rows.
+
+Of its samples or of its guides, which have markers of their own.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import markers, plans, schema
 from photonfarm.shared.store.content_check import ContentCheck, Tally, is_finite
 from photonfarm.shared.store.findings import Cause, Finding
+from photonfarm.shared.store.guides import GUIDES, beside
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.shards import Shard
 from photonfarm.shared.store.storage import Storage
@@ -24,22 +28,50 @@ KINDS: tuple[schema.Kind, ...] = ("sample", "view", "modification")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checked:
-    """A scene that is being checked, and what is known of it."""
+    """What has plans and markers and is being checked, and what is known of it: a scene's samples, or its guides."""
 
     storage: Storage
     scene_id: str
-    name: str  # of its folder
+    name: str  # of the folder that has the plans and markers
     spec: SceneSpec
     plans: list[StoredPlan] | None  # None if one is damaged: then only what markers tell can be checked
     shard_rows: int
     lost: frozenset[str] = frozenset()  # folders of plans that are missing
+    guides: bool = False  # whether it is the guides
+
+    def of_guides(self) -> Checked:
+        """The guides of the scene, whose plans and jobs have the same numbers."""
+        name = f"{self.name}/{GUIDES}"
+        found = None if self.plans is None else [beside(plan, name) for plan in self.plans]
+        lost = frozenset(f"{name}{folder.removeprefix(self.name)}" for folder in self.lost)
+        return replace(self, name=name, plans=found, lost=lost, guides=True)
+
+    @property
+    def arrays(self) -> Mapping[str, schema.ArraySchema]:
+        """What jobs store there, by name."""
+        return schema.guide_arrays(self.spec) if self.guides else schema.output_arrays(self.spec)
+
+    def wanted(self, rows: JobRows) -> dict[schema.Kind, Set[int]]:
+        """The rows that a job stores of each kind."""
+        if self.guides:
+            return {"sample": frozenset(), "view": rows.new_views, "modification": frozenset()}
+        samples = {sample.row for sample in rows.samples}
+        return {"sample": samples, "view": rows.new_views, "modification": rows.new_modifications}
+
+    def finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
+        """Something found of a job."""
+        return Finding(cause, detail, self.scene_id, job, row, file, self.guides)
+
+    def plan_of(self, folder: str) -> str:
+        """The folder of the plan that a folder of its outputs belongs to."""
+        scene = self.name.removesuffix(f"/{GUIDES}") if self.guides else self.name
+        return f"{scene}{folder.removeprefix(self.name)}"
 
     def files_of(self, job: int) -> dict[str, str]:
         """The names that a job's files may have, by array; none for a job of no plan that is known."""
         for plan in self.plans or []:
             if plan.first_job <= job < plan.end_job:
-                arrays = schema.output_arrays(self.spec).items()
-                return {name: plan.shard(name, array, job) for name, array in arrays}
+                return {name: plan.shard(name, array, job) for name, array in self.arrays.items()}
         return {}
 
 
@@ -48,7 +80,8 @@ class JobCheck:
 
     def __init__(self, scene: Checked) -> None:
         self._scene = scene
-        self._arrays = schema.output_arrays(scene.spec)
+        self._finding = scene.finding
+        self._arrays = scene.arrays
         self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
         self._contents = ContentCheck(scene.spec)
 
@@ -101,7 +134,7 @@ class JobCheck:
         with contextlib.suppress(CorruptError):
             named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
             if missing := named - {plan.folder for plan in scene.plans or []}:
-                return Finding(Cause.PLAN, plans.MISSING, scene.scene_id, job, file=f"{min(missing)}/zarr.json")
+                return self._finding(Cause.PLAN, job, plans.MISSING, f"{scene.plan_of(min(missing))}/zarr.json")
         return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
 
     # ------------------------------------------------------------------------------------------------------------ files
@@ -147,8 +180,7 @@ class JobCheck:
                 yield self._finding(
                     Cause.FOREIGN_FILE, rows.job, "is there, and the job's marker does not name it", file
                 )
-        samples = {sample.row for sample in rows.samples}
-        wanted = {"sample": samples, "view": rows.new_views, "modification": rows.new_modifications}
+        wanted = self._scene.wanted(rows)
         held = {name: self._held(rows.job, shard) for name, shard in shards.items()}
         unread = {name for name, file in own.items() if file in files and name not in shards}  # found already
         for name, array in self._arrays.items():
@@ -157,12 +189,18 @@ class JobCheck:
             if array.kind != "sample" and name not in unread:
                 for row in sorted(wanted[array.kind] - held.get(name, set())):
                     yield self._finding(Cause.MISSING_ROW, rows.job, "the plan has it", own[name], row)
+        yield from self._of_radiance(rows.job, wanted["sample"], own, held, unread)
+
+    def _of_radiance(
+        self, job: int, samples: Set[int], own: dict[str, str], held: dict[str, set[int]], unread: set[str]
+    ) -> Iterator[Finding]:
+        """Samples that lie in both of its arrays, or in none; no array has only some of them."""
         narrow, wide = held.get("radiance", set()), held.get("radiance_wide", set())
         for row in sorted(narrow & wide & samples):
-            yield self._finding(Cause.TWICE, rows.job, "radiance has it already", own["radiance_wide"], row)
+            yield self._finding(Cause.TWICE, job, "radiance has it already", own["radiance_wide"], row)
         if not unread & {"radiance", "radiance_wide"}:
             for row in sorted(samples - narrow - wide):
-                yield self._finding(Cause.MISSING_ROW, rows.job, "radiance_wide lacks it too", own["radiance"], row)
+                yield self._finding(Cause.MISSING_ROW, job, "radiance_wide lacks it too", own["radiance"], row)
 
     def _held(self, job: int, shard: Shard) -> set[int]:
         first = job * self._scene.shard_rows
@@ -216,9 +254,6 @@ class JobCheck:
         """The finding for a file that cannot be read; raises OSError if it is the whole store that cannot be."""
         self._scene.storage.names(self._scene.name)
         return self._finding(Cause.UNREADABLE, job, error.strerror or str(error), file)
-
-    def _finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
-        return Finding(cause, detail, self._scene.scene_id, job, row, file)
 
 
 def _array_of(file: str) -> str:

@@ -23,8 +23,8 @@ from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.scene_store import read_base
 from photonfarm.shared.store.storage import Storage
 
-_UNREADABLE = (ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError)
-"""What zarr-python raises for damaged metadata and chunks."""
+UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError)
+"""What zarr-python raises for damaged metadata and chunks; a group in the place of an array lacks its attributes."""
 
 _INPUTS = tuple(field.name for field in fields(PlannedRows))
 
@@ -84,7 +84,7 @@ class PlanCheck:
         except StoreError as error:
             yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
             return
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             detail = f"cannot be read: {plans.reason(error)}; {plans.RESTORE}"
             yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/zarr.json")
             return
@@ -93,7 +93,7 @@ class PlanCheck:
             if detail := self._array(group, folder, name, jobs * shard_rows):
                 yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{name}")
         for array in schema.output_arrays(self._spec).values():
-            if detail := _declaration(group, array, jobs, shard_rows):
+            if detail := declaration(group, array, jobs, shard_rows):
                 yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
 
     def _array(self, group: Any, folder: str, name: str, rows: int | None = None) -> str:
@@ -105,7 +105,7 @@ class PlanCheck:
             values = schema.read_input(self._storage, f"{folder}/{name}", array)
         except CorruptError as error:
             return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             return f"cannot be read: {plans.reason(error)}"
         return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
 
@@ -180,7 +180,7 @@ class PlanCheck:
                     self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False
                 )
                 names = [(field.name, group[part]) for field in fields(record)]
-            except _UNREADABLE as error:
+            except UNREADABLE as error:
                 found.append(
                     Finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", self._id, file=f"{folder}/{part}")
                 )
@@ -193,12 +193,12 @@ class PlanCheck:
             yield Finding(Cause.BASE, detail, self._id, file=folder)
 
 
-def _declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:
+def declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:
     """What is wrong with the declaration of an output array, which other programs read it by; empty if nothing is."""
     try:
         declared = group[array.name]
         found = declared.shape, declared.dtype, declared.chunks, declared.shards
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         return f"cannot be read: {plans.reason(error)}"
     shape = array.shape
     expected = (jobs * shard_rows, *shape), array.dtype, (1, *shape), (shard_rows, *shape)

@@ -64,9 +64,8 @@ class PlanRepair:
                 for path in sorted(built.rglob("*"))
                 if path.is_file() and path.relative_to(built).parts[0] in found
             }
-            self._quarantine.rewrite(
-                self._scene, number, {name: path for name, path in files.items() if self._differs(name, path)}, why
-            )
+            wrong = {name: path for name, path in files.items() if differs(self._storage, name, path)}
+            self._quarantine.rewrite(self._scene, number, wrong, why)
         finally:
             shutil.rmtree(built, ignore_errors=True)
 
@@ -132,18 +131,19 @@ class PlanRepair:
                 raise self._hopeless(folder, f"{declared.name}/{name} is whole, and no chunk of this plan") from error
             yield number * length, stored
 
-    def _differs(self, name: str, built: Path) -> bool:
-        """Whether a file is damaged or missing: a chunk by its checksum, a declaration by what it says."""
-        content = read_or_none(self._storage, name)
-        if content is None or not name.endswith("zarr.json"):
-            return content is None or not _is_whole(content)
-        try:
-            return bool(json.loads(content) != json.loads(built.read_bytes()))
-        except ValueError:
-            return True
-
     def _hopeless(self, folder: str, why: str) -> CorruptError:
         return CorruptError(f"{self._storage.where}/{folder}: cannot be written again: {why}; {plans.RESTORE}")
+
+
+def differs(storage: Storage, name: str, built: Path) -> bool:
+    """Whether a file is damaged or missing: a chunk by its checksum, a declaration by what it says."""
+    content = read_or_none(storage, name)
+    if content is None or not name.endswith("zarr.json"):
+        return content is None or not _is_whole(content)
+    try:
+        return bool(json.loads(content) != json.loads(built.read_bytes()))
+    except ValueError:
+        return True
 
 
 def _is_whole(content: bytes) -> bool:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.errors import CorruptError, StoreError
+from photonfarm.shared.errors import CorruptError, SpecError, StoreError
 from photonfarm.shared.keys import Key, view_key
 from photonfarm.shared.modification import Modification
 from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
@@ -59,10 +59,7 @@ class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
     def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
-        """Name what to follow; store, scene and plans may appear later.
-
-        With `guides` they are read too, and a sample is complete only if its view has them.
-        """
+        """Name what to follow; store, scene and plans may appear later. With `guides` as after `follow_guides`."""
         self._with_guides = guides
         self._guides: GuideStore | None = None
         self._guided: set[int] = set()  # jobs whose guides are there
@@ -90,6 +87,21 @@ class SceneReader:
                 self._guides = GuideStore(self._storage, self._name, self._spec)
                 self._arrays |= schema.guide_arrays(self._spec)
         return self._spec
+
+    def follow_guides(self) -> None:
+        """Read guides too, from the next refresh on: a sample is complete only if its view has them.
+
+        Raises StoreError while the scene is not there, and SpecError for a scene without guides.
+        """
+        if GuideStore(self._storage, self._name, self.spec).settings() is None:
+            raise SpecError(
+                f"scene {self._scene_id} ({self.spec.name}) has no guides, which an older photonfarm did not render; "
+                f"`photonfarm store upgrade --scene {self._scene_id}` and `photonfarm work` add them, and render no "
+                "sample again"
+            )
+        if not self._with_guides:
+            self._with_guides, self._spec = True, None
+            self._committed, self._complete = set(), np.zeros(0, np.bool_)
 
     @property
     def is_begun(self) -> bool:

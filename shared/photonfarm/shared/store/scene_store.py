@@ -23,7 +23,7 @@ from photonfarm.shared.records import BasePointCloud, Geometry
 from photonfarm.shared.scene import SceneSpec, sentences
 from photonfarm.shared.store import declarations, markers, plans, schema
 from photonfarm.shared.store.commit import JobWriter
-from photonfarm.shared.store.guides import GuideStore, GuideWriter
+from photonfarm.shared.store.guides import GuideStore, GuideWriter, has_guides
 from photonfarm.shared.store.plans import JobRows, StoredPlan
 from photonfarm.shared.store.storage import Storage, store_errors
 from photonfarm.shared.top_up import TopUp
@@ -50,6 +50,7 @@ class Progress:
 
     planned_samples: int
     committed_samples: int  # complete ones
+    usable_samples: int  # of these, those whose view lacks no guides, where the scene is to have some
 
 
 class SceneStore:
@@ -82,15 +83,16 @@ class SceneStore:
         Raises SpecError for a request or a number of rows that cannot be, and CorruptError if a plan is missing.
         """
         while True:
-            committed = self.committed_jobs()  # before the plans: each one's plan is there by now
-            found = self.plans()
+            last = {name: max(markers.jobs(self.storage, name), default=-1) for name in (self.name, self.guides.name)}
+            found = self.plans()  # after the markers: each one's plan is there by now
             rows_per_job = self._shard_rows(found, shard_rows)
             first_job = found[-1].end_job if found else 0
-            if (job := max(committed, default=-1)) >= first_job:
-                raise CorruptError(
-                    f"{self.storage.where}/{markers.name_of(self.name, job)}: no plan has this job, and a new one "
-                    "would: `photonfarm store check` tells whether the last plan is missing"
-                )
+            for name, job in last.items():
+                if job >= first_job:
+                    raise CorruptError(
+                        f"{self.storage.where}/{markers.name_of(name, job)}: no plan has this job, and a new one "
+                        "would: `photonfarm store check` tells whether the last plan is missing"
+                    )
             expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
@@ -163,11 +165,16 @@ class SceneStore:
         return markers.read(self.storage, self.name, job)
 
     def progress(self) -> Progress:
-        """How far the scene is; costs one listing of the markers."""
-        committed = self.committed_jobs()
+        """How far the scene is; costs one listing of the markers, and of those of guides."""
+        committed, guided = self.committed_jobs(), self.guides.committed_jobs()
         found = self.plans()
         complete = plans.complete_rows(found, committed)
-        return Progress(sum(plan.samples for plan in found), int(np.count_nonzero(complete)))
+        usable = complete.copy()
+        if self.guides.settings() is not None and found:
+            view_row = np.concatenate([plan.rows.sample_view for plan in found])
+            usable[complete] = has_guides(found, guided)[view_row[complete]]
+        samples = sum(plan.samples for plan in found)
+        return Progress(samples, int(np.count_nonzero(complete)), int(np.count_nonzero(usable)))
 
     # ------------------------------------------------------------------------------------------------------------- base
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.errors import CorruptError
+from photonfarm.shared.records import LIT_POINTS
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store.declarations import GUIDES, OUTPUTS, Declared
 
@@ -33,6 +34,10 @@ BLOSC: dict[str, Any] = {
     "clevel": 1,
     "shuffle": "shuffle",
 }  # byte shuffle: floats compress by their exponents
+
+_INDEX_ENTRY, _CRC, _BLOSC_HEADER = 16, 4, 16
+_ROW_OVERHEAD = _BLOSC_HEADER + _CRC
+"""Bytes of a shard beside its values: of each of its rows in the index, of each checksum, and of what is compressed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +71,7 @@ def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
 def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
-    lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons}
+    lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
     wanted = [each for each in declared if all(lengths.get(str(n), 1) for n in each.shape)]
     return {each.name: _resolved(each, lengths, spec) for each in wanted}
 
@@ -79,6 +84,13 @@ def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
             found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
     found["view"] += sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in guide_arrays(spec).values())
     return found
+
+
+def most_guide_bytes(spec: SceneSpec, views: int, jobs: int, shard_rows: int) -> int:
+    """Stored bytes of the guides of so many views, in so many jobs, where nothing of them can be compressed."""
+    arrays = guide_arrays(spec).values()
+    rows = sum(int(np.prod(array.shape)) * array.dtype.itemsize + _ROW_OVERHEAD for array in arrays)
+    return views * rows + jobs * len(arrays) * (_INDEX_ENTRY * shard_rows + _CRC)
 
 
 def bit_counts(spec: SceneSpec) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Files of a scene that belong to no committed job."""
+"""Files of a scene, or of its guides, that belong to no committed job."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ def strangers(scene: Checked) -> Iterator[Finding]:
             else:
                 left.setdefault(job, f"{folder}/{name}")
     for job in sorted(left.keys() - markers.jobs(scene.storage, scene.name)):  # now: a worker may have been at it
-        yield Finding(Cause.NO_MARKER, "not a sample yet", scene.scene_id, job, file=left[job])
+        what = "not guides yet" if scene.guides else "not a sample yet"
+        yield scene.finding(Cause.NO_MARKER, job, what, left[job])
     yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
 
 
 def _array_folders(scene: Checked) -> Iterator[tuple[str, int, int, schema.ArraySchema]]:
-    arrays = schema.output_arrays(scene.spec).values()
+    arrays = scene.arrays.values()
     return chain.from_iterable(
         ((f"{plan.folder}/{array.name}", plan.first_job, plan.end_job, array) for array in arrays)
         for plan in scene.plans or []

@@ -40,7 +40,9 @@ _KIND_BY_CLASS = {
     "Projector": POSITION,
     "DirectionalEmitter": DIRECTION,
 }
-_BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
+BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
+"""How the names of the parameters begin that say how brightly a light shines."""
+
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 
 
@@ -172,7 +174,7 @@ def _weight(emitter: Any, parameters: Any) -> Any:
     """Weight of selection (Float, 1): the emitter's ``sampling_weight`` while it shines, else 0."""
     shines = mi.Bool(True)
     keys = list(parameters.keys())
-    brightness = [key for key in keys if key.startswith(_BRIGHTNESS) and not key.endswith("to_uv")]
+    brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
     if brightness:
         shines = mi.Bool(False)
         for key in brightness:

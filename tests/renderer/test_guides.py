@@ -254,7 +254,6 @@ def test_over_many_views_direct_light_gloss_and_emission_have_the_mean_of_mitsub
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of its paths of two edges, along the same rays of each pixel's grid; 64 views of 64 pixels, in blocks of 4."""
-    monkeypatch.setattr(guides, "point_light", lambda *_: NOWHERE)  # half of the time
     floor = square((0, 0, 0), UP, 3, bsdf=MATERIALS[name])
     other = lamp((-1.2, 0.8, 0.5), (0, 0, -1), 0.3, np.array([1.0, 4.0, 2.0]))
     scene = scene_of(floor=floor, lamp=lamp(LAMP[0], DOWN, LAMP[1]), other=other)
@@ -448,10 +447,10 @@ def test_a_key_gives_the_same_bytes_recorded_or_not_and_whatever_was_rendered_be
     room: LoadedScene, somewhere: View, lit: Lit
 ) -> None:
     again = room.guides(somewhere, KEY, GuideSpec(), lit)
-    plain = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene), lit)
-    fresh = view_guides(
-        room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene), lit, Recorder(guides.trace)
-    )
+    arrives = [point_light(room.scene, *lit, KEY, GuideSpec(), how) for how in (None, Recorder(guides.irradiance))]
+    told = room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene)
+    plain = view_guides(*told, arrives[0])
+    fresh = view_guides(*told, arrives[1], Recorder(guides.trace))
     assert bytes_of(again) == bytes_of(plain) == bytes_of(fresh)
 
 
@@ -460,7 +459,8 @@ def test_images_that_are_traced_in_several_goes_are_those_of_one(
 ) -> None:
     whole = room.guides(somewhere, KEY, GuideSpec(), lit)
     monkeypatch.setattr(guides, "RAYS", 100 * GRID * GRID)
-    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene), lit)
+    arrives = point_light(room.scene, *lit, KEY, GuideSpec())
+    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene), arrives)
     for name, values in arrays_of(whole).items():
         np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-5, atol=1e-6, err_msg=name)
 

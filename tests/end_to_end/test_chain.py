@@ -88,7 +88,7 @@ def test_the_network_is_evaluated_beside_a_denoiser(photonfarm: Command, folder:
     assert found == json.loads((folder / "run/evaluation.json").read_text())
     with Image.open(folder / "run/comparison.png") as side_by_side:
         assert side_by_side.width > 3 * 64
-    assert [row["predictor"] for row in found["rows"]] == ["light_transport (run)", "fill-in 1/4"]
+    assert [row["predictor"] for row in found["rows"]] == ["guided_transport (run)", "fill-in 1/4"]
     assert all(np.isfinite(row["metric_space"]["mse"]["estimate"]["mean"]) for row in found["rows"])
 
 

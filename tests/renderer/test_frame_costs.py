@@ -194,6 +194,7 @@ def test_each_part_is_charged_with_its_own_seconds(
     monkeypatch.setattr("photonfarm.renderer.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
+    monkeypatch.setattr(room, "guides", takes(lambda *_: 1000, lambda *_: None))
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(
         room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones(len(points), bool))
@@ -201,7 +202,7 @@ def test_each_part_is_charged_with_its_own_seconds(
     monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
     costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
     assert costs.medians() == {
-        "edit_s": 1, "buffers_s": 10, "points_s": 4096, "photons_s": 100, "photons_seen_s": 8192
+        "edit_s": 1, "buffers_s": 10, "guides_s": 1000, "points_s": 4096, "photons_s": 100, "photons_seen_s": 8192
     }  # fmt: skip
     assert costs.render_medians() == {4: 12, 1: 24}
 

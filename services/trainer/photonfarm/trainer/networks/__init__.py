@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
@@ -11,7 +12,7 @@ from photonfarm.trainer.networks.cnn import Cnn
 from photonfarm.trainer.networks.denoiser import Denoiser
 from photonfarm.trainer.networks.feature_projection import FeatureProjection
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.guided import Guided, GuidedPhotons, GuidedTransport, GuidedTransportPhotons
+from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
@@ -32,9 +33,9 @@ ARCHITECTURES: dict[Architecture, Kind] = {
     "light_transport": Kind(LightTransport, Needs()),
     "light_transport_photons": Kind(LightTransportPhotons, Needs(photons=True)),
     "guided": Kind(Guided, Needs(points=False, guides=True)),
-    "guided_transport": Kind(GuidedTransport, Needs(guides=True)),
-    "guided_transport_photons": Kind(GuidedTransportPhotons, Needs(photons=True, guides=True)),
-    "guided_photons": Kind(GuidedPhotons, Needs(points=False, photons=True, guides=True)),
+    "guided_transport": Kind(partial(Guided, transport=True), Needs(guides=True)),
+    "guided_photons": Kind(partial(Guided, photons=True), Needs(points=False, photons=True, guides=True)),
+    "guided_transport_photons": Kind(partial(Guided, transport=True, photons=True), Needs(photons=True, guides=True)),
     "denoise_1": Kind(Denoiser, Needs(points=False, kept=1)),
     "denoise_4": Kind(Denoiser, Needs(points=False, kept=4)),
     "denoise_16": Kind(Denoiser, Needs(points=False, kept=16)),

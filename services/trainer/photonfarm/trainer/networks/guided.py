@@ -2,11 +2,11 @@
 
     image = emission + known light + reflectance × U-Net
 
-Emission and direct light are rendered [renderer.guides], and photons bring the light that was reflected before; what
-the U-Net adds is divided by how much a surface reflects, so that it has neither textures nor the colours of metals to
-learn. Nothing here has seen the noise of the half-estimates that it is compared with.
+Emission and direct light are rendered [renderer.guides], lit points and photons bring light that was reflected before;
+what the U-Net adds is divided by how much a surface reflects, so that it has neither textures nor the colours of metals
+to learn. Nothing here has seen the noise of the half-estimates that it is compared with.
 
-Shape letters: B batch, P points, H W image, C channels.
+Shape letters: B batch, H W image, C channels.
 """
 
 from __future__ import annotations
@@ -37,10 +37,20 @@ def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
 
 
 class Guided(Network):
-    """Image synthesis from the guides of a view, added to its emission and direct light."""
+    """Image synthesis from the guides of a view, added to its emission and direct light.
 
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0) -> None:
+    With `transport` it sees what lit points send on to each pixel, by diffuse reflection and by other lobes; with
+    `photons` what photons that were reflected before bring to diffuse surfaces, which is added to the image too.
+    """
+
+    def __init__(
+        self, settings: NetworkSettings, frame: SceneFrame, *, transport: bool = False, photons: bool = False
+    ) -> None:
+        photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
+        further = (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
         super().__init__(settings, frame, further=further + GUIDE_CHANNELS)
+        self.lit_points = LitPoints(frame, settings.lit_points) if transport else None
+        self.photon_light = photon_light
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure."""
@@ -49,6 +59,18 @@ class Guided(Network):
         further = self.further(inputs)
         channels = torch.cat([*further, *self.guide_channels(guides, scale), self.image_space(inputs)], dim=-1)
         return self.known(inputs, further) + scale * self.synthesise(channels)
+
+    def further(self, inputs: Inputs) -> list[Tensor]:
+        """log(1 + light), (B, H, W, 3) each: of lit points, then of photons by each window."""
+        found = [] if self.lit_points is None else self.lit_points(inputs)
+        gathered = [] if self.photon_light is None else self.photon_light(inputs)
+        return [torch.log1p(light) for light in (*found, *gathered)]
+
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
+        """Emission, reflected direct light, and albedo times what the widest window gathers of photons, (B, H, W, 3)."""
+        guides = given(inputs.guides)
+        light = guides.emission + guides.direct + guides.gloss
+        return light if self.photon_light is None else light + inputs.albedo * torch.expm1(further[-1])
 
     def guide_channels(self, guides: GuideInputs, scale: Tensor) -> list[Tensor]:
         """The guides near 1, each (B, H, W, C): light as log(1 + it), direct light over what reflects it."""
@@ -65,54 +87,3 @@ class Guided(Network):
             guides.mean_depth[..., None] / self.scale,
             guides.beyond_depth[..., None] / self.scale,
         ]
-
-    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:  # noqa: ARG002 - what other kinds see
-        """Emission and reflected direct light, (B, H, W, 3)."""
-        guides = given(inputs.guides)
-        return guides.emission + guides.direct + guides.gloss
-
-
-class GuidedTransport(Guided):
-    """The same, with what lit points send on to each pixel, by diffuse reflection and by other lobes."""
-
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0) -> None:
-        super().__init__(settings, frame, further=further + CHANNELS)
-        self.lit_points = LitPoints(frame, settings.lit_points)
-
-    def further(self, inputs: Inputs) -> list[Tensor]:
-        """log(1 + light), (B, H, W, 3) each."""
-        return [torch.log1p(light) for light in self.lit_points(inputs)]
-
-
-class GuidedPhotons(Guided):
-    """`Guided` with what photons that were reflected before bring to diffuse surfaces, seen and added."""
-
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        photon_light = PhotonLight(frame, settings.architecture, bounces=1)
-        super().__init__(settings, frame, further=3 * len(WINDOWS))
-        self.photon_light = photon_light
-
-    def further(self, inputs: Inputs) -> list[Tensor]:
-        """log(1 + what is gathered) by each window, (B, H, W, 3)."""
-        return [torch.log1p(radiance) for radiance in self.photon_light(inputs)]
-
-    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
-        """Emission, direct light, and albedo times what the widest window has gathered, (B, H, W, 3)."""
-        return super().known(inputs, further) + inputs.albedo * torch.expm1(further[-1])
-
-
-class GuidedTransportPhotons(GuidedTransport):
-    """Both: what lit points send on, and photons, seen and added."""
-
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        photon_light = PhotonLight(frame, settings.architecture, bounces=1)
-        super().__init__(settings, frame, further=3 * len(WINDOWS))
-        self.photon_light = photon_light
-
-    def further(self, inputs: Inputs) -> list[Tensor]:
-        """log(1 + light), (B, H, W, 3) each: of lit points, then of photons by each window."""
-        return [*super().further(inputs), *(torch.log1p(radiance) for radiance in self.photon_light(inputs))]
-
-    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
-        """Emission, direct light, and albedo times what the widest window has gathered, (B, H, W, 3)."""
-        return super().known(inputs, further) + inputs.albedo * torch.expm1(further[-1])

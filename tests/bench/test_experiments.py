@@ -206,7 +206,8 @@ def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
     from photonfarm.trainer.settings import preset
 
     told = {key: experiment.size.train[key] for key in ("max_steps", "loss")}
-    settings = preset("small", network={"width": 4, "points": 128}, hold_out=experiment.size.hold_out, **told)
+    network = {"architecture": "light_transport", "width": 4, "points": 128}
+    settings = preset("small", network=network, hold_out=experiment.size.hold_out, **told)
     state = {"scene_id": experiment.spec().scene_id, "settings": settings.model_dump(mode="json"), "step": step}
     (folder / "runs" / "light_transport").mkdir(parents=True)
     checkpoint.save(folder / "runs" / "light_transport" / "checkpoint.safetensors", state)

@@ -67,7 +67,7 @@ class Guided(Network):
         return [torch.log1p(light) for light in (*found, *gathered)]
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
-        """Emission, reflected direct light, and albedo times what the widest window gathers of photons, (B, H, W, 3)."""
+        """Emission, reflected direct light, and albedo times what the widest window of photons has, (B, H, W, 3)."""
         guides = given(inputs.guides)
         light = guides.emission + guides.direct + guides.gloss
         return light if self.photon_light is None else light + inputs.albedo * torch.expm1(further[-1])

@@ -16,7 +16,7 @@ $(STAMP): constraints.txt scripts/setup.sh $(PROJECTS:%=%/pyproject.toml)
 	@touch $@
 
 demo: $(STAMP)
-	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 1500 --reference-views 8 --store demo/store --run demo/run --out demo
+	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 1000 --reference-views 6 --store demo/store --run demo/run --out demo
 
 # Three at a time on two cores, as many tests wait; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.

@@ -1,7 +1,7 @@
 """What each part of the guided networks is worth, at equal processor time, room by room.
 
 Every candidate is trained by the recipe of the preset `small` for as many steps as fit the same seconds: what a step
-costs is timed by turns before. Errors are in the metric space against references, the references' noise taken out;
+costs is timed before. Errors are in the metric space against references, the references' noise taken out;
 intervals are over held-out configurations, the seeds' mean of each.
 
     PHOTONFARM_SCENES=… python bench/guided_networks.py --rooms room scenes/dining-room-night.toml
@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import argparse
 import functools
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import results
@@ -140,7 +142,8 @@ def settings_of(candidate: str, seed: int, steps: int) -> TrainSettings:
 
 
 def step_seconds(store: Store, spec: SceneSpec, candidates: Sequence[str]) -> dict[str, float]:
-    """Wall seconds of a step of each, the median of some, taken by turns on samples that are there."""
+    """Processor seconds of a step of each on one thread, the median of some, on samples that are there."""
+    torch.set_num_threads(1)  # more would turn while they wait, and be counted
     times: dict[str, list[float]] = {name: [] for name in candidates}
     for name in candidates:
         settings = settings_of(name, 0, 1000)
@@ -154,9 +157,7 @@ def step_seconds(store: Store, spec: SceneSpec, candidates: Sequence[str]) -> di
     return {name: float(np.median(found[2:])) for name, found in times.items()}
 
 
-def _timed(work: Any) -> float:
-    import time
-
+def _timed(work: Callable[[], Any]) -> float:
     began = time.process_time()
     work()
     return time.process_time() - began

@@ -25,7 +25,8 @@ mi = backend.load(threads=1)
 
 from photonfarm.renderer import guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
-from photonfarm.renderer.guides import point_light, roughness_of, view_guides  # noqa: E402
+from photonfarm.renderer.guides import point_light, view_guides  # noqa: E402
+from photonfarm.renderer.materials import Materials  # noqa: E402
 
 Images = NDArray[np.float64]
 Shape = dict[str, Any]
@@ -68,7 +69,7 @@ def of_keys(scene: Any, view: View, keys: list[bytes], light_samples: int, **of_
     """The guides of a view by several keys, one after the other."""
     recorder, wanted = Recorder(guides.trace) if len(keys) > 1 else None, GuideSpec(light_samples=light_samples)
     for key in keys:
-        yield view_guides(scene, view, spec(**of_spec), wanted, key, roughness_of(scene), NOWHERE, recorder)
+        yield view_guides(scene, view, spec(**of_spec), wanted, key, Materials.of(scene), NOWHERE, recorder)
 
 
 def some_keys(count: int, of: str = "key") -> list[bytes]:
@@ -343,7 +344,7 @@ def test_specular_is_the_fresnel_reflectance_of_a_conductor_that_of_its_coat_on_
 )
 def test_roughness_is_the_alpha_that_a_material_states(bsdf: Shape, alpha: float) -> None:
     scene = scene_of(wall=square((0, 0, 0), (0, 0, 1), 2, bsdf=bsdf))
-    assert sorted({*roughness_of(scene).tolist()} - {1.0}) == pytest.approx(sorted({alpha} - {1}), abs=1e-6)
+    assert sorted({*Materials.of(scene).roughness.tolist()} - {1.0}) == pytest.approx(sorted({alpha} - {1}), abs=1e-6)
     if bsdf["type"] in ("roughplastic", "twosided", "null"):
         assert centre(known(scene).roughness) == pytest.approx(alpha, abs=1e-6)
 
@@ -448,7 +449,7 @@ def test_a_key_gives_the_same_bytes_recorded_or_not_and_whatever_was_rendered_be
 ) -> None:
     again = room.guides(somewhere, KEY, GuideSpec(), lit)
     arrives = [point_light(room.scene, *lit, KEY, GuideSpec(), how) for how in (None, Recorder(guides.irradiance))]
-    told = room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene)
+    told = room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene)
     plain = view_guides(*told, arrives[0])
     fresh = view_guides(*told, arrives[1], Recorder(guides.trace))
     assert bytes_of(again) == bytes_of(plain) == bytes_of(fresh)
@@ -460,7 +461,7 @@ def test_images_that_are_traced_in_several_goes_are_those_of_one(
     whole = room.guides(somewhere, KEY, GuideSpec(), lit)
     monkeypatch.setattr(guides, "RAYS", 100 * GRID * GRID)
     arrives = point_light(room.scene, *lit, KEY, GuideSpec())
-    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, roughness_of(room.scene), arrives)
+    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
     for name, values in arrays_of(whole).items():
         np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-5, atol=1e-6, err_msg=name)
 

@@ -56,12 +56,15 @@ def write_frame_costs(
     Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError where the scene's files are
     not here.
     """
-    reader = SceneReader(store, scene_named(Store(store), scene))
+    opened = Store(store)
+    reader = SceneReader(store, scene_id := scene_named(opened, scene))
     reader.refresh()
     _check_complete(reader, rows)
     frames = [_frame(reader, row) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
-    costs = frame_costs(LoadedScene.load(located(reader.spec)), BasePointCloud(**used), frames, kept, timed)
+    wanted = opened.scene(scene_id).guides.settings() or reader.spec.guides
+    spec = located(reader.spec.model_copy(update={"guides": wanted}))
+    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
     costs.write(out)
     return costs
 

@@ -36,6 +36,7 @@ from photonfarm.renderer.arrays import floats, points, rows
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
 from photonfarm.renderer.bdpt.loops import traced_once
 from photonfarm.renderer.gbuffer import GRID, RAYS, diffuse_reflectance
+from photonfarm.renderer.materials import Materials, has_other_lobes, is_pure_delta
 from photonfarm.shared.keys import Key, Stream
 from photonfarm.shared.records import F32, Guides
 from photonfarm.shared.scene import GuideSpec, SceneSpec
@@ -60,10 +61,10 @@ PURPOSE = "direct"
 
 
 def view_guides(
-    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, roughness: F32, arrives: F32,
+    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, materials: Materials, arrives: F32,
     recorder: Recorder | None = None,
 ) -> Guides:  # fmt: skip
-    """The guides of a view in the scene's present configuration; `key` is the view's, `roughness` of `roughness_of`.
+    """The guides of a view in the scene's present configuration; `key` is the view's.
 
     `arrives` is what `point_light` gives. With a `recorder` of `trace` Python runs but once for all views.
     """
@@ -73,7 +74,7 @@ def view_guides(
     shifts = Stream(key, PURPOSE).uniform(pixels, 3).astype(np.float32)
     at_once = max(1, RAYS // SUB_PIXELS)  # pixels
     blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
-    parts = [_traced(scene, camera, spec, (directions[block], shifts[block]), roughness, recorder) for block in blocks]
+    parts = [_traced(scene, camera, spec, (directions[block], shifts[block]), materials, recorder) for block in blocks]
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return _guides(found, camera, arrives)
 
@@ -86,7 +87,7 @@ def _grid(camera: Camera) -> F32:
 
 
 def _traced(
-    scene: Any, camera: Camera, spec: SceneSpec, given: tuple[F32, F32], roughness: F32, recorder: Recorder | None
+    scene: Any, camera: Camera, spec: SceneSpec, given: tuple[F32, F32], materials: Materials, recorder: Recorder | None
 ) -> dict[str, NDArray[np.float64]]:
     """Sums over the grids of some pixels, (pixels, channels), by name; see `trace`."""
     directions, shifts = given[0].reshape(-1, 3), np.repeat(given[1], SUB_PIXELS, axis=0)
@@ -96,12 +97,12 @@ def _traced(
     lights = read_lights(scene) if scene.emitters() else None
     settings = Settings(
         spec.guides.light_samples if lights is not None else 0,
-        FOLLOWED if has_pure_deltas(scene) else 0,
+        FOLLOWED if materials.has_pure_deltas else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
         spec.view.near,
-        has_other_lobes(scene),
+        materials.has_other_lobes,
     )
-    tables = floats(roughness), *(floats(column) for column in _pattern(settings.light_samples).T)
+    tables = floats(materials.roughness), *(floats(column) for column in _pattern(settings.light_samples).T)
     arguments = lights, tables, *rays, floats(along), points(shifts), settings
     kind = (len(along), settings, lights.kinds if lights else None)
     columns = recorder(kind, scene, None, *arguments) if recorder else trace(scene, None, *arguments)
@@ -174,52 +175,6 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
     found = dr.select(lit, light.radiance_over_density * cosine, 0)
     dr.eval(found)
     return found
-
-
-# ---------------------------------------------------------------------------------------------------- of the materials
-
-
-def has_pure_deltas(scene: Any) -> bool:
-    """Whether any shape of the scene has a BSDF of delta lobes alone, so that there is something to follow."""
-    return any(bool(_is_pure_delta(shape.bsdf().flags())) for shape in scene.shapes() if shape.bsdf() is not None)
-
-
-def _is_pure_delta(flags: Any) -> Any:
-    return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
-
-
-def has_other_lobes(scene: Any) -> bool:
-    """Whether any shape of the scene has a BSDF with lobes beside a diffuse one, and not of delta lobes alone."""
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
-    return any(bool(_has_other_lobes(bsdf.flags())) for bsdf in bsdfs)
-
-
-def _has_other_lobes(flags: Any) -> Any:
-    smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth)
-    return smooth & (mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy))
-
-
-def roughness_of(scene: Any) -> F32:
-    """Roughness of every BSDF of the scene's shapes, by its number in Dr.Jit's registry."""
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
-    numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
-    table = np.ones(max(numbers, default=0) + 1, np.float32)
-    for number, bsdf in zip(numbers, bsdfs, strict=True):
-        table[number] = _alpha(bsdf)
-    return table
-
-
-def _alpha(bsdf: Any) -> float:
-    """α of a BSDF: the mean of those that its parameters name; without any 0 of pure delta lobes, otherwise 1."""
-    found = [
-        float(np.mean(np.array(value))) ** (2 if "roughness" in key else 1)  # of `principled`: α = roughness²
-        for key, value in mi.traverse(bsdf)
-        if {"alpha", "alpha_u", "alpha_v", "roughness"} & set(key.split("."))
-        and key.rsplit(".", 1)[-1] in ("alpha", "alpha_u", "alpha_v", "roughness", "value", "data")
-    ]
-    if found:
-        return float(np.clip(np.mean(found), 0, 1))
-    return 0.0 if _is_pure_delta(bsdf.flags()) else 1.0
 
 
 # ------------------------------------------------------------------------------------------------------------- tracing
@@ -346,7 +301,7 @@ def _follow(scene: Any, s: _Path, settings: Settings) -> _Path:
     si = scene.ray_intersect(s.ray, active=s.active)
     emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
     bsdf = si.bsdf()
-    leads_on = s.active & si.is_valid() & _is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)
+    leads_on = s.active & si.is_valid() & is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)
     bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), leads_on)
     return _Path(
         active=leads_on,
@@ -388,7 +343,7 @@ def _lit(
     two_sided = mi.has_flag(flags, mi.BSDFFlags.BackSide)
     diffuse = reached & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0))
     diffuse &= mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
-    other = reached & _has_other_lobes(flags) & settings.glossy
+    other = reached & has_other_lobes(flags) & settings.glossy
     at = _Surface(scene, lights, si, _turned(si.sh_frame.n, path.ray.d), path.ray.d, diffuse, other, settings)
     return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
 

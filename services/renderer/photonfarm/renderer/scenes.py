@@ -30,6 +30,7 @@ class LoadedScene:
         from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.editing import MovableGroup
         from photonfarm.renderer.loading import lower_corner
+        from photonfarm.renderer.materials import Materials
         from photonfarm.renderer.sensor import AimedSensor
 
         self.spec = spec
@@ -38,7 +39,7 @@ class LoadedScene:
         self._integrator = integrator_of(spec.transport)
         self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
         self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
-        self._roughness = guides.roughness_of(scene)
+        self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
@@ -128,7 +129,7 @@ class LoadedScene:
         from photonfarm.renderer.guides import point_light, view_guides
 
         arrives = point_light(self.scene, *lit, key, wanted, self._point_recorder)
-        return view_guides(self.scene, view, self.spec, wanted, key, self._roughness, arrives, self._guide_recorder)
+        return view_guides(self.scene, view, self.spec, wanted, key, self._materials, arrives, self._guide_recorder)
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""

@@ -249,18 +249,11 @@ OF_LIGHT = ("emission", "direct", "gloss", "point_light")
 
 
 def _fill_guides(memory: GuideInputs, place: int, guides: Guides | None, exposure: float) -> None:
-    for name, array in arrays_of(held(guides)).items():
+    for name, array in arrays_of(given(guides)).items():
         values = getattr(memory, name)
         values[place] = torch.from_numpy(array)
         if name in OF_LIGHT:
             values[place].mul_(exposure)
-
-
-def held(guides: Guides | None) -> Guides:
-    """The guides of a sample whose source follows them; raises ValueError where it does not."""
-    if guides is None:
-        raise ValueError("sample: has no guides; call `follow_guides` of its source before it is read")
-    return guides
 
 
 def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -79,7 +80,7 @@ class Committed(Protocol):
         """Whether a job has its marker there."""
 
 
-class RowWriter:
+class RowWriter(ABC):
     """Takes rows of a job's arrays in any order, and commits them once all are there: into a `Committed`.
 
     A context manager: leaving it without `commit` leaves nothing behind. Arrays that are given must not be changed
@@ -278,9 +279,9 @@ class RowWriter:
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
+    @abstractmethod
     def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
         """What must be given of each kind of rows: what it is called, and the rows."""
-        raise NotImplementedError
 
     def _check_complete(self) -> None:
         for kind, (what, rows) in self._expected().items():
@@ -309,9 +310,9 @@ class RowWriter:
             return False
         return True
 
+    @abstractmethod
     def _check_readable(self) -> None:
         """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
-        raise NotImplementedError
 
     def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
         """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""

@@ -46,9 +46,12 @@ class DatasetCard:
         versions: dict[str, set[str]] = {}
         workers = set()
         core_s: dict[int, float] = {}
-        for job in scene.committed_jobs():
-            figures = scene.marker(job)["figures"]
-            core_s[job] = figures["core_s"]
+        committed, guided = scene.committed_jobs(), scene.guides.committed_jobs()
+        told = [(job, scene.marker(job)) for job in sorted(committed)]
+        told += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
+        for job, marker in told:
+            figures = marker["figures"]
+            core_s[job] = core_s.get(job, 0.0) + figures["core_s"]
             workers.add(figures["worker"])
             for package, version in figures["versions"].items():
                 versions.setdefault(package, set()).add(version)
@@ -69,7 +72,7 @@ class DatasetCard:
 
     @property
     def core_s_per_sample(self) -> float:
-        """Processor time of a sample of a new view, buffers and photons included; 0 without one."""
+        """Processor time of a sample of a new view, buffers, guides and photons included; 0 without one."""
         return self.samples.core_s / self.samples.rows if self.samples.rows else 0.0
 
     def document(self) -> dict[str, Any]:

@@ -241,7 +241,7 @@ def trace(
     scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
     settings: Settings,
 ) -> dict[str, Any]:  # fmt: skip
-    """Of each ray what `_guides` makes means of, by name; zeros where there is nothing.
+    """What `_guides` makes means of, by name, of each ray; zeros where there is nothing.
 
     `tables` are the roughness of BSDFs and three columns of points; rays begin on the near plane, whose distance from
     the eye is `settings.near` / `along`.

@@ -82,7 +82,7 @@ def frames_of(
 def _guides(
     scene: SceneRenderer, modification: Modification, views: Sequence[View], told: tuple[str, GuideSpec, BasePointCloud]
 ) -> Guides:
-    """Of all views, stacked; `told` is the scene's id, how they are rendered, and its base cloud."""
+    """The guides of all views, stacked; `told` is the scene's id, how they are rendered, and its base cloud."""
     scene_id, wanted, cloud = told
     key, lit = modification.key(scene_id), lit_points(cloud, modification)
     found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]

@@ -38,7 +38,7 @@ class LitPoints(nn.Module):
     normal: Tensor
 
     def __init__(self, frame: SceneFrame, count: int) -> None:
-        """For the first `count` points of a frame's cloud, or as many as are lit."""
+        """Take the first `count` points of a frame's cloud, or as many as are lit."""
         super().__init__()
         self._optics = frame.optics
         self._count = min(count, len(frame.appearance))
@@ -48,7 +48,7 @@ class LitPoints(nn.Module):
 
     @torch.no_grad()
     def forward(self, inputs: Inputs) -> list[Tensor]:
-        """By diffuse reflection and by other lobes, (B, H, W, 3) each; the latter 0 where a surface has none."""
+        """Light by diffuse reflection and by other lobes, (B, H, W, 3) each; the latter 0 where a surface has none."""
         images = [self._of_sample(inputs, place) for place in range(len(inputs.depth))]
         return [torch.stack(parts) for parts in zip(*images, strict=True)]
 

@@ -24,7 +24,7 @@ class PhotonLight:
     """
 
     def __init__(self, frame: SceneFrame, architecture: str, *, bounces: int = 0) -> None:
-        """For the scene of a frame; raises SpecError where it has no photons."""
+        """Take the scene of a frame; raises SpecError where it has no photons."""
         if not frame.photon_paths:
             raise SpecError(
                 f"network.architecture = {architecture!r}: the scene has photons.paths = 0, and none are stored; set "

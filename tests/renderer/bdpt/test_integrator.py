@@ -161,6 +161,33 @@ def test_a_mesh_light_with_smooth_normals_is_left_to_hits(renders: Any, assert_e
 # ------------------------------------------------ Refusals ------------------------------------------------
 
 
+def test_what_stands_just_behind_the_near_plane_hides_the_scene_from_light_paths_too() -> None:
+    turned, shifted = mi.ScalarTransform4f().rotate, mi.ScalarTransform4f().translate
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": shifted([0, 0, -3]).scale(3)},
+            "wall": {"type": "rectangle", "to_world": shifted([3, 0, 0]).rotate([0, 1, 0], -90).scale(3)},
+            "lamp": {"type": "point", "position": [0, 0, -1], "intensity": 10.0},
+            "card": {
+                "type": "rectangle",
+                "to_world": shifted([0, 0, -0.0101]),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            },
+            "sensor": {
+                "type": "perspective",
+                "near_clip": 0.01,
+                "to_world": turned([0, 1, 0], 180),
+                "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+            },
+        },
+        optimize=False,
+    )
+    assert image(scene, spp=64, connections=0, light_ratio=0.0).max() == 0
+    assert image(scene, spp=64, connections=0, light_ratio=1.0).max() == 0
+    assert image(scene, spp=64, connections=1, light_ratio=1.0).max() == 0
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

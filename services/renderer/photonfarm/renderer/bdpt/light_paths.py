@@ -167,7 +167,7 @@ def vertex_bounce(
             seen.area_density_over_cos * cos_out, options.light_ratio, count, p_reverse, dvcm, dvc
         )
         joined = seen.valid & (dr.max(value) > 0)
-        joined &= ~scene.ray_test(si.spawn_ray_to(seen.start), joined)
+        joined &= ~scene.ray_test(_from_lens(seen.start, si), joined)
         splat.add(seen.position, s.throughput * value * seen.weight * (w * cos_out / cos_in), joined)
 
     # ----------------------------- Keep for connections -----------------------------
@@ -188,6 +188,18 @@ def vertex_bounce(
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
     state.active &= state.hit.is_valid()
     return (state,)
+
+
+def _from_lens(start: Any, si: Any) -> Any:
+    """The ray from the near plane to just before a surface.
+
+    The other way round, `spawn_ray_to` would leave out the last part, and what stands just behind the near plane would
+    hide nothing, though it hides all from primary rays.
+    """
+    end = si.spawn_ray_to(start).o
+    way = end - start
+    distance = dr.norm(way)
+    return mi.Ray3f(start, way / distance, distance, si.time, si.wavelengths)
 
 
 def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:

@@ -54,7 +54,7 @@ class NetworkSettings(_Frozen):
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
-    lit_points: Count = 512  # of guided_transport: points that send direct light on, at most as many as are lit
+    lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
 
     @model_validator(mode="after")

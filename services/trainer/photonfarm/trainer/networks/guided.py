@@ -16,7 +16,7 @@ from torch import Tensor
 
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, given
-from photonfarm.trainer.networks.lit_points import CHANNELS, LitPoints
+from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_light import PhotonLight
 from photonfarm.trainer.photon_map import WINDOWS
@@ -39,8 +39,9 @@ def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
-    With `transport` it sees what lit points send on to each pixel, by diffuse reflection and by other lobes; with
-    `photons` what photons that were reflected before bring to diffuse surfaces, which is added to the image too.
+    With `transport` it sees what lit points send on to each pixel, by diffuse reflection and by other lobes, and the
+    diffuse part is added to the image. With `photons` it sees what photons that were reflected before bring to diffuse
+    surfaces, which is added where lit points add nothing.
     """
 
     def __init__(
@@ -67,10 +68,15 @@ class Guided(Network):
         return [torch.log1p(light) for light in (*found, *gathered)]
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
-        """Emission, reflected direct light, and albedo times what the widest window of photons has, (B, H, W, 3)."""
+        """Emission, reflected direct light, and albedo times further diffuse light, (B, H, W, 3).
+
+        That is what all lit points bring, or else what the widest window of photons has.
+        """
         guides = given(inputs.guides)
         light = guides.emission + guides.direct + guides.gloss
-        return light if self.photon_light is None else light + inputs.albedo * torch.expm1(further[-1])
+        if self.lit_points is None and self.photon_light is None:
+            return light
+        return light + inputs.albedo * torch.expm1(further[-1] if self.lit_points is None else further[DIFFUSE])
 
     def guide_channels(self, guides: GuideInputs, scale: Tensor) -> list[Tensor]:
         """The guides near 1, each (B, H, W, C): light as log(1 + it), direct light over what reflects it."""

@@ -1,11 +1,19 @@
-"""Light that lit points send on: instant radiosity from the scene's point cloud [Keller 1997]. Nothing is learned here.
+"""Light that lit points send on: instant radiosity from the scene's point cloud [Keller 1997], with learned visibility.
 
-Each of the first points of the cloud stands for its share of the scene's surface, and sends on what direct light brings
-to it and it reflects. Every pixel sums that over all points, by the form factor cos θ cos θ′ A / (π r²): a sum that
-depends on the receiver, which a maximum over points cannot be. Glossy surfaces sum it over the directions that their
-lobe mirrors. Direct light has its shadows, as rendered; what stands between point and pixel is left to the U-Net.
+Each of the first points of the cloud stands for its share A of the scene's surface. Direct light reaches it, rendered
+with its shadows. What it reflects goes to every other point, and from all of these to every pixel, by the form factor
+F = cos θ cos θ′ A / (π r²):
 
-Shape letters: B batch, L lit points, H W image, N receivers.
+    B₁ = ρ (F ∘ V) E / π        B₀ = ρ E / π        light of a pixel = (F ∘ V) (B₀ + B₁)
+
+This is attention over points. Its kernel is the form factor, so that what a pixel receives depends on where it lies, as
+a maximum over points cannot. What is learned is the visibility V between two surfaces, of their places and normals:
+
+    V = sigmoid(r(receiver) · s(sender) + b)
+
+Glossy surfaces sum B₀ over the directions that their lobe mirrors; there nothing is learned.
+
+Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
 """
 
 from __future__ import annotations
@@ -18,9 +26,10 @@ from torch.nn import functional
 
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
+from photonfarm.trainer.networks.network import with_octaves
 
-HALVED = 2
-"""Diffuse surfaces receive at half the resolution: what comes from all around changes little from pixel to pixel."""
+COARSE = 4
+"""Diffuse light is summed for squares of so many by so many pixels: from one to the next it changes little."""
 
 GLOSSY = 0.02
 """Directional albedo of lobes other than diffuse and followed ones, from which a pixel sums over a lobe."""
@@ -28,7 +37,49 @@ GLOSSY = 0.02
 SHARPEST = 0.15
 """Least roughness of such a lobe: a narrower one would fall between points."""
 
-CHANNELS = 6
+CHANNELS = 9
+
+DIFFUSE = 1
+"""Which of what `LitPoints` gives is all diffuse light."""
+
+OCTAVES = 3
+HIDDEN = 64
+FACTORS = 8
+"""Numbers of each surface whose products say what it sees."""
+
+OPEN = 2.0
+"""b at first: before anything is learned most surfaces see each other."""
+
+
+class Visibility(nn.Module):
+    """How much of one surface another sees, learned: in (0, 1)."""
+
+    centre: Tensor
+
+    def __init__(self, frame: SceneFrame) -> None:
+        """Take the scene's place and size from a frame."""
+        super().__init__()
+        self._scale = frame.scale
+        self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
+        self.receiver, self.sender = _factors(std=0.3 / HIDDEN**0.5), _factors()
+        self.open = nn.Parameter(torch.tensor(OPEN))
+
+    def surfaces(self, position: Tensor, normal: Tensor) -> Tensor:
+        """What is asked of a surface: its place, in sines and cosines, and its normal, (N, C)."""
+        return torch.cat([with_octaves((position - self.centre) / self._scale, OCTAVES), normal], dim=-1)
+
+    def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
+        """(N, C) and (L, C) → (N, L)."""
+        return torch.sigmoid(self.receiver(receivers) @ self.sender(senders).T + self.open)
+
+
+def _factors(std: float | None = None) -> nn.Sequential:
+    """What makes factors of a surface's numbers; with `std` they are that small at first."""
+    last = nn.Linear(HIDDEN, FACTORS)
+    if std is not None:
+        nn.init.normal_(last.weight, std=std)
+        nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(6 + 6 * OCTAVES, HIDDEN), nn.ReLU(), last)
 
 
 class LitPoints(nn.Module):
@@ -43,27 +94,31 @@ class LitPoints(nn.Module):
         self._optics = frame.optics
         self._count = min(count, len(frame.appearance))
         self._area = frame.area / self._count
+        self.visibility = Visibility(frame)
         self.register_buffer("normal", torch.from_numpy(frame.appearance[: self._count, 0:3].copy()), persistent=False)
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 
-    @torch.no_grad()
     def forward(self, inputs: Inputs) -> list[Tensor]:
-        """Light by diffuse reflection and by other lobes, (B, H, W, 3) each; the latter 0 where a surface has none."""
+        """Diffuse light B₀ as if nothing hid it, all diffuse light, and light by other lobes, (B, H, W, 3) each.
+
+        The last is 0 where a surface has no other lobes.
+        """
         images = [self._of_sample(inputs, place) for place in range(len(inputs.depth))]
         return [torch.stack(parts) for parts in zip(*images, strict=True)]
 
-    def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor]:
+    def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = given(inputs.points), given(inputs.guides)
         source, there = points.position[place, : self._count], points.visible[place, : self._count, None]
-        sent = self.albedo * guides.point_light[place, : self._count] * there / math.pi
+        reflects = self.albedo * there
+        sent = reflects * guides.point_light[place, : self._count] / math.pi
         rays, surface, normal = self._surfaces(inputs, place)
-        diffuse = self._diffuse(surface, normal, source, sent)
+        unhidden, light = self._diffuse(surface, normal, source, reflects, sent)
         glossy = (guides.specular[place] - guides.throughput[place]).mean(-1) > GLOSSY
         gloss = torch.zeros_like(surface)
         if glossy.any():
             at = surface[glossy], normal[glossy], rays[glossy], guides.roughness[place][glossy]
             gloss[glossy] = self._lobes(*at, source, sent)
-        return diffuse, gloss
+        return unhidden, light, gloss
 
     def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         """Ray, position and normal of what each pixel sees, (H, W, 3) each."""
@@ -73,16 +128,27 @@ class LitPoints(nn.Module):
         distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
         return rays, eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
 
-    def _diffuse(self, surface: Tensor, normal: Tensor, source: Tensor, sent: Tensor) -> Tensor:
-        """Σ over points of what they send × form factor, (H, W, 3)."""
-        height, width = surface.shape[:2]
+    def _diffuse(
+        self, surface: Tensor, normal: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What points send straight on as if nothing hid it, and what they send with what they pass on, (H, W, 3)."""
         at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
         facing = functional.normalize(facing, dim=-1)
+        factors = self._form_factors(at, facing, source)
+        senders = self.visibility.surfaces(source, self.normal)
+        between = self._form_factors(source, self.normal, source) * self.visibility(senders, senders)
+        seen = factors * self.visibility(self.visibility.surfaces(at, facing), senders)
+        found = torch.cat([factors @ sent, seen @ (sent + reflects * (between @ sent))], dim=-1)
+        height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
+        coarse = found.reshape(1, height, width, 6).permute(0, 3, 1, 2)
+        fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear")[0].permute(1, 2, 0)
+        return fine[..., :3], fine[..., 3:]
+
+    def _form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
+        """cos θ cos θ′ A / (π r²) of surfaces (N, 3) that face (N, 3) and each point, (N, L)."""
         leaves, squared = self._between(at, source)
         cosines = (facing @ source.T - (facing * at).sum(-1, keepdim=True)).clamp(min=0) * leaves
-        found = (cosines / (squared * squared)) @ (sent * (self._area / math.pi))
-        coarse = found.reshape(1, height // HALVED, width // HALVED, 3).permute(0, 3, 1, 2)
-        return functional.interpolate(coarse, scale_factor=HALVED, mode="bilinear")[0].permute(1, 2, 0)
+        return cosines / (squared * squared) * (self._area / math.pi)
 
     def _lobes(
         self, at: Tensor, normal: Tensor, rays: Tensor, roughness: Tensor, source: Tensor, sent: Tensor
@@ -110,5 +176,5 @@ class LitPoints(nn.Module):
 
 
 def _pooled(image: Tensor) -> Tensor:
-    """Means over squares of pixels, (H, W, 3) → (H/2, W/2, 3)."""
-    return functional.avg_pool2d(image.permute(2, 0, 1)[None], HALVED)[0].permute(1, 2, 0)
+    """Means over squares of pixels, (H, W, 3) → (H/4, W/4, 3)."""
+    return functional.avg_pool2d(image.permute(2, 0, 1)[None], COARSE)[0].permute(1, 2, 0)

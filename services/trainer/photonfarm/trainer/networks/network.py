@@ -30,6 +30,15 @@ def descriptors(points: int, settings: NetworkSettings) -> nn.Parameter:
     return nn.Parameter(DESCRIPTOR_SIZE * torch.randn(points, settings.descriptor))
 
 
+def with_octaves(x: Tensor, octaves: int) -> Tensor:
+    """Coordinates near 1, (…, 3), with sin and cos of π/2 · 2ᵏ times each, k = 0 … octaves − 1: (…, 3 + 6 · octaves).
+
+    From these, functions of the position are learnt in far fewer steps (Tancik et al., Fourier Features, 2020).
+    """
+    angles = [x * (0.5 * math.pi * 2**octave) for octave in range(octaves)]
+    return torch.cat([x, *(wave(angle) for angle in angles for wave in (torch.sin, torch.cos))], dim=-1)
+
+
 class Network(nn.Module):
     """Image synthesis from the image-space channels, and from whatever further ones a kind of network puts before."""
 
@@ -79,12 +88,9 @@ class Network(nn.Module):
     def coordinates(self, position: Tensor) -> Tensor:
         """World positions about the scene's centre, over half its diagonal, and their sines and cosines.
 
-        (…, 3) → (…, 3 + 6 · octaves): sin and cos of π/2 · 2ᵏ times each, k = 0 … octaves − 1, from which functions of
-        the position are learnt in far fewer steps (Tancik et al., Fourier Features, 2020).
+        (…, 3) → (…, 3 + 6 · octaves); see `with_octaves`.
         """
-        x = (position - self.centre) / self.scale
-        angles = [x * (0.5 * math.pi * 2**octave) for octave in range(self.octaves)]
-        return torch.cat([x, *(wave(angle) for angle in angles for wave in (torch.sin, torch.cos))], dim=-1)
+        return with_octaves((position - self.centre) / self.scale, self.octaves)
 
     def project(self, features: Tensor, position: Tensor, visible: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""

@@ -20,7 +20,12 @@ from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.projection import Optics
 from photonfarm.trainer.settings import NetworkSettings
 
-MODULES = {"light_transport": "point branch", "photon_transport": "photon branch", "image_synthesis": "U-Net"}
+MODULES = {
+    "light_transport": "point branch",
+    "lit_points": "point branch",
+    "photon_transport": "photon branch",
+    "image_synthesis": "U-Net",
+}
 """The part that each module of a network is; whatever lies in none is projection, and each point's descriptor."""
 
 PARTS = ("point branch", "photon branch", "projection", "U-Net")
@@ -47,7 +52,9 @@ def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
         network(_inputs(spec, settings))
     counts = {name: sum(ops.values()) / 2e9 for name, ops in counter.get_flop_counts().items()}
     root = type(network).__name__
-    gmacs = {part: counts.get(f"{root}.{module}", 0.0) for module, part in MODULES.items()}
+    gmacs = dict.fromkeys(PARTS, 0.0)
+    for module, part in MODULES.items():
+        gmacs[part] += counts.get(f"{root}.{module}", 0.0)
     gmacs["projection"] = counts["Global"] - sum(gmacs.values())
     parameters = _parameters(network)
     return [Part(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]

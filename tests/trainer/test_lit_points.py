@@ -1,0 +1,79 @@
+"""Light that points of a closed surface send on: inside a sphere all of it is known in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.lit_points import LitPoints
+from photonfarm.trainer.projection import Optics
+
+POINTS, ALBEDO, SENT = 1024, 0.6, 0.3
+
+
+@pytest.fixture
+def sphere() -> tuple[LitPoints, Tensor]:
+    """Points of a sphere of radius 1 that faces inwards, and where they are, (L, 3)."""
+    number = np.arange(POINTS) + 0.5
+    z, angle = 1 - 2 * number / POINTS, math.pi * (1 + 5**0.5) * number
+    ring = np.sqrt(1 - z * z)
+    position = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1).astype(np.float32)
+    appearance = np.concatenate([-position, np.full((POINTS, 3), ALBEDO), np.zeros((POINTS, 3))], axis=1)
+    optics = Optics(16.0, 16, 16, 0.01, 10.0)
+    centre, area = np.zeros(3, np.float32), 4 * math.pi
+    frame = SceneFrame(optics, centre, 1.0, position, appearance.astype(np.float32), 0, 0, 1.0, -1, area, 1.0)
+    return LitPoints(frame, POINTS), torch.from_numpy(position)
+
+
+def surfaces() -> tuple[Tensor, Tensor]:
+    """Places well inside, and where they face, (8, 8, 3), the same for each square of pixels."""
+    torch.manual_seed(0)
+    place, facing = 0.6 * torch.rand(2, 2, 3) - 0.3, torch.randn(2, 2, 3)
+    return tuple(each.repeat_interleave(4, 0).repeat_interleave(4, 1) for each in (place, facing))
+
+
+def diffuse(layer: LitPoints, position: Tensor) -> tuple[Tensor, Tensor]:
+    sent = torch.full((POINTS, 3), SENT)
+    return layer._diffuse(*surfaces(), position, layer.albedo, sent)
+
+
+def test_a_closed_surface_that_sends_the_same_everywhere_is_seen_so_from_everywhere(sphere) -> None:
+    unhidden, _ = diffuse(*sphere)
+    torch.testing.assert_close(unhidden, torch.full((8, 8, 3), SENT), rtol=0.02, atol=0)
+
+
+def test_where_nothing_is_hidden_each_point_passes_on_its_share(sphere) -> None:
+    layer, position = sphere
+    with torch.no_grad():
+        layer.visibility.open.fill_(50.0)
+    _, light = diffuse(layer, position)
+    torch.testing.assert_close(light, torch.full((8, 8, 3), SENT * (1 + ALBEDO)), rtol=0.03, atol=0)
+
+
+def test_where_all_is_hidden_no_light_comes_and_what_is_not_there_sends_none(sphere) -> None:
+    layer, position = sphere
+    with torch.no_grad():
+        layer.visibility.open.fill_(-50.0)
+    unhidden, light = diffuse(layer, position)
+    assert light.max() < 1e-6 < unhidden.min()
+    dark = layer._diffuse(*surfaces(), position, 0 * layer.albedo, torch.zeros(POINTS, 3))
+    assert all(each.max() == 0 for each in dark)
+
+
+def test_a_wall_between_is_learned(sphere) -> None:
+    """The half of the sphere below is dark to whoever is above: by 60 steps most of its light is gone."""
+    layer, position = sphere
+    above = 0.3 * torch.rand(8, 8, 3) + torch.tensor([-0.15, -0.15, 0.2])
+    facing = torch.tensor([0.0, 0.0, -1.0]).expand(8, 8, 3)
+    sent = SENT * (position[:, 2:] < 0).float().expand(-1, 3)
+    optimiser = torch.optim.Adam(layer.parameters(), lr=3e-2)
+    for _ in range(60):
+        optimiser.zero_grad()
+        unhidden, light = layer._diffuse(above, facing, position, layer.albedo, sent)
+        light.square().mean().backward()
+        optimiser.step()
+    assert all(parameter.grad is not None for parameter in layer.parameters())
+    assert light.mean() < 0.1 * unhidden.mean()

@@ -39,7 +39,8 @@ class Size(Frozen):
     changes: Mapping[str, Any] = Field(default_factory=dict)  # of the scene's spec
     modifications: int
     views: int
-    seed: int
+    seed: int  # of the plan
+    seeds: tuple[int, ...] = (0,)  # of networks; denoisers are trained from the first alone
     hold_out: float
     references: References
     architectures: tuple[str, ...]
@@ -81,13 +82,31 @@ class Experiment(Frozen):
         return parse_spec(described, where=str(HERE / f"{self.name}.toml"), beside=file.parent)
 
     def trained(self) -> list[Run]:
-        """Every network: one of each architecture, then the experiment's own."""
+        """Every network from the first seed: one of each architecture, then the experiment's own."""
         alike = [Run(name=name, train={"architecture": name}) for name in self.size.architectures]
         return [Run(name=run.name, train=self._settings(run)) for run in (*alike, *self.runs)]
 
+    def again(self) -> list[Run]:
+        """The same networks from each further seed, but for denoisers."""
+        networks = [run for run in self.trained() if not _denoises(run)]
+        return [
+            Run(name=seeded(run.name, seed), train={**run.train, "seed": seed})
+            for seed in self.size.seeds[1:]
+            for run in networks
+        ]
+
     def _settings(self, run: Run) -> dict[str, Any]:
-        denoises = str(run.train["architecture"]).startswith("denoise")
-        return {**self.size.train, **(self.size.train_denoisers if denoises else {}), **run.train}
+        own = self.size.train_denoisers if _denoises(run) else {}
+        return {"seed": self.size.seeds[0], **self.size.train, **own, **run.train}
+
+
+def seeded(name: str, seed: int) -> str:
+    """The name of a network's run from a further seed."""
+    return f"{name}-seed-{seed}"
+
+
+def _denoises(run: Run) -> bool:
+    return str(run.train["architecture"]).startswith("denoise")
 
 
 def names() -> list[str]:

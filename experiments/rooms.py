@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from experiment import Experiment
+from experiment import Experiment, seeded
 from photonfarm.shared.errors import IncompleteError, SpecError
 from photonfarm.shared.estimate import Estimate
+from stages import EVALUATION
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +33,11 @@ class Room:
                 f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
                 f"`python experiments/run.py {experiment.name}` makes it anew"
             )
-        return cls.of(experiment, report, commit)
+        found = cls.of(experiment, report, commit)
+        if again := experiment.again():
+            evaluated = file.parents[1] / "runs" / again[0].name / EVALUATION
+            found.document["further_seeds"] = _further_seeds(experiment, evaluated)
+        return found
 
     @classmethod
     def kept(cls, experiment: Experiment, document: dict[str, Any], file: Path) -> Self:
@@ -121,30 +127,65 @@ class Room:
         own, of_unit = self.rows[name]["frame_seconds"], unit and unit["frame_seconds"]
         return own["total"] / of_unit["total"] if own and of_unit else None
 
-    def gap(self, first: str, second: str) -> tuple[Estimate, float] | None:
-        """By how much the first's MSE is above the second's, in pairs of views, and the first's MSE.
+    def errors(self, name: str) -> NDArray[np.float64] | None:
+        """MSE of a row's images, (seeds, views); None where it has none.
 
-        None where either has none. Raises SpecError where a configuration has several views, which are not
-        independent.
+        Raises SpecError where a configuration has several views, which are not independent.
         """
-        pair = [self.rows.get(name) for name in (first, second)]
-        found = [row for row in pair if row is not None and "mse" in row]
-        if len(found) < len(pair):
+        row = self.rows.get(name)
+        if row is None or "mse" not in row:
             return None
-        count, views = found[0]["mse"]["count"], len(found[0]["mse_of_images"])
+        count, views = row["mse"]["count"], len(row["mse_of_images"])
         if count != views:
             raise SpecError(
                 f"{self.name}: its {views} views are of {count} configurations; gaps are taken in pairs of views, "
                 "which are independent only where each configuration has one: set views = 1"
             )
-        values = [np.array(row["mse_of_images"]) for row in found]
-        return Estimate.of(values[0] - values[1]), found[0]["mse"]["mean"]
+        return np.array([row["mse_of_images"], *self.document.get("further_seeds", {}).get(name, ())])
+
+    def mse(self, name: str) -> Estimate | None:
+        """MSE of a row over its views, the mean of its seeds; None where it has none. Raises SpecError as `errors`."""
+        found = self.errors(name)
+        return None if found is None else Estimate.of(found.mean(axis=0))
+
+    def gap(self, first: str, second: str) -> Gap | None:
+        """How far the first's MSE is above the second's; None where either has none. Raises SpecError as `errors`."""
+        pair = [self.errors(name) for name in (first, second)]
+        found = [errors for errors in pair if errors is not None]
+        if len(found) < len(pair):
+            return None
+        seeds = min(len(errors) for errors in found)
+        differences = found[0][:seeds] - found[1][:seeds]
+        unit = float(found[0].mean())
+        return Gap(Estimate.of(differences.mean(axis=0)), unit, tuple((differences.mean(axis=1) / unit).tolist()))
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """How far one network's MSE is above another's, in pairs of views."""
+
+    difference: Estimate  # the mean of all seeds
+    unit: float  # the first's MSE
+    of_seeds: tuple[float, ...]  # each seed's difference as a share of the unit
 
 
 def estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
     """Mean and standard error of a metric that each image has; None where it could not be computed."""
     found = row.get(metric)
     return None if found is None else Estimate(**found)
+
+
+def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
+    """MSE of each image by each further seed, of each network; raises IncompleteError where they were not measured."""
+    if not file.is_file():
+        raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    by_run = {Path(row["predictor"]).name: row["metric_space"]["mse"]["values"] for row in rows}
+    found: dict[str, list[list[float]]] = {}
+    for run in experiment.trained():
+        values = [by_run.get(seeded(run.name, seed)) for seed in experiment.size.seeds[1:]]
+        found[run.name] = [[round(value, 6) for value in of_images] for of_images in values if of_images]
+    return {name: values for name, values in found.items() if values}
 
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:

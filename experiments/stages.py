@@ -24,6 +24,7 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.markers import COMMITTED
 from photonfarm.shared.verbs import command
 
+EVALUATION = "evaluation.json"  # what `evaluate` leaves in each run's folder
 PREVIEW = "preview.html"  # what `up` makes last
 
 REFERENCE = re.compile(r"([0-9a-f]{32})(\.partial)?\.npz")
@@ -108,10 +109,13 @@ class Stages:
 
         Raises StageError for a run of another scene or of other settings than are asked for, before anything is done.
         """
-        missing = [run for run in self.experiment.trained() if not self._is_trained(run)]
+        missing = [run for run in self._runs() if not self._is_trained(run)]
         with ThreadPoolExecutor(self.workers) as pool:
             for _ in pool.map(self._train, missing):
                 pass
+
+    def _runs(self) -> list[Run]:
+        return [*self.experiment.trained(), *self.experiment.again()]
 
     def _is_trained(self, run: Run) -> bool:
         """Whether the last checkpoint of a run is its end. Raises StageError where it is not of what is asked for."""
@@ -163,20 +167,25 @@ class Stages:
     # -------------------------------------------------------------------------------------------------------- report
 
     def report(self) -> Path:
-        """The report of all networks and of the denoisers that nobody trained; made anew where any of it is newer."""
-        size, out, runs = self.experiment.size, self.folder / "report", self.experiment.trained()
-        references = self.folder / "references"  # renewed by every file that comes or goes
-        arguments: list[Any] = ["report", "--store", self.folder / "store", "--out", out]
-        for run in runs:
-            arguments += ["--run", self._folder(run)]
-        arguments += ["--references", references]
-        arguments += [argument for name in size.untrained for argument in ("--denoiser", name)]
-        arguments += [argument for kept in size.kept for argument in ("--kept", kept)]
-        held_out = size.modifications * size.views * size.hold_out
-        arguments += ["--samples", round(held_out)]  # further passes of the same views come after these
-        made_of = [references, *(self._checkpoint(run) for run in runs)]
-        self._verb("report", arguments, made=[out / "report.json"], of=made_of)
+        """The report of the networks from the first seed and of denoisers that nobody trained; all others' errors too.
+
+        Made anew where any of it is newer.
+        """
+        size, out = self.experiment.size, self.folder / "report"
+        denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
+        denoisers += [argument for kept in size.kept for argument in ("--kept", kept)]
+        self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
+        if again := self.experiment.again():
+            self._measure("evaluate", again, [], self._folder(again[0]) / EVALUATION)
         return out
+
+    def _measure(self, verb: str, runs: Sequence[Run], more: Sequence[Any], made: Path) -> None:
+        """What a verb makes of some runs against the references."""
+        size, references = self.experiment.size, self.folder / "references"  # renewed by every file that comes or goes
+        held_out = round(size.modifications * size.views * size.hold_out)  # further passes of them come after these
+        arguments = [verb, "--store", self.folder / "store", "--references", references, "--samples", held_out, *more]
+        arguments += [argument for run in runs for argument in ("--run", self._folder(run))]
+        self._verb(verb, arguments, made=[made], of=[references, *(self._checkpoint(run) for run in runs)])
 
     # --------------------------------------------------------------------------------------------------------- verbs
 

@@ -79,6 +79,7 @@ changes = { film = { width = 16, height = 16 }, transport = { half_spp = 1 }, po
 modifications = 12
 views = 1
 seed = 0
+seeds = [0, 1]
 hold_out = 0.4
 references = { views = 2, spp = 4 }
 architectures = ["light_transport", "denoise_4"]
@@ -137,6 +138,9 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert "| denoise_4 |" in paper_table([room], MOVABLE_LIGHTS)
     assert room_table([room]).splitlines()[-1].startswith("| tiny | A tiny room |")
     assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
+    assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
+        "light_transport": 2, "denoise_4": 1, "fill-in 1/4": 1,
+    }  # fmt: skip
 
     before = reports(stages)
     assert stages.run() == out

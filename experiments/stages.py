@@ -172,8 +172,7 @@ class Stages:
         arguments += ["--references", references]
         arguments += [argument for name in size.untrained for argument in ("--denoiser", name)]
         arguments += [argument for kept in size.kept for argument in ("--kept", kept)]
-        held_out = size.modifications * size.views * size.hold_out
-        arguments += ["--samples", round(held_out)]  # further passes of the same views come after these
+        arguments += ["--samples", size.modifications * size.views]  # all that are held out
         made_of = [references, *(self._checkpoint(run) for run in runs)]
         self._verb("report", arguments, made=[out / "report.json"], of=made_of)
         return out

@@ -459,7 +459,7 @@ def test_images_that_are_traced_in_several_goes_are_those_of_one(
     room: LoadedScene, somewhere: View, lit: Lit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = room.guides(somewhere, KEY, GuideSpec(), lit)
-    monkeypatch.setattr(guides, "RAYS", 100 * GRID * GRID)
+    monkeypatch.setattr("photonfarm.renderer.guides.images.RAYS", 100 * GRID * GRID)
     arrives = point_light(room.scene, *lit, KEY, GuideSpec())
     parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
     for name, values in arrays_of(whole).items():

@@ -15,8 +15,9 @@ the diffuse part, of which a coat may take some: so it may be below 0.
 
 **Point light** is the irradiance of the cloud's first points by the same light, by 16 shadow rays each.
 
-**Specular** is the directional albedo of the whole BSDF, by its own sampling at fixed points, less the diffuse
-reflectance. **Roughness** is α of the microfacet distribution as the material states it, the mean of a texture.
+**Specular** is the directional albedo of all lobes but the diffuse one, by the BSDF's own sampling at fixed points: of
+plastic the Fresnel reflectance of its coat, of glass 1, of a mask also what it lets through. **Roughness** is α of the
+microfacet distribution as the material states it, the mean of a texture.
 
 Shape letters: H W image, L lit points, N rays: pixel by pixel, and within a pixel row by row of its grid.
 """

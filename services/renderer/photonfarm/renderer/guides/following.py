@@ -23,13 +23,14 @@ def trace(
 ) -> dict[str, Any]:  # fmt: skip
     """What `images` makes means of, by name, of each ray; zeros where there is nothing.
 
-    `tables` are the roughness of BSDFs and three columns of points; rays begin on the near plane, whose distance from
-    the eye is `settings.near` / `along`.
+    `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
+    plane, whose distance from the eye is `settings.near` / `along`.
     """
-    roughness, *pattern = tables
+    roughness, diffuse_kept, *pattern = tables
     ray = mi.Ray3f(o=o, d=d, maxt=reach, time=0, wavelengths=[])
     first = scene.ray_intersect(ray)
     hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
+    number = dr.reinterpret_array(mi.UInt32, bsdf)
     path = _followed(scene, ray, before, settings)
     last = scene.ray_intersect(path.ray)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
@@ -39,8 +40,8 @@ def trace(
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),
         "normal": dr.select(hit, turned(first.sh_frame.n, d), 0),
-        "specular": specular_of(bsdf, first, hit),
-        "roughness": dr.gather(mi.Float, roughness, dr.reinterpret_array(mi.UInt32, bsdf), hit),
+        "specular": specular_of(bsdf, first, hit, dr.gather(mi.Float, diffuse_kept, number, hit)),
+        "roughness": dr.gather(mi.Float, roughness, number, hit),
         "emission": path.emission,
         "direct": path.throughput * albedo * arrives.diffuse,
         "gloss": path.throughput * (arrives.whole - albedo * arrives.diffuse),

@@ -72,7 +72,8 @@ def _traced(
         spec.view.near,
         materials.has_other_lobes,
     )
-    tables = floats(materials.roughness), *(floats(column) for column in pattern_of(settings.light_samples).T)
+    of_bsdfs = floats(materials.roughness), floats(materials.diffuse_kept)
+    tables = *of_bsdfs, *(floats(column) for column in pattern_of(settings.light_samples).T)
     arguments = lights, tables, *rays, floats(along), points(shifts), settings
     kind = (len(along), settings, lights.kinds if lights else None)
     columns = recorder(kind, scene, None, *arguments) if recorder else trace(scene, None, *arguments)

@@ -1,4 +1,8 @@
-"""How much of the light a surface reflects, or lets through, by its other lobes than the diffuse one."""
+"""How much of the light a surface reflects, or lets through, by other lobes than the diffuse one.
+
+A BSDF is asked for these lobes alone, by the context's `type_mask`. To take the diffuse reflectance off the total would
+not do: the coat of a plastic leaves its base less light, so that the difference is too small, and often below 0.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +18,14 @@ BSDF_SAMPLES = 2
 """Of each ray, for the directional albedo."""
 
 
-def specular_of(bsdf: Any, si: Any, hit: Any) -> Any:
-    """Directional albedo less diffuse reflectance, where the BSDF has more than a diffuse lobe; may be below 0.
+def specular_of(bsdf: Any, si: Any, hit: Any, diffuse_kept: Any) -> Any:
+    """Directional albedo of all lobes but the diffuse one, 0 where there are none; may be below 0 for `principled`.
 
-    That of the light's power: radiance in glass is larger by the square of the refractive index.
+    `diffuse_kept` is that of `Materials`. Of the light's power: radiance in glass is larger by the square of the
+    refractive index.
     """
     flags, context = bsdf.flags(), mi.BSDFContext(mi.TransportMode.Importance)
+    context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
     other = mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy)
     sampled = hit & other
     total = mi.Color3f(0)
@@ -29,4 +35,4 @@ def specular_of(bsdf: Any, si: Any, hit: Any) -> Any:
         u = [x - dr.floor(x) for x in u]
         _, weight = bsdf.sample(context, si, u[0], mi.Point2f(u[1], u[2]), sampled)
         total += dr.select(sampled, weight, 0)
-    return total / BSDF_SAMPLES - dr.select(sampled, diffuse_reflectance(si, sampled), 0)
+    return total / BSDF_SAMPLES - dr.select(sampled, diffuse_kept * diffuse_reflectance(si, sampled), 0)

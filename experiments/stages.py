@@ -182,8 +182,8 @@ class Stages:
     def _measure(self, verb: str, runs: Sequence[Run], more: Sequence[Any], made: Path) -> None:
         """What a verb makes of some runs against the references."""
         size, references = self.experiment.size, self.folder / "references"  # renewed by every file that comes or goes
-        held_out = round(size.modifications * size.views * size.hold_out)  # further passes of them come after these
-        arguments = [verb, "--store", self.folder / "store", "--references", references, "--samples", held_out, *more]
+        most = size.modifications * size.views  # so all that are held out
+        arguments = [verb, "--store", self.folder / "store", "--references", references, "--samples", most, *more]
         arguments += [argument for run in runs for argument in ("--run", self._folder(run))]
         self._verb(verb, arguments, made=[made], of=[references, *(self._checkpoint(run) for run in runs)])
 

@@ -8,12 +8,9 @@ model after each step. It takes the same steps each time; for others, and as man
 A step that fails is printed with those before it, shrunk to a few, as a program that can be pasted.
 """
 
-import hashlib
 import itertools
 import os
 import signal
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +19,22 @@ import pytest
 import store_samples as samples
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from store_model import Model, Planned, Reader, Writer, base_of, compare
 
-from photonfarm.shared.errors import CorruptError, IncompleteError, StoreError
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.plan import UNUSED, Known, Request, expand, sample_key
-from photonfarm.shared.records import BasePointCloud, Geometry, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store
+from photonfarm.shared.errors import CorruptError, IncompleteError, SpecError, StoreError
+from photonfarm.shared.plan import UNUSED, Request
+from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.guides import beside
 from photonfarm.shared.top_up import TopUp, spp_per_pass
 
 EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
@@ -50,130 +54,6 @@ processes = st.integers(0, PROCESSES - 1)
 counts = st.integers(1, 3)
 
 
-# ------------------------------------------------------------------------------ what is rendered: a function of content
-
-
-def radiance_of(spec: SceneSpec, key: bytes) -> np.ndarray:
-    """A sample's halves; every fourth has a value that float16 cannot hold."""
-    halves = samples.values(_seed(key), (2, spec.film.height, spec.film.width, 3))
-    if key[0] % 4 == 0:
-        halves[:, 0, 0, 0] = 70000
-    return halves
-
-
-def buffers_of(spec: SceneSpec, modification: bytes, view: bytes) -> ViewBuffers:
-    size = (spec.film.height, spec.film.width)
-    seed = _seed(modification + view)
-    return ViewBuffers(*(samples.values(seed + i, shape) for i, shape in enumerate([size, (*size, 3), (*size, 3)])))
-
-
-def visibility_of(spec: SceneSpec, modification: bytes, view: bytes) -> Visibility:
-    return samples.visibility(spec, _seed(modification + view))
-
-
-def photons_of(spec: SceneSpec, modification: bytes) -> Any:
-    return samples.photons(spec, _seed(modification))
-
-
-def base_of(spec: SceneSpec) -> tuple[Geometry, BasePointCloud]:
-    geometry, cloud = samples.base()
-    return geometry, cloud if spec.groups else replace(cloud, group=np.full_like(cloud.group, -1))
-
-
-def _seed(content: bytes) -> int:
-    return int.from_bytes(hashlib.blake2b(content, digest_size=7).digest(), "little")
-
-
-# ------------------------------------------------------------------------------------------------------------ the model
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A sample of the model."""
-
-    modification: bytes  # vectors
-    view: bytes
-    pass_: int
-    row: int
-    view_row: int
-    modification_row: int
-
-
-@dataclass
-class Model:
-    """A scene: what is planned, and which jobs are committed."""
-
-    spec: SceneSpec
-    shard_rows: int
-    planned: dict[bytes, Planned] = field(default_factory=dict)  # by sample key
-    plans: int = 0
-    jobs: int = 0
-    committed: set[int] = field(default_factory=set)
-
-    def jobs_of(self, sample: Planned) -> set[int]:
-        """The jobs that must be committed for a sample to be complete."""
-        return {row // self.shard_rows for row in (sample.row, sample.view_row, sample.modification_row)}
-
-    def complete(self) -> dict[int, bytes]:
-        """The keys of the complete samples, by row."""
-        return {s.row: key for key, s in self.planned.items() if self.jobs_of(s) <= self.committed}
-
-    def views(self) -> dict[tuple[bytes, bytes], list[Planned]]:
-        """The passes of each view, by modification and view, in the order of the views' rows."""
-        found: dict[tuple[bytes, bytes], list[Planned]] = {}
-        for sample in sorted(self.planned.values(), key=lambda s: s.view_row):
-            found.setdefault((sample.modification, sample.view), []).append(sample)
-        return found
-
-    def key(self, modification: bytes, view: bytes, pass_: int) -> bytes:
-        vector = np.frombuffer(modification, np.float32).reshape(-1, 4)
-        return sample_key(self.spec.scene_id, Modification.from_vector(vector), np.frombuffer(view, np.float32), pass_)
-
-    def named(self, request: Request) -> set[bytes]:
-        """The keys that a request names, whatever is planned."""
-        rows = expand(self.spec, request, Known(), first_job=0, shard_rows=self.shard_rows).rows
-        return {key.tobytes() for key in rows.sample_key[rows.sample_modification != UNUSED]}
-
-
-class Writer:
-    """A JobWriter, and the rows that it still wants."""
-
-    def __init__(self, number: int, scene: SceneStore, job: int) -> None:
-        self.number, self.job, self.spec = number, job, scene.spec
-        self.out: JobWriter = scene.job_writer(job)
-        rows = scene.job_rows(job)
-        vectors = {row: modification.vector.tobytes() for row, modification in rows.modifications.items()}
-        views = {
-            s.view_row: (vectors[s.modification_row], rows.views[s.view_row].vector.tobytes()) for s in rows.samples
-        }
-        self.left: list[tuple[Callable[..., None], int, Callable[[], Any]]] = []
-        for row in sorted(rows.new_modifications if scene.spec.photons.paths else ()):
-            self.left.append((self.out.photons, row, lambda row=row: photons_of(self.spec, vectors[row])))
-        for row in sorted(rows.new_views):
-            self.left.append((self._view, row, lambda row=row: views[row]))
-        for s in rows.samples:
-            self.left.append((self.out.radiance, s.row, lambda key=s.key: radiance_of(self.spec, key)))
-
-    def _view(self, row: int, view: tuple[bytes, bytes]) -> None:
-        self.out.view(row, buffers_of(self.spec, *view), visibility_of(self.spec, *view))
-
-    def give(self, count: int, choose: int = 0) -> None:
-        """Hand over so many of the rows, in some order."""
-        for _ in range(min(count, len(self.left))):
-            take, row, values = self.left.pop(choose % len(self.left))
-            take(row, values())
-
-
-@dataclass
-class Reader:
-    """A SceneReader, and what it has been shown."""
-
-    number: int
-    reader: SceneReader
-    seen: set[int] = field(default_factory=set)
-    disturbed: set[int] = field(default_factory=set)  # jobs damaged or taken back since it refreshed
-
-
 # ---------------------------------------------------------------------------------------------------------- the machine
 
 
@@ -187,15 +67,23 @@ class StoreMachine(RuleBasedStateMachine):
         self.models = [Model(spec, rows) for spec, rows in zip(SPECS, SHARD_ROWS, strict=True)]
         for spec in SPECS:
             self.stores[0].add(spec).write_base(*base_of(spec))
+        self.ask_for_guides(number=0, process=0, light_samples=1)  # as `submit` does; of the other scene in its time
         self.writers: list[Writer] = []
         self.readers: list[Reader] = []
-        self.watchers = [SceneReader(root, spec.scene_id) for spec in SPECS]
+        self.watchers = [(n, g, SceneReader(root, SPECS[n].scene_id, guides=g)) for n in (0, 1) for g in (False, True)]
         self.quarantined: dict[str, bytes] = {}
         self.dead: list[int] = []  # numbers of processes
         self.steps = 0
 
     def scene(self, number: int, process: int) -> SceneStore:
         return self.stores[process].scene(SPECS[number].scene_id)
+
+    @initialize(sizes=st.tuples(counts, counts, counts), jobs=st.integers(0, 3))
+    def begin(self, sizes: tuple[int, int, int], jobs: int) -> None:
+        """A plan, and some of its jobs."""
+        self.plan(number=0, process=0, sizes=sizes, seed=0)
+        for _ in range(jobs):
+            self.render(number=0, process=1, which=0)
 
     # ------------------------------------------------------------------------------------------------------------ plans
 
@@ -267,21 +155,34 @@ class StoreMachine(RuleBasedStateMachine):
     def _plan_of(plans: list[Any], row: int) -> Any:
         return next(plan for plan in plans if plan.first_row <= row < plan.end_row)
 
+    @rule(number=scene_numbers, process=processes, light_samples=st.sampled_from([1, 1, 1, 2]))
+    def ask_for_guides(self, number: int, process: int, light_samples: int) -> None:
+        """At any time; the settings that come first stay."""
+        model, wanted = self.models[number], GuideSpec(light_samples=light_samples)
+        guides = self.scene(number, process).guides
+        if model.wanted not in (None, wanted):
+            with pytest.raises(SpecError, match="fixed when they were first asked for"):
+                guides.want(wanted)
+            return
+        assert guides.want(wanted) is (model.wanted is None)
+        model.wanted = wanted
+
     # ---------------------------------------------------------------------------------------------------------- writing
 
-    def _some_job(self, number: int, which: int) -> int | None:
-        """A missing job; now and then any job."""
+    def _some_job(self, number: int, which: int, guides: bool) -> tuple[int, bool] | None:
+        """A missing job, and whether it is of guides, once these are asked for; now and then any job."""
         model = self.models[number]
-        missing = sorted(set(range(model.jobs)) - model.committed)
-        jobs = missing if missing and which % 8 else list(range(model.jobs))
-        return jobs[which // 8 % len(jobs)] if jobs else None
+        guides &= model.wanted is not None
+        missing = sorted(model.every(guides) - model.done(guides))
+        jobs = missing if missing and which % 8 else sorted(model.every(guides))
+        return (jobs[which // 8 % len(jobs)], guides) if jobs else None
 
     @precondition(lambda self: any(model.jobs for model in self.models) and len(self.writers) < 4)
-    @rule(number=scene_numbers, process=processes, which=any_index, count=st.integers(0, 12))
-    def open_writer(self, number: int, process: int, which: int, count: int) -> None:
+    @rule(number=scene_numbers, process=processes, which=any_index, count=st.integers(0, 12), guides=st.booleans())
+    def open_writer(self, number: int, process: int, which: int, count: int, guides: bool) -> None:
         """Also one for a job that another writer is at, or that is committed."""
-        if (job := self._some_job(number, which)) is not None:
-            writer = Writer(number, self.scene(number, process), job)
+        if (job := self._some_job(number, which, guides)) is not None:
+            writer = Writer(number, self.scene(number, process), *job)
             self.writers.append(writer)
             writer.give(count, which)
 
@@ -294,7 +195,7 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(which=any_index)
     def commit(self, which: int) -> None:
         writer = self.writers.pop(which % len(self.writers))
-        committed = self.models[writer.number].committed
+        committed = self.models[writer.number].done(writer.guides)
         with writer.out:
             writer.give(len(writer.left))
             assert writer.out.commit(samples.FIGURES) is (writer.job not in committed)
@@ -313,25 +214,29 @@ class StoreMachine(RuleBasedStateMachine):
         with self.writers.pop(which % len(self.writers)).out:
             pass
 
-    @precondition(lambda self: any(len(model.committed) < model.jobs for model in self.models))
+    @precondition(lambda self: any(model.missing() for model in self.models))
     @rule(number=scene_numbers, process=processes, which=any_index)
     def render(self, number: int, process: int, which: int) -> None:
-        """A job from beginning to end."""
-        if (job := self._some_job(number, which)) is not None:
-            self.writers.append(Writer(number, self.scene(number, process), job))
-            self.commit(len(self.writers) - 1)
+        """A missing job from beginning to end, as workers do: its guides first."""
+        model = self.models[number]
+        if jobs := model.missing():
+            job = jobs[which % len(jobs)]
+            for guides in (True, False):
+                if job in model.every(guides) - model.done(guides):
+                    self.writers.append(Writer(number, self.scene(number, process), job, guides))
+                    self.commit(len(self.writers) - 1)
 
-    @precondition(lambda self: any(len(model.committed) < model.jobs for model in self.models))
+    @precondition(lambda self: any(model.missing() for model in self.models))
     @rule(
-        number=scene_numbers, process=processes, which=any_index,
-        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 11), after=st.booleans(),
+        number=scene_numbers, process=processes, which=any_index, guides=st.booleans(),
+        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 13), after=st.booleans(),
     )  # fmt: skip
-    def die(self, number: int, process: int, which: int, given: int, links: int, after: bool) -> None:
+    def die(self, number: int, process: int, which: int, guides: bool, given: int, links: int, after: bool) -> None:
         """A process of its own, which is killed: in the middle of its rows, or before or after a link of its commit."""
-        if (job := self._some_job(number, which)) is None:
+        if (job := self._some_job(number, which, guides)) is None:
             return
         scene = self.scene(number, process)
-        scene.job_rows(job)  # the plans are loaded here: a fork shall not have to
+        scene.job_rows(job[0])  # the plans are loaded here: a fork shall not have to
         told, tell = os.pipe()
         if (pid := os.fork()) == 0:
             try:
@@ -345,7 +250,7 @@ class StoreMachine(RuleBasedStateMachine):
             said = told_of.read()
         assert said in (b"", b"marker"), said.decode()
         if said == b"marker":
-            self.models[number].committed.add(job)
+            self.models[number].done(job[1]).add(job[0])
         self.dead.append(pid)
 
     # --------------------------------------------------------------------------------------------- processes and sweeps
@@ -371,15 +276,28 @@ class StoreMachine(RuleBasedStateMachine):
     # ---------------------------------------------------------------------------------------------------------- reading
 
     @precondition(lambda self: len(self.readers) < 3)
-    @rule(number=scene_numbers)
-    def open_reader(self, number: int) -> None:
-        self.readers.append(Reader(number, SceneReader(self.root, SPECS[number].scene_id)))
+    @rule(number=scene_numbers, guides=st.booleans())
+    def open_reader(self, number: int, guides: bool = False) -> None:
+        self.readers.append(Reader(number, SceneReader(self.root, SPECS[number].scene_id, guides=guides), guides))
+
+    @precondition(lambda self: self.readers)
+    @rule(which=any_index)
+    def follow_guides(self, which: int) -> None:
+        """From now on, of a scene that is to have some."""
+        following = self.readers[which % len(self.readers)]
+        if self.models[following.number].wanted is None:
+            with pytest.raises(SpecError, match="has no guides"):
+                following.reader.follow_guides()
+            return
+        following.reader.follow_guides()
+        if not following.guides:
+            following.guides, following.seen = True, set()
 
     @precondition(lambda self: self.readers)
     @rule(which=any_index)
     def refresh(self, which: int) -> None:
         following = self.readers[which % len(self.readers)]
-        complete = set(self.models[following.number].complete())
+        complete = set(self.models[following.number].complete(following.guides))
         new = set(following.reader.refresh().tolist())
         assert new == complete - following.seen
         assert set(following.reader.taken_back.tolist()) == following.seen - complete
@@ -408,7 +326,7 @@ class StoreMachine(RuleBasedStateMachine):
         model = self.models[following.number]
         sample = next(s for s in model.planned.values() if s.row == row)
         try:
-            _compare(following.reader, row, model)
+            compare(following.reader, row, model, guides=following.guides)
         except CorruptError:
             assert model.jobs_of(sample) & following.disturbed, "what nobody has touched reads whole"
 
@@ -417,29 +335,37 @@ class StoreMachine(RuleBasedStateMachine):
     @precondition(lambda self: any(model.committed for model in self.models))
     @rule(
         number=scene_numbers, process=processes, which=any_index, file=any_index, at=st.floats(0, 1),
+        guides=st.booleans(),
         harm=st.sampled_from(["flip", "flip", "cut", "cut", "delete", "cut marker", "delete marker"]),
     )  # fmt: skip
-    def damage_and_repair(self, number: int, process: int, which: int, file: int, at: float, harm: str) -> None:
-        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left."""
+    def damage_and_repair(
+        self, number: int, process: int, which: int, file: int, at: float, harm: str, guides: bool = False
+    ) -> None:
+        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left.
+
+        Of a job's guides it leaves the samples where they are, and the other way round.
+        """
         model = self.models[number]
-        if not model.committed:
+        done = model.done(guides := guides and bool(model.guided))
+        if not done:
             return
         scene = self.scene(number, process)
-        job = sorted(model.committed)[which % len(model.committed)]
-        marker = f"{scene.name}/committed/{job:012d}.json"
-        files = sorted(f"{scene.name}/{name}" for name in scene.marker(job)["files"])
+        part, called = (scene.guides, "guides of job") if guides else (scene, "job")
+        job = sorted(done)[which % len(done)]
+        marker = f"{part.name}/committed/{job:012d}.json"
+        files = sorted(f"{part.name}/{name}" for name in part.marker(job)["files"])
         _harm(self.root / (marker if "marker" in harm else files[file % len(files)]), harm.split()[0], at)
         self._disturb(number, job)
-        fresh = Reader(number, SceneReader(self.root, SPECS[number].scene_id), disturbed={job})
+        fresh = Reader(number, SceneReader(self.root, SPECS[number].scene_id, guides=guides), guides, disturbed={job})
         for row in fresh.reader.refresh().tolist():
             self._read(fresh, row)
 
         left = {name: (self.root / name).read_bytes() for name in [marker, *files] if (self.root / name).exists()}
         report = check_store(self.stores[process], when="now", repair=True)
-        model.committed.discard(job)
+        done.discard(job)
         aside = {each.scene_id: each.set_aside for each in report.scenes}
         without_marker = harm == "delete marker"  # nobody knows that it was there
-        assert aside.pop(model.spec.scene_id) == (() if without_marker else (f"job {job}",))
+        assert aside.pop(model.spec.scene_id) == (() if without_marker else (f"{called} {job}",))
         assert set(aside.values()) <= {()}
         assert report.exit_code == (0 if without_marker else 7)
         moved = {name: content for name, content in left.items() if not (self.root / name).exists()}
@@ -460,8 +386,10 @@ class StoreMachine(RuleBasedStateMachine):
         left = [
             path
             for plan in scene.plans()
-            for path in sorted((self.root / plan.folder).glob("*/c.*"))
-            if path.parent.name in WRITTEN and plan.first_job + int(path.name.split(".")[1]) not in model.committed
+            for guides, folder in ((False, plan.folder), (True, beside(plan, scene.guides.name).folder))
+            for path in sorted((self.root / folder).glob("*/c.*"))
+            if guides or path.parent.name in WRITTEN
+            if plan.first_job + int(path.name.split(".")[1]) not in model.done(guides)
         ]
         if left:
             path = left[which % len(left)]
@@ -485,16 +413,22 @@ class StoreMachine(RuleBasedStateMachine):
         for model in self.models:
             scene = Store(self.root).scene(model.spec.scene_id)
             assert scene.committed_jobs() == model.committed
+            assert scene.guides.committed_jobs() == model.guided
+            assert scene.guides.settings() == model.wanted
+            assert scene.missing_jobs() == model.missing()
+            usable = model.complete(guides=model.wanted is not None)
+            assert scene.progress().usable_samples == len(usable)
 
     def who_looks_after_each_step_sees_every_complete_sample_bit_for_bit(self) -> None:
         self.steps += 1
-        for watcher, model in zip(self.watchers, self.models, strict=True):
-            complete = model.complete()
+        for number, guides, watcher in self.watchers:
+            model = self.models[number]
+            complete = model.complete(guides)
             watcher.refresh()
             assert watcher.rows.tolist() == sorted(complete)
             assert watcher.planned == len(model.planned)
             for i in range(min(2, len(complete))):
-                _compare(watcher, sorted(complete)[(self.steps * 2 + i) % len(complete)], model)
+                compare(watcher, sorted(complete)[(self.steps * 2 + i) % len(complete)], model, guides=guides)
 
     def what_is_quarantined_stays(self) -> None:
         for path, content in self.quarantined.items():
@@ -510,19 +444,22 @@ class StoreMachine(RuleBasedStateMachine):
             while self.writers:
                 self.give_up(0)
             for number, model in enumerate(self.models):
-                for job in sorted(set(range(model.jobs)) - model.committed):
-                    self.writers.append(Writer(number, self.scene(number, 0), job))
-                    self.commit(0)
-                reader = SceneReader(self.root, model.spec.scene_id)
+                for guides in (False, True):
+                    for job in sorted(model.every(guides) - model.done(guides)):
+                        self.writers.append(Writer(number, self.scene(number, 0), job, guides))
+                        self.commit(0)
+                guides = model.wanted is not None
+                reader = SceneReader(self.root, model.spec.scene_id, guides=guides)
                 assert len(reader.refresh()) == len(model.planned)
-                assert {_compare(reader, row, model) for row in reader.rows.tolist()} == model.planned.keys()
+                rows = reader.rows.tolist()
+                assert {compare(reader, row, model, guides=guides) for row in rows} == model.planned.keys()
             for following in self.readers:
                 self.refresh(self.readers.index(following))
                 for row in sorted(following.seen):
                     self._read(following, row)
             report = check_store(Store(self.root), when="now")
             assert report.exit_code == 0
-            assert self.stores[0].sweep(stray_age_s=0) <= 14 * len(self.dead)
+            assert self.stores[0].sweep(stray_age_s=0) <= 14 * len(self.dead)  # 12 guides, their folder and marker
             assert self._parts() == set()
         finally:
             for writer in self.writers:
@@ -533,23 +470,6 @@ class StoreMachine(RuleBasedStateMachine):
 WRITTEN = {"radiance", "radiance_wide", "depth", "albedo", "normal"} | {
     f"photon_{name}" for name in ("position", "direction", "normal", "power", "bounce")
 }
-
-
-def _compare(reader: SceneReader, row: int, model: Model) -> bytes:
-    """Read a row, and compare it bit for bit with what the model has under its key; the key."""
-    sample = reader.read(row)
-    modification, view = sample.modification.vector.tobytes(), sample.view.vector.tobytes()
-    key = model.key(modification, view, sample.pass_)
-    assert model.complete().get(row, key) == key
-    assert model.planned[key].row == row
-    np.testing.assert_array_equal(sample.radiance, radiance_of(model.spec, key))
-    for name, values in arrays_of(buffers_of(model.spec, modification, view)).items():
-        np.testing.assert_array_equal(getattr(sample.buffers, name), values, name)
-    if model.spec.photons.paths:
-        stored = arrays_of(reader.read_photons(row))
-        for name, values in arrays_of(photons_of(model.spec, modification)).items():
-            np.testing.assert_array_equal(stored[name], values, name)
-    return key
 
 
 def _harm(path: Path, harm: str, at: float) -> None:
@@ -566,7 +486,7 @@ def _harm(path: Path, harm: str, at: float) -> None:
             file.write(bytes([content[place] ^ 1 << place % 8]))
 
 
-def _doomed(scene: SceneStore, job: int, given: int, links: int, after: bool, tell: int) -> None:
+def _doomed(scene: SceneStore, job: tuple[int, bool], given: int, links: int, after: bool, tell: int) -> None:
     """In a process of its own: write, and be killed; says whether the marker was placed before that."""
     try:
         plain, left = os.link, itertools.count(1)
@@ -581,7 +501,7 @@ def _doomed(scene: SceneStore, job: int, given: int, links: int, after: bool, te
             if last:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-        writer = Writer(0, scene, job)
+        writer = Writer(0, scene, *job)
         writer.give(given)
         if not writer.left:
             os.link = dying
@@ -590,21 +510,23 @@ def _doomed(scene: SceneStore, job: int, given: int, links: int, after: bool, te
         os.write(tell, repr(error).encode())
 
 
+@pytest.mark.parametrize("guides", [False, True], ids=["samples", "guides"])
 def test_a_reader_that_did_not_look_while_a_job_was_repaired_and_rendered_again_reads_what_is_there_now(
-    tmp_path: Path,
+    tmp_path: Path, guides: bool
 ) -> None:
     """The committed jobs are the same as before, and the shard that it has kept open is the damaged one."""
     machine = StoreMachine(tmp_path / "store")
     machine.plan(number=0, process=0, sizes=(2, 1, 1), seed=0)
-    machine.render(number=0, process=0, which=1)
-    machine.open_reader(number=0)
+    machine.render(number=0, process=0, which=0)
+    machine.open_reader(number=0, guides=guides)
     machine.refresh(which=0)
     rows = len(machine.readers[0].seen)
     for row in range(rows):
         machine.read(which=0, row=row)
-    for file in range(len(machine.scene(0, 0).marker(0)["files"])):
-        machine.damage_and_repair(number=0, process=0, which=0, file=file, at=0.3, harm="flip")
-        machine.render(number=0, process=0, which=1)
+    part = machine.scene(0, 0).guides if guides else machine.scene(0, 0)
+    for file in range(len(part.marker(0)["files"])):
+        machine.damage_and_repair(number=0, process=0, which=0, file=file, at=0.3, harm="flip", guides=guides)
+        machine.render(number=0, process=0, which=0)
         machine.refresh(which=0)
         for row in range(rows):
             machine.read(which=0, row=row)
@@ -616,7 +538,7 @@ def test_a_store_under_random_use_is_what_a_dictionary_would_be(tmp_path: Path) 
     run_state_machine_as_test(
         lambda: StoreMachine(tmp_path / str(next(number))),
         settings=settings(
-            max_examples=EXAMPLES or 12,
+            max_examples=EXAMPLES or 8,
             stateful_step_count=STEPS,
             derandomize=not EXAMPLES,
             database=None,

@@ -321,6 +321,62 @@ def test_specular_is_the_fresnel_reflectance_of_a_conductor_that_of_its_coat_on_
     np.testing.assert_allclose(centre(of_material({"type": "dielectric"}).specular), 1, rtol=1e-4)
 
 
+WHITE = 0.9 * np.ones(3)
+COATED: dict[str, Shape] = {
+    "plastic": {"type": "plastic", "diffuse_reflectance": rgb(WHITE)},
+    "nonlinear": {"type": "plastic", "diffuse_reflectance": rgb(GREY), "nonlinear": True},
+    "twosided": {"type": "twosided", "bsdf": {"type": "plastic", "diffuse_reflectance": rgb(GREY)}},
+}
+
+
+def of_a_ball(bsdf: Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What is specular of a ball of radius 1, and the cosine of each ray to its normal (N, 16): where pixels show it.
+
+    The ray from (0, 0, 3) passes the middle at a distance of 3 sin a, which is the sine at the surface.
+    """
+    found = known(scene_of(ball={"type": "sphere", "bsdf": bsdf})).specular
+    sine = 3 * np.sqrt(1 - grid_rays(AHEAD, spec())[1][..., 2] ** 2)
+    shown = (sine < 0.999).all(axis=-1)
+    assert shown.sum() > 100
+    return found[shown].astype(np.float64), np.sqrt(1 - sine[shown] ** 2)
+
+
+@pytest.mark.parametrize("name", COATED)
+def test_specular_of_a_plastic_ball_is_the_fresnel_reflectance_of_its_coat_whatever_lies_below(name: str) -> None:
+    found, cosine = of_a_ball(COATED[name])
+    eta = 1.49 / 1.000277
+    below = np.sqrt(1 - (1 - cosine**2) / eta**2)
+    across, along = (cosine - eta * below) / (cosine + eta * below), (eta * cosine - below) / (eta * cosine + below)
+    expected = ((across**2 + along**2) / 2).mean(axis=1)
+    np.testing.assert_allclose(found, np.repeat(expected[:, None], 3, axis=1), rtol=2e-3)
+    assert ((eta - 1) / (eta + 1)) ** 2 < found.min() * 1.001
+    assert found.max() < 1
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_specular_of_a_rough_plastic_ball_lies_between_the_fresnel_reflectance_head_on_and_1(nonlinear: bool) -> None:
+    bsdf = {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": rgb(WHITE), "nonlinear": nonlinear}
+    found, _ = of_a_ball(bsdf)
+    assert 0.038 < found.min() < 0.04
+    assert 0.1 < found.max() < 1
+
+
+def test_specular_of_principled_materials_is_without_their_diffuse_lobe_and_that_of_metal_is_whole() -> None:
+    """It answers with all of its lobes whatever is asked for."""
+    dull, metal = ({"type": "principled", "base_color": rgb(GREY), "metallic": share} for share in (0.0, 1.0))
+    assert 0.02 < centre(of_material(dull).specular).min() < centre(of_material(dull).specular).max() < 0.1
+    np.testing.assert_allclose(centre(of_material(metal).specular), GREY, rtol=0.1)
+    np.testing.assert_allclose(centre(of_material({"type": "twosided", "bsdf": metal}).specular), GREY, rtol=0.1)
+
+
+def test_specular_of_a_mask_counts_what_it_lets_through_and_of_a_blend_each_part() -> None:
+    """Of lobes chosen by chance, by 32 samples in each pixel: the mean of all pixels."""
+    masked = of_material({"type": "mask", "opacity": 0.6, "bsdf": COATED["plastic"]}).specular.mean()
+    blended = of_material({"type": "blendbsdf", "weight": 0.25, "a": diffuse(), "b": {"type": "conductor"}}).specular
+    assert masked == pytest.approx(0.4 + 0.6 * 0.039, abs=0.02)
+    assert blended.mean() == pytest.approx(0.25, abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("bsdf", "alpha"),
     [
@@ -459,7 +515,7 @@ def test_images_that_are_traced_in_several_goes_are_those_of_one(
     room: LoadedScene, somewhere: View, lit: Lit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = room.guides(somewhere, KEY, GuideSpec(), lit)
-    monkeypatch.setattr(guides, "RAYS", 100 * GRID * GRID)
+    monkeypatch.setattr("photonfarm.renderer.guides.images.RAYS", 100 * GRID * GRID)
     arrives = point_light(room.scene, *lit, KEY, GuideSpec())
     parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
     for name, values in arrays_of(whole).items():

@@ -14,9 +14,12 @@ from click.testing import CliRunner
 from photonfarm.shared import cli
 from photonfarm.shared.errors import SpecError, StoreError
 from photonfarm.shared.plan import PlannedRows, Request
+from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.show_store import commands
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.find import Matches, Query, find_samples, scene_named
 from photonfarm.shared.store.plans import StoredPlan
+from photonfarm.shared.store.schema import guide_arrays
 
 
 @pytest.fixture
@@ -142,6 +145,27 @@ def test_a_sample_is_complete_with_the_jobs_of_its_row_view_and_modification(sto
     assert reader.refresh().tolist() == [row for row in sorted(found) if found[row].complete]
 
 
+def test_guides_are_listed_where_the_scene_is_to_have_some(store: Store, scene: SceneStore) -> None:
+    (before,) = find(store, row=12).samples
+    assert before.guided is None
+    assert not {place.array for place in before.places} & guide_arrays(scene.spec).keys()
+    scene.guides.want(GuideSpec())
+    assert samples.commit_guides(scene, 0)
+    found = {s.row: s for s in find(store).samples}
+    assert (found[12].guided, found[4].guided) == (True, False)  # views of jobs 0 and 1
+    reader = SceneReader(store.root, scene.scene_id, guides=True)
+    reader.refresh()
+    known = reader.read(12).guides
+    places = {place.array: place for place in found[12].places[len(before.places) :]}
+    assert places.keys() == guide_arrays(scene.spec).keys()
+    for name, place in places.items():
+        assert (place.there, place.file.split("/")[2]) == (True, "guides")
+        stored = zarr.open_array(store.root / Path(place.file).parent, mode="r")
+        np.testing.assert_array_equal(stored[place.index], getattr(known, name))
+    assert commands(found[12], store.root).keys() == {"look at it"}
+    assert commands(found[4], store.root).keys() == {"look at it", "render job 1"}
+
+
 def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene: SceneStore) -> None:
     for name in (scene.scene_id, scene.scene_id[:6], "small"):
         assert scene_named(store, name) == scene.scene_id
@@ -193,12 +217,15 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     told = run("--row", "8")
     assert told.exit_code == 0
     assert "row 8, pass 0: not complete" in told.stdout
+    assert "guides" not in told.stdout
     assert f"photonfarm work --store {store.root} --scene {scene.scene_id} --job 2" in told.stdout
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
     assert printed["samples"][0]["complete"]
     assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
+    scene.guides.want(GuideSpec())
+    assert "guides        of job 2: missing" in run("--row", "8").stdout
 
 
 @pytest.mark.parametrize(

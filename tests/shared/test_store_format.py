@@ -15,7 +15,7 @@ import zarr
 from photonfarm.shared.errors import CorruptError, StoreError
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import LIT_POINTS, arrays_of
-from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.scene import Emitters, GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, declarations, markers, schema, store_status
 from photonfarm.shared.store.local import LocalStorage
 
@@ -72,6 +72,7 @@ def test_the_document_is_of_this_version_and_names_the_constants() -> None:
     assert f"One chunk is {schema.INPUT_ROWS_PER_CHUNK} rows" in text
     assert f"L is {LIT_POINTS}, or P if that is less" in text
     assert all(f"| `{setting}` |" in text for setting in GuideSpec.model_fields)
+    assert all(f"`emitters.{key}`" in text for key in Emitters.model_fields)
 
 
 def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) -> None:

@@ -74,15 +74,15 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     assert of_run["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
     assert of_run["bottleneck"] == bottleneck(of_run["waits"])
     assert of_run["samples_per_used"] == 1.0
-    assert of_run["trained_on"] == 40 - figures["evaluation"]["samples"]
+    assert of_run["trained_on"] == 40 - 2 * figures["evaluation"]["samples"]
     assert of_run["curve"][-1]["used"] == of_run["trained_on"], "120 draws of fewer than 40 samples"
-    assert all(0 < point["held_out"] <= figures["evaluation"]["samples"] for point in of_run["curve"])
+    assert all(0 < point["held_out"] <= 2 * figures["evaluation"]["samples"] for point in of_run["curve"])
     assert dataset["core_seconds_per_sample"] == pytest.approx(5 * 0.5 / 40)
     (row,) = figures["evaluation"]["rows"]
     assert row["linear_mse"]["mean"] < figures["untrained"]
     assert figures["evaluation"]["noise_floor"] > 0
     assert figures["mean_colour"] > 0
-    assert figures["evaluation"]["samples"] == 4 * figures["evaluation"]["units"], "two views of two passes each"
+    assert figures["evaluation"]["samples"] == 2 * figures["evaluation"]["units"], "two views, of whose passes one"
 
     page = (tmp_path / "out/report.html").read_text()
     shown = min(4, figures["evaluation"]["units"])
@@ -283,6 +283,7 @@ def test_passes_for_references_count_neither_as_samples_nor_as_their_cost(measur
     assert after["dataset"]["core_seconds_per_sample"] == 2.0 / 32
     (run,) = after["runs"]
     assert run["trained_on"] == before["runs"][0]["trained_on"], "what was added is held out"
+    assert after["evaluation"]["samples"] == before["evaluation"]["samples"], "each view is measured once"
     assert run["curve"][-1]["samples"] == 32 + further
     assert run["curve"][-1]["used"] == min(run["draws"], run["trained_on"])
     page = (tmp_path / "after/report.html").read_text()

@@ -75,7 +75,7 @@ class Guides:
     emission: F32  # (H, W, 3) radiance emitted towards the eye, also by what is seen in mirrors and through glass
     direct: F32  # (H, W, 3) radiance of the diffuse reflection of what lights send directly, likewise
     gloss: F32  # (H, W, 3) … of its reflection by all other lobes; with `direct` the whole, so that it may be below 0
-    specular: F32  # (H, W, 3) directional albedo of all lobes less the diffuse reflectance, at least 0
+    specular: F32  # (H, W, 3) directional albedo of all lobes but the diffuse one, at least 0
     roughness: F32  # (H, W) microfacet α of the surface: 0 for mirrors and glass, 1 for diffuse surfaces
     mean_depth: F32  # (H, W) along the camera's forward axis
     mean_normal: F32  # (H, W, 3) shading normals turned to the eye, world; shorter than 1 where they differ

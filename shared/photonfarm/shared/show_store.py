@@ -172,6 +172,8 @@ def _sample(sample: FoundSample, store: str | Path) -> None:
     click.echo(f"  view          {sample.view_key}  row {sample.view_row}: {view}")
     for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
         click.echo(f"  job           {job}: {'committed' if committed else 'missing'}")
+    if sample.guided is not None:
+        click.echo(f"  guides        of job {sample.jobs[1]}: {'committed' if sample.guided else 'missing'}")
     for place in sample.places:
         held = "" if place.there else "  (not there)"
         click.echo(f"  {place.array:<16} {place.file}  inner chunk {place.chunk}, index {place.index}{held}")
@@ -188,8 +190,11 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
             f"r = SceneReader({str(store)!r}, {sample.scene_id!r}); r.refresh(); print(r.read({sample.row}))"
         )
         listed["look at it"] = shlex.join(["python", "-c", program])
-    for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
-        if not committed:
+    lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
+    if sample.guided is False:
+        lacking.add(sample.jobs[1])  # which is rendered for its view's guides alone, if it is committed
+    for job in dict.fromkeys(sample.jobs):
+        if job in lacking:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
             listed[f"render job {job}"] = shlex.join(words)
     return listed

@@ -34,6 +34,8 @@ STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker
 AT_ONCE_S = 1.0  # for them to end when asked again, which is in the middle of a job
 
 Process = subprocess.Popen[bytes]
+Count = tuple[int, int]
+"""How many are committed, and how many planned."""
 
 
 def run_farm(
@@ -193,14 +195,15 @@ class _Farm:
         self.step = 0
         self.note = ""
 
-    def look(self) -> tuple[int, int]:
-        """Samples committed and planned, by now; `step` and `note` follow the trainer's log."""
+    def look(self) -> tuple[Count, Count]:
+        """Samples by now, and further passes of their views; `step` and `note` follow the trainer's log."""
         for record in self._records():
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
                 self.note = f", held-out error {stated(record['error'], record['standard_error'])}"
-        progress = self.scene.progress()
-        return progress.committed_samples, progress.planned_samples
+        found = self.scene.progress()
+        passes = found.committed_passes, found.planned_passes
+        return (found.committed_samples - passes[0], found.planned_samples - passes[1]), passes
 
     def _records(self) -> list[dict[str, Any]]:
         """The trainer's log as it is now; read whole, since a trainer that resumes takes back what it will redo."""
@@ -214,19 +217,19 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, co
     last_line = started = time.monotonic()
     with _bars(console) as bars:
         samples = bars.add_task("samples", total=None)
+        passes = bars.add_task("further passes", total=None, visible=False)
         steps = bars.add_task("training steps", total=farm.steps, visible=farm.steps > 0)
         while True:
             redis.keep_running()
             alive = any(process.poll() is None for process in running.values())
-            committed, planned = farm.look()
-            bars.update(samples, completed=committed, total=planned)
+            counts = farm.look()
+            for bar, (committed, planned) in zip((samples, passes), counts, strict=True):
+                bars.update(bar, completed=committed, total=planned, visible=bar == samples or planned > 0)
             bars.update(steps, completed=farm.step, description=f"training steps{farm.note}")
             now = time.monotonic()
             if not console.is_terminal and (now - last_line > PLAIN_LINE_S or not alive):
                 last_line = now
-                console.print(
-                    f"{now - started:4.0f} s  samples {committed}/{planned}  steps {farm.step}/{farm.steps}{farm.note}"
-                )
+                console.print(f"{now - started:4.0f} s  {_line(farm, *counts)}")
             for name, process in running.items():
                 if process.poll():
                     log = farm.run / f"{name}.log"
@@ -234,6 +237,12 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, co
             if not alive:
                 return
             time.sleep(POLL_S)
+
+
+def _line(farm: _Farm, samples: Count, passes: Count) -> str:
+    """How far it is, in words."""
+    further = f"  further passes {passes[0]}/{passes[1]}" if passes[1] else ""
+    return f"samples {samples[0]}/{samples[1]}{further}  steps {farm.step}/{farm.steps}{farm.note}"
 
 
 def _tail(log: Path) -> str:

@@ -97,8 +97,7 @@ class Evaluation:
     scene: str
     scene_id: str
     unit: str  # what is independent: "configuration" or, of a static scene, "view"
-    measured: tuple[int, ...]  # rows of the store, of which those that are complete no longer are left out
-    views: int  # that these show
+    measured: tuple[int, ...]  # rows of the store, one of each view; those that are complete no longer are left out
     device: str  # of the networks
     threads: int  # of torch on the CPU
     references: References | None
@@ -107,7 +106,7 @@ class Evaluation:
 
     @property
     def samples(self) -> int:
-        """How many samples all were measured on."""
+        """How many samples all were measured on, each of a view of its own."""
         return len(self.measured)
 
     @property
@@ -126,7 +125,7 @@ class Evaluation:
             "scene": self.scene,
             "scene_id": self.scene_id,
             "samples": self.samples,
-            "views": self.views,
+            "views": self.samples,
             "unit": self.unit,
             "units": self.units,
             "noise_floor": self.noise_floor,
@@ -149,12 +148,12 @@ def compare(
     tell: Tell | None = None,
     choose: Choose | None = None,
 ) -> Evaluation:
-    """The runs, and denoisers of one of so many pixels, on the first `most` samples that no run was trained on.
+    """The runs, and denoisers of one of so many pixels, on the first `most` views that no run was trained on.
 
-    References are files `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the
-    metric space, and each view is in it once, by its first sample. Raises SpecError for runs of different scenes, for
-    references of another size, for a film with too few pixels to keep some, and for a package that is missing;
-    IncompleteError if no held-out sample is complete.
+    Each view is measured once, by its first sample, however many passes of it there are. References are files
+    `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space. Raises
+    SpecError for runs of different scenes, for references of another size, for a film with too few pixels to keep some,
+    and for a package that is missing; IncompleteError if no held-out sample is complete.
     """
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
@@ -178,7 +177,6 @@ def compare(
         scene_id=first.scene_id,
         unit="configuration" if spec.groups else "view",
         measured=tuple(samples.rows),
-        views=len(set(samples.view_keys)),
         device=described(place),
         threads=first.settings.threads,
         references=References.of(found, spec.transport.half_spp),

@@ -46,8 +46,9 @@ kept_option = click.option(
     help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
 )  # fmt: skip
 samples_option = click.option(
-    "--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True, help="At most so many."
-)
+    "--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True,
+    help="At most so many, each of a view of its own.",
+)  # fmt: skip
 inception_option = click.option(
     "--inception", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
@@ -85,7 +86,7 @@ def _how(
 @measuring
 @json_option
 def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: Any) -> None:
-    """Measure trained networks on samples that none of them was trained on.
+    """Measure trained networks on views that none of them was trained on, each by its first sample.
 
     The linear error is mean squared, of radiance × exposure, against the clean images: the targets' noise is taken out.
     With references there are the columns of the paper too: of clip(exposure · I, 0, 1)^(1/2.2). In each run's folder

@@ -70,22 +70,27 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """The held-out samples that all predictors are measured on."""
+    """The held-out samples that all predictors are measured on: one of each view, whatever passes of it there are."""
 
     source: StoreSource
-    rows: list[int]
+    rows: list[int]  # ascending
     view_keys: list[Key]  # of each
 
     @classmethod
     def of(cls, source: StoreSource, share: float, most: int) -> Samples:
-        """Those held out by the smallest share: shares are nested, so that no run has seen them."""
+        """The first of each view, of those held out by the smallest share: shares are nested, so no run has seen them.
+
+        Of `most` views at the most; IncompleteError if there is none.
+        """
         complete = source.refresh().tolist()
         held_out = [row for row, held in zip(complete, rows_held_out(source, complete, share), strict=True) if held]
         if not held_out:
             raise IncompleteError(
                 f"hold_out = {share:g}: none of the {len(complete)} complete samples is held out; wait for the workers"
             )
-        return cls(source, held_out[:most], source.view_keys(held_out[:most]))
+        first = dict(zip(reversed(source.view_keys(held_out)), reversed(held_out), strict=True))
+        chosen = sorted((row, key) for key, row in first.items())[:most]
+        return cls(source, [row for row, _ in chosen], [key for _, key in chosen])
 
     def to_show(self, references: Mapping[int, Reference]) -> list[int]:
         """The first sample of each of the first configurations: of those that have a reference, where there are any."""
@@ -105,20 +110,20 @@ class Samples:
 
 
 def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
-    """The references there are, by the first row that shows their view; raises SpecError where none can be used."""
+    """The references there are, by the row that shows their view; raises SpecError where none can be used."""
     if not folder.is_dir():
         raise SpecError(f"{folder}: there is no such folder")
     spec = samples.source.spec
     film = spec.film
     found: dict[int, Reference] = {}
-    for key, row in dict(zip(reversed(samples.view_keys), reversed(samples.rows), strict=True)).items():
+    for row, key in zip(samples.rows, samples.view_keys, strict=True):
         if (file := folder / f"{key.hex()}.npz").is_file():
             found[row] = Reference.of(Merged.read(file), spec.exposure)
             if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:
         raise SpecError(
-            f"{folder}: holds no reference of the {len(set(samples.view_keys))} held-out views; "
+            f"{folder}: holds no reference of the {len(samples.rows)} held-out views; "
             "`photonfarm store merge --out` writes them, named by their views' keys"
         )
-    return dict(sorted(found.items()))
+    return found

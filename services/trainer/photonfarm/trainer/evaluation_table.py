@@ -95,7 +95,7 @@ def _of_inception(metrics: ImageMetrics) -> list[str]:
 
 def _head(evaluation: Evaluation) -> str:
     return (
-        f"{evaluation.scene}: {counted(evaluation.samples, 'held-out sample')} of {of_units(evaluation)}; "
+        f"{evaluation.scene}: {views_of(evaluation, 'held-out view')}, one sample of each; "
         f"noise of the targets, as linear MSE, {evaluation.noise_floor:.5f}"
     )
 
@@ -129,10 +129,10 @@ def _interval(estimate: Estimate) -> str:
     return NOT_AVAILABLE if found is None else f"{found[0]:.5f} … {found[1]:.5f}"
 
 
-def of_units(evaluation: Evaluation) -> str:
-    """What the samples show: so many views of so many configurations, or of a static scene views alone."""
-    units = counted(evaluation.units, evaluation.unit)
-    return units if evaluation.unit == "view" else f"{counted(evaluation.views, 'view')} of {units}"
+def views_of(evaluation: Evaluation, noun: str = "view") -> str:
+    """What was measured: so many views of so many configurations, or of a static scene views alone."""
+    views = counted(evaluation.samples, noun)
+    return views if evaluation.unit == "view" else f"{views} of {counted(evaluation.units, evaluation.unit)}"
 
 
 def counted(number: int, noun: str) -> str:

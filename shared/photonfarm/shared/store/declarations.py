@@ -229,7 +229,7 @@ GUIDES = (
         ("R", "H", "W", 3),
         "<f2",
         "1",
-        f"directional albedo of all lobes {_FIRST} less its diffuse reflectance, at least 0, {_MEAN}",
+        f"directional albedo of all lobes {_FIRST} but the diffuse one, at least 0, {_MEAN}",
     ),
     Declared(
         "roughness",

@@ -18,6 +18,7 @@ from photonfarm.shared.plan import UNUSED
 from photonfarm.shared.records import F32
 from photonfarm.shared.sampling import modification_keys, view_keys
 from photonfarm.shared.store import plans, schema
+from photonfarm.shared.store.guides import beside
 from photonfarm.shared.store.plans import StoredPlan
 from photonfarm.shared.store.query import Query
 from photonfarm.shared.store.scene_store import SceneStore
@@ -57,6 +58,7 @@ class FoundSample:
     plan: int
     jobs: tuple[int, ...]  # of its own row, its view's and its modification's
     committed: tuple[bool, ...]  # these jobs
+    guided: bool | None  # whether its view has guides, by its job's marker; None: the scene is to have none
     places: tuple[Place, ...]
 
     @property
@@ -160,22 +162,37 @@ class SceneMatch:
             plan=plan.number,
             jobs=jobs,
             committed=tuple(job in self._committed for job in jobs),
-            places=tuple(self._places(rows)),
+            guided=self._guided(jobs[1]),
+            places=(*self._places(rows), *self._guide_places(sample.view_row)),
         )
+
+    def _guided(self, job: int) -> bool | None:
+        guides = self._scene.guides
+        return None if guides.settings() is None else guides.is_committed(job)
 
     def _places(self, rows: dict[str, int]) -> list[Place]:
         found = []
         for name, array in schema.output_arrays(self._scene.spec).items():
             row = rows[array.kind]
-            plan = plans.plan_of(self._plans, row)
-            job, chunk = divmod(row, plan.shard_rows)
-            file = plan.shard(name, array, job)
-            there = self._is_there(file, array, chunk, plan.shard_rows)
-            if there or name != "radiance_wide":  # which few samples need
-                found.append(Place(name, file, chunk, row - plan.first_row, there))
+            place = self._place(plans.plan_of(self._plans, row), name, array, row)
+            if place.there or name != "radiance_wide":  # which few samples need
+                found.append(place)
         if any(place.array == "radiance_wide" for place in found):  # and those have nothing in the other
             found = [place for place in found if place.array != "radiance" or place.there]
         return found
+
+    def _guide_places(self, view_row: int) -> list[Place]:
+        """Those of the guides of a view; none if the scene is to have none."""
+        if self._scene.guides.settings() is None:
+            return []
+        plan = beside(plans.plan_of(self._plans, view_row), self._scene.guides.name)
+        arrays = schema.guide_arrays(self._scene.spec)
+        return [self._place(plan, name, array, view_row) for name, array in arrays.items()]
+
+    def _place(self, plan: StoredPlan, name: str, array: schema.ArraySchema, row: int) -> Place:
+        job, chunk = divmod(row, plan.shard_rows)
+        file = plan.shard(name, array, job)
+        return Place(name, file, chunk, row - plan.first_row, self._is_there(file, array, chunk, plan.shard_rows))
 
     def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
         storage = self._scene.storage

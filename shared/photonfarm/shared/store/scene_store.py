@@ -51,6 +51,8 @@ class Progress:
     planned_samples: int
     committed_samples: int  # complete ones
     usable_samples: int  # of these, those whose view lacks no guides, where the scene is to have some
+    planned_passes: int  # of the planned samples, further passes: those that top-ups planned
+    committed_passes: int  # of these, the complete ones
 
 
 class SceneStore:
@@ -173,8 +175,14 @@ class SceneStore:
         if self.guides.settings() is not None and found:
             view_row = np.concatenate([plan.rows.sample_view for plan in found])
             usable[complete] = has_guides(found, guided)[view_row[complete]]
-        samples = sum(plan.samples for plan in found)
-        return Progress(samples, int(np.count_nonzero(complete)), int(np.count_nonzero(usable)))
+        further = [plan for plan in found if isinstance(plan.request, TopUp)]
+        return Progress(
+            planned_samples=sum(plan.samples for plan in found),
+            committed_samples=int(np.count_nonzero(complete)),
+            usable_samples=int(np.count_nonzero(usable)),
+            planned_passes=sum(plan.samples for plan in further),
+            committed_passes=sum(int(np.count_nonzero(complete[p.first_row : p.end_row])) for p in further),
+        )
 
     # ------------------------------------------------------------------------------------------------------------- base
 

@@ -6,7 +6,7 @@ import base64
 from html import escape
 
 from photonfarm.shared.pictures import Picture, png_uri
-from photonfarm.trainer.evaluation_table import counted, of_units
+from photonfarm.trainer.evaluation_table import views_of
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents
 from photonfarm.trainer.report.pictures import Case, Panel, cases, first_row, legend_of_cases
@@ -92,11 +92,10 @@ def _headline(contents: Contents) -> str:
         (f"{colour:.4g}", f"of the mean colour{f': {colour / error.mean:.1f} × as much' if error.mean > 0 else ''}"),
         (f"{evaluation.noise_floor:.4g}", "noise of the targets"),
     ]
-    passes = ", further passes counted," if evaluation.samples > evaluation.views else ""
     boxes = "".join(f"<div><b>{value}</b>{escape(name)}</div>" for value, name in cells)
     return (
         f'<div class="figures">{boxes}</div>\n<p>Errors are mean squared errors of linear radiance × exposure, on '
-        f"{counted(evaluation.samples, 'sample')}{passes} of {of_units(evaluation)} that were never trained on. The "
+        f"one sample of each of {views_of(evaluation)} that were never trained on. The "
         "noise of the targets is taken out exactly: each sample has two independent renders A and B, and "
         "(f − A)(f − B) averages to the error against the clean image. Noise would add the last figure on top.</p>"
     )

@@ -4,7 +4,9 @@ Every candidate is trained by the recipe of the preset `small` for as many steps
 costs is timed before. Errors are in the metric space against references, the references' noise taken out;
 intervals are over held-out configurations, the seeds' mean of each.
 
-    PHOTONFARM_SCENES=… python bench/guided_networks.py --rooms room scenes/dining-room-night.toml
+    PHOTONFARM_SCENES=… python bench/guided_networks.py --rooms room night-living-room-2 movable-veach-ajar
+
+A room is a built-in spec, or an experiment of experiments/ in its small size, whose store it shares.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import results
 import room_study
 from photonfarm.shared.estimate import Estimate, group_means
 from photonfarm.shared.plan import Request
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.top_up import TopUp
 from photonfarm.trainer.evaluation import by_turns
@@ -74,13 +76,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", nargs="+", default=["room"], help="specs (%(default)s)")
     parser.add_argument("--candidates", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
-    parser.add_argument("--modifications", type=int, default=320)
-    parser.add_argument("--references", type=int, default=24, help="held-out views (%(default)s)")
+    parser.add_argument("--modifications", type=int, default=512)
+    parser.add_argument("--references", type=int, default=48, help="held-out views (%(default)s)")
     parser.add_argument("--reference-spp", type=int, default=256)
     parser.add_argument("--seconds", type=float, default=60.0, help="of processor time, for each run (%(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--work", type=Path, default=room_study.ROOT / "build/guided_networks")
+    parser.add_argument("--work", type=Path, default=room_study.ROOT / "build/experiments/small")
     results.add_options(parser)
     told = parser.parse_args()
     found = {name: measured(name, told) for name in told.rooms}
@@ -91,7 +93,7 @@ def main() -> None:
 
 def small(name: str) -> SceneSpec:
     """The room at 64², 8 samples per pixel."""
-    spec = load_spec(name)
+    spec = room_study.named_room(name)
     film = spec.film.model_copy(update={"width": 64, "height": 64})
     return spec.model_copy(update={"film": film, "transport": spec.transport.model_copy(update={"half_spp": 4})})
 
@@ -99,7 +101,7 @@ def small(name: str) -> SceneSpec:
 def measured(name: str, told: argparse.Namespace) -> list[Result]:
     """All candidates in one room."""
     spec = small(name)
-    store = Store(told.work / spec.name, create=True)
+    store = Store(told.work / name / "store", create=True)
     store.add(spec).guides.want(spec.guides)
     where = [f"held-out={HOLD_OUT}", f"views=first:{told.references}"]
     requests = [Request(modifications=told.modifications), TopUp.of(str(told.reference_spp), where)]
@@ -109,8 +111,8 @@ def measured(name: str, told: argparse.Namespace) -> list[Result]:
         (candidate, seed): room_study.Run(
             functools.partial(StoreSource, store.root, spec.scene_id),
             settings_of(candidate, seed, max(1, round(told.seconds / steps[candidate]))),
-            told.work,
-            f"{spec.name}-{candidate}",
+            told.work / name / "guided_networks",
+            candidate,
         )
         for candidate in told.candidates
         for seed in told.seeds

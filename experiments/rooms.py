@@ -179,12 +179,12 @@ def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[fl
     """MSE of each image by each further seed, of each network; raises IncompleteError where they were not measured."""
     if not file.is_file():
         raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
-    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
-    by_run = {Path(row["predictor"]).name: row["metric_space"]["mse"]["values"] for row in rows}
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]  # in the order of the runs
+    errors = {run.name: row["metric_space"]["mse"]["values"] for run, row in zip(experiment.again(), rows, strict=True)}
     found: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
-        values = [by_run.get(seeded(run.name, seed)) for seed in experiment.size.seeds[1:]]
-        found[run.name] = [[round(value, 6) for value in of_images] for of_images in values if of_images]
+        names = [seeded(run.name, seed) for seed in experiment.size.seeds[1:]]
+        found[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
     return {name: values for name, values in found.items() if values}
 
 

@@ -43,6 +43,7 @@ T = TypeVar("T")
 KINDS: Mapping[str, tuple[str, Table]] = {
     "movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS),
     "night": ("The same at night: movable lights are all the light", MOVABLE_LIGHTS),
+    "vanishing": ("The same with lamps that vanish", MOVABLE_LIGHTS),
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
     "static-ablation": ("The supplement's static ablation", {}),
     "static": ("Static rooms", {}),

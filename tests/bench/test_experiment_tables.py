@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import tables
-from experiment import Experiment
+from experiment import Experiment, SizeName
 from photonfarm.shared.errors import IncompleteError, SpecError
 from rooms import Room
 
@@ -67,6 +67,16 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
             "rows": [row(name, place, 0.01 * (place + 1)) for place, name in enumerate(rows)],
         },
     }  # fmt: skip
+
+
+def leave(folder: Path, size: SizeName, document: dict[str, Any]) -> None:
+    """An experiment's folder with its report, and with what was measured of further seeds."""
+    (folder / "report").mkdir(parents=True)
+    (folder / "report/report.json").write_text(json.dumps(document))
+    if again := Experiment.load(folder.name, size).again():
+        evaluated = folder / "runs" / again[0].name / "evaluation.json"
+        evaluated.parent.mkdir(parents=True)
+        evaluated.write_text(json.dumps({"rows": [row(run.name, 0, 0.01) for run in again]}))
 
 
 def room(name: str, document: dict[str, Any] | None = None) -> Room:
@@ -191,16 +201,15 @@ def test_an_earlier_version_s_report_is_refused_with_what_makes_it_anew(tmp_path
 def test_tables_are_written_with_the_command_and_each_report_s_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = tmp_path / "work" / "small" / "movable-living-room" / "report" / "report.json"
-    file.parent.mkdir(parents=True)
     arguments = ["--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
     assert tables.main() == IncompleteError.exit_code
-    file.write_text(json.dumps(report()))
+    leave(tmp_path / "work" / "small" / "movable-living-room", "small", report())
     assert tables.main() == 0
     document = json.loads((tmp_path / "out" / "tables.json").read_text())
     assert document["command"] == "python experiments/tables.py --size small"
     assert document["rooms"]["movable-living-room"]["machine"] == MACHINE
+    assert document["rooms"]["movable-living-room"]["further_seeds"]["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
     assert document["rooms"]["movable-living-room"]["runs"]["cnn"]["trained_on"] == 769
     assert str(tmp_path) not in (tmp_path / "out" / "tables.md").read_text()
 
@@ -208,10 +217,8 @@ def test_tables_are_written_with_the_command_and_each_report_s_machine(
 def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def made(place: str, name: str, size: str = "small", **values: Any) -> dict[str, Any]:
-        file = tmp_path / place / size / name / "report" / "report.json"
-        file.parent.mkdir(parents=True)
-        file.write_text(json.dumps(report(**values)))
+    def made(place: str, name: str, size: SizeName = "small", **values: Any) -> dict[str, Any]:
+        leave(tmp_path / place / size / name, size, report(**values))
         arguments = ["--size", size, "--work", str(tmp_path / place), "--out", str(tmp_path / "out")]
         monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
         assert tables.main() == 0

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Runs experiments from nothing to their reports, and goes on where it was interrupted.
 
-    python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments]
+    python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments] [--dry-run]
 
 Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
-and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. Exit code 0, 2 for wrong usage, 3 for
+and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. `--dry-run` says what that would take: what
+a sample costs is measured on this machine, training is counted in operations. Exit code 0, 2 for wrong usage, 3 for
 a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end: the others are run
 all the same.
 """
@@ -16,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import get_args
 
+import dry_run
 from experiment import Experiment, SizeName, names
 from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError
 from stages import Stages, tell
@@ -30,6 +32,8 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
     parser.add_argument("--workers", type=_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
+    parser.add_argument("--dry-run", action="store_true", help="say what it would take, and do none of it")
+    parser.add_argument("--tflops", type=float, default=50.0, help="10¹² operations a second that a GPU sustains (50)")
     return parser
 
 
@@ -50,6 +54,10 @@ def main() -> int:
     except SpecError as error:
         tell(f"error: {error}")
         return SpecError.exit_code
+    if told.dry_run:
+        for experiment in experiments:
+            print(dry_run.measured(experiment).line(told.tflops), flush=True)
+        return 0
     failed = False
     for experiment in experiments:
         stages = Stages(experiment, told.work / told.size / experiment.name, told.workers)

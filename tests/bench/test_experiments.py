@@ -12,8 +12,10 @@ import pytest
 
 import experiment
 import run
+from dry_run import Need
 from experiment import Experiment, SizeName, merged, names
 from photonfarm.shared.errors import SpecError
+from photonfarm.shared.sample_costs import SampleCosts
 from photonfarm.shared.scene import SCENES_VARIABLE, Emitters
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from rooms import Room
@@ -111,6 +113,16 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def with_size(tiny: Experiment, **changes: Any) -> Experiment:
     return tiny.model_copy(update={"size": tiny.size.model_copy(update=changes)})
+
+
+def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> None:
+    need = Need.of(tiny, SampleCosts("0" * 32, 1.0, 2.0, 3.0, 0.5, 0.1))
+    assert (need.samples, need.passes, need.runs) == (12, 2, 3)  # 2 spp a pass; a network twice, and a denoiser
+    assert need.sample_hours == pytest.approx(12 * (1 + 2 + 3 + 2 * 0.5) / 3600)
+    assert need.pass_hours == pytest.approx(2 * (3 + 2 * 0.5) / 3600)
+    longer = Need.of(with_size(tiny, train={**tiny.size.train, "max_steps": 6}), SampleCosts("0" * 32, 1, 1, 1, 1, 0))
+    assert longer.operations == pytest.approx(2 * need.operations)
+    assert need.line(1.0).startswith("tiny: 12 samples 0.0 core-h; 2 further passes for references 0.0 core-h; 3 runs ")
 
 
 def reports(stages: Stages) -> list[int]:

@@ -1,0 +1,71 @@
+"""What an experiment would take, before anything of it is rendered or trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+from experiment import Experiment, Run
+from photonfarm.shared.sample_costs import SampleCosts
+from photonfarm.shared.scene import SceneSpec
+
+FRAMES = 4
+"""Views that a scene's costs are measured on."""
+
+OF_A_STEP = 3
+"""A step's operations over those of making the images: once forward, and about twice that backward."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Core-hours of rendering on this machine, and operations of training."""
+
+    name: str
+    samples: int
+    sample_hours: float
+    passes: int  # of the references, beside their first, which are among the samples
+    pass_hours: float
+    runs: int
+    operations: float  # floating-point, of all runs
+
+    @classmethod
+    def of(cls, experiment: Experiment, costs: SampleCosts) -> Self:
+        """By the costs of the experiment's scene."""
+        size, spec = experiment.size, experiment.spec()
+        spp = 2 * spec.transport.half_spp
+        samples = size.modifications * size.views
+        passes = size.references.views * (-(-size.references.spp // spp) - 1)
+        of_samples = costs.seconds(spp, configurations=size.modifications, views=samples, samples=samples)
+        of_passes = costs.seconds(spp, configurations=0, views=0, samples=passes)
+        runs = [*experiment.trained(), *experiment.again()]
+        return cls(
+            experiment.name, samples, of_samples / 3600, passes, of_passes / 3600, len(runs),
+            sum(operations(spec, run) for run in runs),
+        )  # fmt: skip
+
+    def line(self, tflops: float) -> str:
+        """All of it in words, with the hours of a device that sustains so many 10¹² operations a second."""
+        return (
+            f"{self.name}: {self.samples:,} samples {self.sample_hours:.1f} core-h; {self.passes:,} further passes for "
+            f"references {self.pass_hours:.1f} core-h; {self.runs} runs {self.operations:.2g} operations, "
+            f"{self.operations / (tflops * 1e12) / 3600:.1f} h at {tflops:g} TFLOP/s"
+        )
+
+
+def measured(experiment: Experiment) -> Need:
+    """What an experiment needs, its scene's costs measured here. Raises SpecError."""
+    from photonfarm.renderer.sample_costs import measured_costs
+
+    return Need.of(experiment, measured_costs(experiment.spec(), frames=FRAMES))
+
+
+def operations(spec: SceneSpec, run: Run) -> float:
+    """Floating-point operations of a run's convolutions and matrix products."""
+    from photonfarm.trainer.networks.summary import summary
+    from photonfarm.trainer.settings import NetworkSettings, preset
+
+    told = {key: value for key, value in run.train.items() if key != "preset"}
+    network = {key: told.pop(key) for key in [*told] if key in NetworkSettings.model_fields}
+    settings = preset(run.train["preset"], network=network, **told)
+    of_image = sum(part.gmacs for part in summary(spec, settings.network)) * 2e9
+    return OF_A_STEP * of_image * settings.batch * settings.max_steps

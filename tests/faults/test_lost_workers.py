@@ -91,7 +91,7 @@ def test_a_redis_that_dies_and_comes_back_empty_delays_and_loses_nothing(
     scene = planned(10)
     root = scene.folder.parent.parent
     with EmbeddedRedis(tmp_path / "first") as server:
-        running = start(root, server.url, analytic.command(0.05), until_complete=True)
+        running = start(root, server.url, analytic.command(0.2), until_complete=True)
         analytic.wait_for(lambda: len(scene.committed_jobs()) >= 2)
         os.kill(server.pid, signal.SIGKILL)
         time.sleep(2)

@@ -3,7 +3,9 @@
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from photonfarm.trainer.learner import DivergedError
 from photonfarm.trainer.loop import CHECKPOINT, METRICS, train
 from photonfarm.trainer.recovery import GOOD, NEXT
 from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.validation import Best, Validation, compared
+from photonfarm.trainer.validation import Best, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
@@ -31,7 +33,8 @@ def records(run: Path, kind: str) -> list[dict[str, Any]]:
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
     """Of rows, of which each `views` are of one configuration."""
     values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
-    return Validation(step, (*errors,), HeldOut(Estimate.of(group_means(values, units)), 0.0, values, units))
+    held_out = HeldOut(Estimate.of(group_means(values, units)), 0.0, values, values, units)
+    return Validation(step, (*errors,), held_out)
 
 
 def best(errors: dict[int, float]) -> Best:
@@ -55,7 +58,7 @@ def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
 def as_if(monkeypatch: pytest.MonkeyPatch, errors: dict[int, Sequence[float]]) -> None:
     """Have validations find these errors of rows 0, 1, … at each step, whatever the network."""
 
-    def validate(predict: Any, step: int, found: Any, show: Any) -> Validation:
+    def validate(predict: Any, step: int, found: Any, show: Any, loss: str) -> Validation:
         list(found)
         return validation(dict(enumerate(errors[step])), step=step)
 
@@ -112,6 +115,33 @@ def test_where_no_row_of_the_best_was_measured_again_the_best_begins_anew() -> N
     assert found.is_best
     assert not found.is_worse
     assert not compared(validation({5: math.nan}), None).is_best
+
+
+def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little_for_them() -> None:
+    """Seen is a lamp of 100 in one pixel of 16, which the network takes for 2 now; the rest is right."""
+    image = np.full((1, 4, 4, 3), 0.5, np.float32)
+    image[:, 0, 0] = 100.0
+    batch = SimpleNamespace(
+        rows=(0,), units=(b"a",), inputs=SimpleNamespace(noisy=None),
+        target=torch.from_numpy(image[:, None]).expand(1, 2, 4, 4, 3),
+    )  # fmt: skip
+    learned, before = image.clip(max=2.0), image.clip(max=50.0) + 0.1
+
+    def at(predicted: Any, loss: str) -> Validation:
+        return validate(lambda _: predicted, 0, iter([batch]), loss=loss)
+
+    for loss, worse in [("linear", True), ("relative", False), ("paired", False)]:
+        was = at(before, loss)
+        assert compared(at(learned, loss), Best(0, was.errors, was.by_shown)).is_worse is worse
+    assert at(learned, "relative").held_out.shown == pytest.approx(0.0)
+    assert at(before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
+
+
+def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_white() -> None:
+    older = {"step": 4, "rows": torch.tensor([0]), "errors": torch.tensor([0.5], dtype=torch.float64)}
+    now = replace(validation({0: 50.0}), by_shown=True)
+    assert compared(now, Best.of(older)).is_best
+    assert compared(now, Best.of(Best(4, {0: 0.5}, by_shown=True).state())).is_worse
 
 
 # ----------------------------------------------------------------------------------------------------------------- runs

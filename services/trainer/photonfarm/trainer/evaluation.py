@@ -36,8 +36,12 @@ class HeldOut:
     error: Estimate  # against the clean image, over configurations
     floor: float  # noise of the target: what the error against it would show on top
     per_sample: NDArray[np.float64]  # (n,) clean error of each
+    shown: NDArray[np.float64]  # (n,) the same where light above white counts as white, as a display shows it
     units: tuple[Key, ...]  # (n,) what each is held out by: equal for those of one configuration
 
+
+WHITE = np.float32(1)
+"""Of a display, in exposed radiance."""
 
 NONE_COMPLETE = "none of the samples to measure on is complete at present; wait for the workers"
 
@@ -115,6 +119,16 @@ def error_of(batch: Batch) -> Callable[[F32, F32, F32], float]:
     return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
 
 
+def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
+    """The error of images whose light above white counts as white.
+
+    It is not unbiased, as noise above white is cut. But a lamp in view, hundreds of times brighter than what it lights,
+    is most of the error otherwise.
+    """
+    prediction, half_a, half_b = (np.minimum(image, WHITE) for image in images)
+    return error(prediction, half_a, half_b)
+
+
 def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
 
@@ -122,16 +136,17 @@ def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
 
     Raises IncompleteError if there is no sample.
     """
-    errors, floors = [], []
+    errors, shown, floors = [], [], []
     units: list[Key] = []
     for batch in found:
         units.extend(batch.units)
         error = error_of(batch)
         for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
             errors.append(error(image, half_a, half_b))
+            shown.append(_shown(error, image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
     if not errors:
         raise IncompleteError(NONE_COMPLETE)
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
-    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, tuple(units))
+    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))

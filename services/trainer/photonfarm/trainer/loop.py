@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.estimate import group_means
 from photonfarm.shared.processes import Stop
 from photonfarm.shared.store import store_errors
 from photonfarm.trainer import checkpoint
@@ -260,7 +261,8 @@ class Session:
             self._following.drop()
             found = batches(self._feed, rows, self._settings.batch)
             try:
-                now = validate(network_predictor(self._learner.predicting), self._step, found, self._around.show)
+                predict, loss = network_predictor(self._learner.predicting), self._settings.loss
+                now = validate(predict, self._step, found, self._around.show, loss=loss)
             except IncompleteError:  # a repair has taken all of them back, for now
                 return
             finally:
@@ -279,6 +281,7 @@ class Session:
             step=self._step,
             error=held_out.error.mean,
             standard_error=held_out.error.standard_error,
+            shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
             waits=waits(seconds := self._watch.seconds, self._seconds_told),
@@ -289,7 +292,7 @@ class Session:
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
         if self._compared.is_best:
-            self._best = Best(now.step, now.errors)
+            self._best = Best(now.step, now.errors, now.by_shown)
 
     def _keep_or_go_back(self) -> None:
         """Do what the last validation asks for, in all processes."""

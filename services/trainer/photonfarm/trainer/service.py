@@ -312,9 +312,10 @@ def _tell(record: dict[str, Any]) -> None:
     if record["kind"] == "recovered":
         click.echo(f"step {record['step']}: {_recovered(record)}", err=True)
     if record["kind"] == "validation":
+        there = f"on {record['held_out']} of {record['samples']} samples; "
         click.echo(
             f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
-            f"on {record['held_out']} of {record['samples']} samples; "
+            f"({stated(record['shown_error'], None)} up to white) {there}"
             + waits.stated(record["waits"], record["samples_per_used"]),
             err=True,
         )

@@ -22,6 +22,7 @@ NAMES = {
     "rate_factor": "optimiser/rate factor",
     "error": "error/held out",
     "standard_error": "error/standard error",
+    "shown_error": "error/held out, light up to white",
     "noise_floor": "error/noise of the targets",
     "samples": "samples/arrived",
     "draws": "samples/drawn",

@@ -32,11 +32,13 @@ class Validation:
     step: int
     rows: tuple[int, ...]  # (n,) those measured, in the order of `held_out.per_sample`
     held_out: HeldOut
+    by_shown: bool = False  # it is compared by the error of light up to white, and not by that of all light
 
     @property
     def errors(self) -> dict[int, float]:
-        """The error of each row."""
-        return dict(zip(self.rows, self.held_out.per_sample.tolist(), strict=True))
+        """The error of each row, by which it is compared."""
+        errors = self.held_out.shown if self.by_shown else self.held_out.per_sample
+        return dict(zip(self.rows, errors.tolist(), strict=True))
 
     @property
     def is_finite(self) -> bool:
@@ -44,8 +46,13 @@ class Validation:
         return math.isfinite(self.held_out.error.mean)
 
 
-def validate(predict: Predictor, step: int, found: Iterator[Batch], show: Show | None = None) -> Validation:
+def validate(
+    predict: Predictor, step: int, found: Iterator[Batch], show: Show | None = None, *, loss: str = "linear"
+) -> Validation:
     """The error of a network over held-out samples; `show` gets targets and predictions of the first batch.
+
+    The linear loss weighs all light alike. A network of another one is compared by the error of light up to white: it
+    cares less for lamps in view, which most of the error of all light comes from, and may learn the rest meanwhile.
 
     Raises IncompleteError if there is no sample.
     """
@@ -64,7 +71,7 @@ def validate(predict: Predictor, step: int, found: Iterator[Batch], show: Show |
 
     with np.errstate(invalid="ignore", over="ignore"):  # of a network that has diverged: it is told as that
         held_out = measure(predict_and_show, noted())
-    return Validation(step, tuple(rows), held_out)
+    return Validation(step, tuple(rows), held_out, by_shown=loss != "linear")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,20 +80,23 @@ class Best:
 
     step: int
     errors: dict[int, float]  # of each row that was measured
+    by_shown: bool = False
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
         rows, errors = list(self.errors), list(self.errors.values())
         return {
             "step": self.step,
+            "by_shown": self.by_shown,
             "rows": torch.tensor(rows, dtype=torch.int64),
             "errors": torch.tensor(errors, dtype=torch.float64),
         }
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Self:
-        """That of a `state`."""
-        return cls(state["step"], dict(zip(state["rows"].tolist(), state["errors"].tolist(), strict=True)))
+        """That of a `state`; older ones are of all light."""
+        errors = dict(zip(state["rows"].tolist(), state["errors"].tolist(), strict=True))
+        return cls(state["step"], errors, state.get("by_shown", False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,13 +134,14 @@ class Comparison:
 
 
 def compared(now: Validation, best: Best | None) -> Comparison:
-    """A validation beside the best one; beside itself if there is none, or no row of that was measured again.
+    """A validation beside the best one; beside itself if there is none, none of the same rows, or of the same error.
 
     The set that is held out grows while the store does, and samples are taken back for a while: the mean over other
     rows would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
     """
     mine = now.errors
-    theirs = mine if best is None or best.errors.keys().isdisjoint(mine) else best.errors
+    same = best is not None and best.by_shown == now.by_shown and not best.errors.keys().isdisjoint(mine)
+    theirs = best.errors if best is not None and same else mine
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]
     ours, others = (group_means(np.array([errors[row] for row in rows]), units) for errors in (mine, theirs))

@@ -31,8 +31,7 @@ def trace(
     first = scene.ray_intersect(ray)
     hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
     number = dr.reinterpret_array(mi.UInt32, bsdf)
-    path = _followed(scene, ray, before, settings)
-    last = scene.ray_intersect(path.ray)
+    path, last = _followed(scene, ray, first, before, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = diffuse_reflectance(last, met)
     arrives = lit(scene, lights, last, Seen(met, path.ray.d, path.followed), pattern, shift, settings)
@@ -67,26 +66,29 @@ class _Path:
     followed: Any  # UInt32: surfaces left behind
 
 
-def _followed(scene: Any, ray: Any, before: Any, settings: Settings) -> _Path:
-    """The path of each ray up to the one that meets the first surface which is no pure mirror, glass or null."""
+def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings) -> tuple[_Path, Any]:
+    """The path of each ray, which meets `first`, up to a surface that is no pure mirror, glass or null; that surface."""
     active = dr.full(mi.Bool, True, dr.width(ray))
     start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
+    start = _follow(scene, start, first, settings)
+    if not settings.followed:
+        return start, first
     (path,) = traced_once(
         state=(start,),
         cond=lambda s: s.active,
-        body=lambda s: (_follow(scene, s, settings),),
+        body=lambda s: (_follow(scene, s, scene.ray_intersect(s.ray, active=s.active), settings),),
         labels=("path",),
         label="mirrors and glass",
     )
-    return path
+    led_on = path.followed > 0
+    return path, dr.select(led_on, scene.ray_intersect(path.ray, active=led_on), first)
 
 
-def _follow(scene: Any, s: _Path, settings: Settings) -> _Path:
-    """One surface on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
+def _follow(scene: Any, s: _Path, si: Any, settings: Settings) -> _Path:
+    """One surface `si` on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
 
     Sampled at 1/2, glass gives the lobe that takes more than half, with its probability, which is what it takes.
     """
-    si = scene.ray_intersect(s.ray, active=s.active)
     emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
     bsdf = si.bsdf()
     leads_on = s.active & si.is_valid() & is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)

@@ -46,7 +46,7 @@ def test_a_room_at_night_is_the_room_with_its_own_lights_off_and_lamps_that_move
     assert night.emitters == Emitters(all=0)
     assert len(night.lights) == 2
     assert night.lights == (day.lights or night.lights)
-    same = {"emitters", "exposure", "lights", "name", "photons", "transport"}
+    same = {"emitters", "exposure", "guides", "lights", "name", "photons", "transport"}
     assert night.model_dump(exclude=same) == day.model_dump(exclude=same)
 
 

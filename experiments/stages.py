@@ -176,7 +176,7 @@ class Stages:
         denoisers += [argument for kept in size.kept for argument in ("--kept", kept)]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
         if again := self.experiment.again():
-            self._measure("evaluate", again, [], self._folder(again[0]) / EVALUATION)
+            self._measure("evaluate", again, ["--without-inception"], self._folder(again[0]) / EVALUATION)
         return out
 
     def _measure(self, verb: str, runs: Sequence[Run], more: Sequence[Any], made: Path) -> None:

@@ -128,6 +128,20 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
     assert np.array_equal(*pictures)
 
 
+def test_without_inception_all_else_is_measured(store: Path, trained, references: Path) -> None:
+    run = trained("run").folder
+    arguments = ["evaluate", "--store", store, "--references", references, "--run", run, "--samples", 5]
+    both = []
+    for more in ([], ["--without-inception"]):
+        CliRunner().invoke(umbrella, [*map(str, arguments), *more], catch_exceptions=False)
+        (row,) = json.loads((run / EVALUATION).read_text())["rows"]
+        both.append(row["metric_space"])
+    full, quick = both
+    assert quick["fid"] is None
+    assert quick["kid"] is None
+    assert {name: full[name] for name in ("mse", "mssim")} == {name: quick[name] for name in ("mse", "mssim")}
+
+
 def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references: Path) -> None:
     """Of 2 passes of a view one half A is a quarter of its reference."""
     runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]

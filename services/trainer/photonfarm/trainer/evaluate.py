@@ -143,6 +143,7 @@ def compare(
     *,
     references: Path | None = None,
     inception: Path | None = None,
+    without_inception: bool = False,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
     tell: Tell | None = None,
@@ -151,9 +152,10 @@ def compare(
     """The runs, and denoisers of one of so many pixels, on the first `most` views that no run was trained on.
 
     Each view is measured once, by its first sample, however many passes of it there are. References are files
-    `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space. Raises
-    SpecError for runs of different scenes, for references of another size, for a film with too few pixels to keep some,
-    and for a package that is missing; IncompleteError if no held-out sample is complete.
+    `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
+    FID, KID and Feature L1 take most of the time; `without_inception` they are left out. Raises SpecError for runs of
+    different scenes, for references of another size, for a film with too few pixels to keep some, and for a package
+    that is missing; IncompleteError if no held-out sample is complete.
     """
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
@@ -164,7 +166,7 @@ def compare(
         kept_count(spec, kept)
     found = {} if references is None else read_references(references, samples)
     shown = samples.to_show(found)
-    network = load_inception(inception, str(place)) if found else None
+    network = load_inception(inception, str(place)) if found and not without_inception else None
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
     untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     leading, *others = test.timed([*runs, *untrained])

@@ -84,7 +84,9 @@ def _how(
 
 @click.command()
 @measuring
-@click.option("--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time.")
+@click.option(
+    "--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time."
+)
 @json_option
 def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: Any) -> None:
     """Measure trained networks on views that none of them was trained on, each by its first sample.

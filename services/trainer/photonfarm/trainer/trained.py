@@ -54,8 +54,10 @@ class TrainedRun:
 
     @property
     def name(self) -> str:
-        """Architecture and folder."""
-        return f"{self.settings.network.architecture} ({self.folder})"
+        """Architecture, and the folder where that says more; of an absolute path its last part."""
+        architecture, folder = self.settings.network.architecture, self.folder
+        said = folder.name if folder.is_absolute() else str(folder)
+        return architecture if said == architecture else f"{architecture} ({said})"
 
     @property
     def needs(self) -> Needs:

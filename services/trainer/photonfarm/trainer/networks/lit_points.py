@@ -11,6 +11,8 @@ a maximum over points cannot. What is learned is the visibility V between two su
 
     V = sigmoid(r(receiver) · s(sender) + b)
 
+Metals sum B₀ over the directions that their lobe mirrors; there nothing is learned.
+
 Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
 """
 
@@ -29,7 +31,17 @@ from photonfarm.trainer.networks.network import with_octaves
 COARSE = 4
 """Diffuse light is summed for squares of so many by so many pixels: from one to the next it changes little."""
 
-CHANNELS = 6
+GLOSSY = 0.2
+"""Directional albedo of lobes other than diffuse and followed ones, from which a pixel sums over one: that of metals.
+The coats of plastics and varnish took a third of a step and brought nothing."""
+
+SHARPEST = 0.15
+"""Least roughness of such a lobe: a narrower one would fall between points."""
+
+LEAST_LOGARITHM = -60.0
+"""Of a lobe's values: smaller ones are denormal numbers, which processors multiply some four times slower."""
+
+CHANNELS = 9
 
 DIFFUSE = 1
 """Which of what `LitPoints` gives is all diffuse light."""
@@ -75,7 +87,7 @@ def _factors(std: float | None = None) -> nn.Sequential:
 
 
 class LitPoints(nn.Module):
-    """The radiance of white diffuse surfaces by what lit points send on."""
+    """The radiance of white diffuse surfaces, and of lobes over their albedo, by what lit points send on."""
 
     albedo: Tensor
     normal: Tensor
@@ -91,25 +103,34 @@ class LitPoints(nn.Module):
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 
     def forward(self, inputs: Inputs) -> list[Tensor]:
-        """Diffuse light B₀ as if nothing hid it, and all diffuse light, (B, H, W, 3) each."""
+        """Diffuse light B₀ as if nothing hid it, all diffuse light, and light by other lobes, (B, H, W, 3) each.
+
+        The last is 0 but for metals.
+        """
         images = [self._of_sample(inputs, place) for place in range(len(inputs.depth))]
         return [torch.stack(parts) for parts in zip(*images, strict=True)]
 
-    def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor]:
+    def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = given(inputs.points), given(inputs.guides)
         source, there = points.position[place, : self._count], points.visible[place, : self._count, None]
         reflects = self.albedo * there
         sent = reflects * guides.point_light[place, : self._count] / math.pi
-        surface, normal = self._surfaces(inputs, place)
-        return self._diffuse(surface, normal, source, reflects, sent)
+        rays, surface, normal = self._surfaces(inputs, place)
+        unhidden, light = self._diffuse(surface, normal, source, reflects, sent)
+        glossy = (guides.specular[place] - guides.throughput[place]).mean(-1) > GLOSSY
+        gloss = torch.zeros_like(surface)
+        if glossy.any():
+            at = surface[glossy], normal[glossy], rays[glossy], guides.roughness[place][glossy]
+            gloss[glossy] = self._lobes(*at, source, sent)
+        return unhidden, light, gloss
 
-    def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor]:
-        """Position and normal of what each pixel sees, (H, W, 3) each."""
+    def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Ray, position and normal of what each pixel sees, (H, W, 3) each."""
         guides, to_camera = given(inputs.guides), inputs.world_to_camera[place]
         rays = self._optics.rays(to_camera[None])[0]
         eye = -to_camera[:, :3].T @ to_camera[:, 3]
         distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
-        return eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
+        return rays, eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
 
     def _diffuse(
         self, surface: Tensor, normal: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
@@ -132,6 +153,21 @@ class LitPoints(nn.Module):
         leaves, squared = self._between(at, source)
         cosines = (facing @ source.T - (facing * at).sum(-1, keepdim=True)).clamp(min=0) * leaves
         return cosines / (squared * squared) * (self._area / math.pi)
+
+    def _lobes(
+        self, at: Tensor, normal: Tensor, rays: Tensor, roughness: Tensor, source: Tensor, sent: Tensor
+    ) -> Tensor:
+        """The mean of what points send over a lobe about the mirrored ray, (N, 3).
+
+        By a von Mises–Fisher lobe of κ = 2 / α², over the solid angle that each point stands for.
+        """
+        mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
+        leaves, squared = self._between(at, source)
+        distance = squared.sqrt()
+        cosine = (mirrored @ source.T - (mirrored * at).sum(-1, keepdim=True)) / distance
+        sharpness = 2 / roughness.clamp(min=SHARPEST)[:, None] ** 2
+        weight = (sharpness * (cosine - 1)).clamp(min=LEAST_LOGARITHM).exp() * leaves / (squared * distance)
+        return (weight @ sent) / weight.sum(-1, keepdim=True).clamp(min=1e-12)
 
     def _between(self, at: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         """Distance × cosine at each point's front, at least 0, and the squared distance, (N, L) each.

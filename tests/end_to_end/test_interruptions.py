@@ -107,7 +107,7 @@ def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[by
 def wait_for_native_code(folder: Path) -> None:
     """The base is written right before the first sample is rendered."""
     wait_until(lambda: list(folder.glob("store/scenes/*/base/zarr.json")))
-    time.sleep(3)
+    time.sleep(2)
 
 
 def assert_nothing_is_torn(folder: Path) -> None:

@@ -20,8 +20,9 @@ demo: $(STAMP)
 
 # Three at a time on two cores, as many tests wait; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.
+# Bytecode is kept whatever the environment says: hundreds of processes start, and each would compile photonfarm anew.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)

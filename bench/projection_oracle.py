@@ -18,8 +18,14 @@ F64 = NDArray[np.float64]
 SELF_HIT = 1e-4
 """A line of sight ends this share of its length before its point, so that it does not meet the point's own surface."""
 
-AT_ONCE = 2048
-"""Triangles: with a few hundred points, what is worked out of them stays in the processor's cache."""
+AT_ONCE = 8192
+"""Triangles: with so few lines, what is worked out of them stays in the processor's cache."""
+
+TOGETHER = 16
+"""Lines at most that are tried against the same triangles."""
+
+ROUNDING = 1e-9
+"""Of directions: what touches the outermost line is in its way."""
 
 
 def triangles(geometry: Geometry, modification: Modification) -> F64:
@@ -55,9 +61,19 @@ def first_met(corners: F64, camera: Camera, spec: SceneSpec, position: F32) -> F
     In shares of the distance to the point, so that its own surface is at 1; ∞ where they meet none.
     """
     ends = in_camera(camera, position)
-    near = spec.view.near / ends[:, 2]
+    return _first(in_camera(camera, corners), ends, spec.view.near / ends[:, 2])
+
+
+def _first(corners: F64, ends: F64, near: F64) -> F64:
+    """That, in camera coordinates: by halves of the lines, so that each is tried against few triangles off its way."""
     found = np.full(len(ends), np.inf)
-    rest = _in_frustum(in_camera(camera, corners), camera)
+    if not len(ends):
+        return found
+    rest, at = _in_the_way(corners, ends), ends[:, :2] / ends[:, 2:]
+    if len(ends) > TOGETHER:
+        for half in np.array_split(np.argsort(at[:, np.ptp(at, axis=0).argmax()]), 2):
+            found[half] = _first(rest, ends[half], near[half])
+        return found
     for start in range(0, len(rest), AT_ONCE):
         point, share = _met(rest[start : start + AT_ONCE], ends)
         beyond = share >= near[point]
@@ -65,11 +81,12 @@ def first_met(corners: F64, camera: Camera, spec: SceneSpec, position: F32) -> F
     return found
 
 
-def _in_frustum(corners: F64, camera: Camera) -> F64:
-    """Those of the triangles that some line through the image may meet: not beyond one side of it with all corners."""
-    x, y, z = np.moveaxis(corners, -1, 0) * np.array([camera.focal_px, camera.focal_px, 1])[:, None, None]
-    half = np.array([camera.width, camera.height]) / 2
-    beyond = [x > half[0] * z, x < -half[0] * z, y > half[1] * z, y < -half[1] * z, z < 0]
+def _in_the_way(corners: F64, ends: F64) -> F64:
+    """Those of the triangles that a line may meet: not beyond one side of the pyramid of all lines with all corners."""
+    x, y, z = np.moveaxis(corners, -1, 0)
+    at = ends[:, :2] / ends[:, 2:]
+    low, high = at.min(axis=0) - ROUNDING, at.max(axis=0) + ROUNDING
+    beyond = [x > high[0] * z, x < low[0] * z, y > high[1] * z, y < low[1] * z, z < 0]
     return corners[~np.any([side.all(axis=1) for side in beyond], axis=0)]
 
 

@@ -8,7 +8,7 @@ from photonfarm.shared.errors import SpecError
 from projection import Found
 from projection_rooms import Counts, Room
 
-SIZE, VIEWS, POINTS, JUDGED = 256, 6, 4096, 300
+SIZE, VIEWS, POINTS, JUDGED = 256, 4, 4096, 450
 
 
 @pytest.fixture(scope="module", params=["room", *projection.TARGET_ROOMS])

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.shared import cli
 from photonfarm.shared.errors import SpecError
 from photonfarm.shared.hold_out import check_hold_out
 from photonfarm.shared.scene import load_spec
@@ -17,6 +19,27 @@ from photonfarm.shared.store import Store
 from photonfarm.shared.submission import request_of, submit
 from photonfarm.trainer.dataset import rows_held_out
 from photonfarm.trainer.store_source import StoreSource
+
+Ended = subprocess.CompletedProcess[str]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
+    """The command line in an empty folder, as `photonfarm` is, but in this process: a start costs a second each."""
+
+    def run(*args: str, **environment: str) -> Ended:
+        capfd.readouterr()
+        with monkeypatch.context() as patch:
+            patch.chdir(tmp_path)
+            for name, value in {"PHOTONFARM_REDIS_URL": "redis://127.0.0.1:1/0", **environment}.items():
+                patch.setenv(name, value)
+            with pytest.raises(SystemExit) as ended:  # an error that is not ours comes through
+                cli.main([*args])
+        code = ended.value.code
+        assert code is None or isinstance(code, int)
+        return Ended([*args], code or 0, *capfd.readouterr())
+
+    return run
 
 
 def test_an_unknown_spec_is_exit_code_3(photonfarm) -> None:
@@ -26,29 +49,29 @@ def test_an_unknown_spec_is_exit_code_3(photonfarm) -> None:
     assert "Traceback" not in result.stderr
 
 
-def test_an_inverted_box_is_exit_code_3_and_names_key_value_and_rule(photonfarm, tmp_path: Path) -> None:
+def test_an_inverted_box_is_exit_code_3_and_names_key_value_and_rule(here, tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text(
         'name = "bad"\nscene.builtin = "room"\n'
         "[view]\norigin = { min = [0, 2, 0], max = [1, 1, 1] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"
     )
-    result = photonfarm("submit", "bad.toml", "--no-queue")
+    result = here("submit", "bad.toml", "--no-queue")
     assert result.returncode == 3
     assert "view.origin: is inverted along y: min 2.0 is above max 1.0; min ≤ max is required" in result.stderr
     assert not (tmp_path / "store").exists()
 
 
-def test_an_unwritable_store_is_exit_code_4(photonfarm, tmp_path: Path) -> None:
+def test_an_unwritable_store_is_exit_code_4(here, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
-    result = photonfarm("submit", "cornell", "--no-queue", "--store", "file/store")
+    result = here("submit", "cornell", "--no-queue", "--store", "file/store")
     assert result.returncode == 4
     assert "file/store" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_a_folder_that_is_no_store_is_exit_code_4_and_left_alone(photonfarm, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_store_is_exit_code_4_and_left_alone(here, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/diary.txt").write_text("dear diary")
-    result = photonfarm("submit", "cornell", "--no-queue", "--store", "mine")
+    result = here("submit", "cornell", "--no-queue", "--store", "mine")
     assert result.returncode == 4
     assert [p.name for p in (tmp_path / "mine").iterdir()] == ["diary.txt"]
 
@@ -63,9 +86,9 @@ def test_no_redis_is_exit_code_5_and_the_plan_is_kept(photonfarm, tmp_path: Path
     assert '"planned_before": 4' in again.stdout
 
 
-def test_a_worker_without_redis_is_exit_code_5(photonfarm) -> None:
-    assert photonfarm("submit", "cornell", "--no-queue").returncode == 0
-    result = photonfarm("work", "--until-complete")
+def test_a_worker_without_redis_is_exit_code_5(here) -> None:
+    assert here("submit", "cornell", "--no-queue").returncode == 0
+    result = here("work", "--until-complete")
     assert result.returncode == 5
     assert "Traceback" not in result.stderr
 
@@ -77,9 +100,9 @@ def test_no_llvm_is_exit_code_6_and_says_what_to_install(photonfarm, tmp_path: P
     assert "Traceback" not in result.stderr
 
 
-def test_wrong_usage_is_exit_code_2(photonfarm) -> None:
-    assert photonfarm("submit", "cornell", "--views", "0").returncode == 2
-    assert photonfarm("fly").returncode == 2
+def test_wrong_usage_is_exit_code_2(here) -> None:
+    assert here("submit", "cornell", "--views", "0").returncode == 2
+    assert here("fly").returncode == 2
 
 
 @pytest.mark.parametrize(
@@ -91,27 +114,23 @@ def test_wrong_usage_is_exit_code_2(photonfarm) -> None:
     ],
 )
 def test_up_refuses_a_hold_out_that_leaves_one_side_empty_before_it_writes_anything(
-    photonfarm, tmp_path: Path, options: tuple[str, ...], sentence: str
+    here, tmp_path: Path, options: tuple[str, ...], sentence: str
 ) -> None:
-    result = photonfarm("up", *options, timeout=60)
+    result = here("up", *options)
     assert result.returncode == 3
     assert sentence in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anything(
-    photonfarm, tmp_path: Path
-) -> None:
+def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anything(here, tmp_path: Path) -> None:
     (tmp_path / "photonfarm.toml").write_text("[train]\nthreads = 0\n")
-    result = photonfarm("up", "room", timeout=60)
+    result = here("up", "room")
     assert result.returncode == 2
     assert "Invalid value for '--threads': 0 is not in the range x>=1" in result.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
 
 
-def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(
-    photonfarm, tmp_path: Path
-) -> None:
+def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(here, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
     (tmp_path / "mine/ball.toml").write_text(
@@ -119,14 +138,14 @@ def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_fin
         "[view]\norigin = { min = [0, 0, 3], max = [1, 1, 4] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"
     )
     found = {"PHOTONFARM_SCENES": str(tmp_path / "mine")}
-    told = photonfarm("submit", "mine/ball.toml", "--no-queue", PHOTONFARM_SCENES="")
+    told = here("submit", "mine/ball.toml", "--no-queue", PHOTONFARM_SCENES="")
     assert told.stderr == f"workers find its scene file with PHOTONFARM_SCENES={found['PHOTONFARM_SCENES']}\n"
-    assert photonfarm("submit", "mine/ball.toml", "--no-queue", **found).stderr == ""
+    assert here("submit", "mine/ball.toml", "--no-queue", **found).stderr == ""
 
 
-def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(photonfarm, tmp_path: Path) -> None:
+def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp_path: Path) -> None:
     """With 64 configurations planned before, some of them held out, one more may be of either side."""
-    assert photonfarm("submit", "room", "--modifications", "64", "--no-queue").returncode == 0
+    assert here("submit", "room", "--modifications", "64", "--no-queue").returncode == 0
     wanted = request_of(modifications=1, views=1, passes=1, seed=1)
     check_hold_out(load_spec("room"), tmp_path / "store", 0.125, wanted)
     with pytest.raises(SpecError, match="none is held out"):
@@ -168,6 +187,6 @@ def test_up_without_a_trainer_says_so_before_it_writes_anything(tmp_path: Path) 
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_exit_code_4(photonfarm, tmp_path: Path) -> None:
+def test_a_read_only_folder_is_exit_code_4(here, tmp_path: Path) -> None:
     (tmp_path / "locked").mkdir(mode=0o500)
-    assert photonfarm("submit", "cornell", "--no-queue", "--store", "locked/store").returncode == 4
+    assert here("submit", "cornell", "--no-queue", "--store", "locked/store").returncode == 4

@@ -63,7 +63,7 @@ def test_the_same_again_renders_nothing_and_trains_nothing(photonfarm: Command, 
 
     (folder / "photonfarm.toml").write_text("[report]\nuntimed = true\n")  # its report may cost less
     before, trained, told = markers(), network(), records()
-    again = photonfarm(*UP)
+    again = photonfarm(*UP, "--workers", "1")  # as there is nothing to render
     assert again.returncode == 0, again.stderr
     assert markers() == before
     assert network() == trained
@@ -81,7 +81,7 @@ def test_the_reading_example_of_the_readme_reads_committed_samples_with_plain_za
 
 def test_the_network_is_evaluated_beside_a_denoiser(photonfarm: Command, folder: Path) -> None:
     assert photonfarm("store", "merge", "--out", "references").returncode == 0
-    asked = ("--references", "references", "--denoiser", "fill-in", "--kept", "4", "--json")
+    asked = ("--references", "references", "--denoiser", "fill-in", "--kept", "4", "--samples", "2", "--json")
     evaluated = photonfarm("evaluate", *asked)
     assert evaluated.returncode == 0, evaluated.stderr
     found = json.loads(evaluated.stdout)

@@ -46,7 +46,7 @@ def test_a_worker_killed_in_the_middle_changes_no_bit_of_what_mitsuba_renders(
         run_worker(tmp_path / "clean", server.url, until_complete=True, idle_s=1)
     with (
         EmbeddedRedis(tmp_path / "redis-shaken") as server,
-        analytic.start_worker(tmp_path / "shaken", server.url, CHILD, until_complete=True, max_jobs=2) as running,
+        analytic.start_worker(tmp_path / "shaken", server.url, CHILD, until_complete=True) as running,
     ):
         analytic.wait_for(lambda: queue_status(connect(server.url)).running == 1, 60)
         os.kill(analytic.child_of(running), signal.SIGKILL)

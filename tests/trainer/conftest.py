@@ -22,7 +22,7 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_source() -> Callable[..., AnalyticSource]:
     """A source of so many analytic samples; how: views=, noise=, per_look=."""
 
@@ -52,7 +52,7 @@ def make_scarce() -> Callable[..., ScarceSource]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def tiny() -> Callable[..., TrainSettings]:
     """Settings of a tiny network on tiny batches, with changes."""
 

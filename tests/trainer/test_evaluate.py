@@ -107,7 +107,7 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
     pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
     runs = [trained("one", network={"width": 4, "architecture": "denoise_4"}), trained("two", seed=1)]
     named = ["--store", store, "--references", references, "--run", runs[0].folder, "--run", runs[1].folder]
-    arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 5]
+    arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 3]
     result = CliRunner().invoke(umbrella, [str(a) for a in (*arguments, "--inception", tmp_path / "none")])
     assert isinstance(result.exception, SpecError), "weights that are named must be there"
     result = CliRunner().invoke(umbrella, [str(a) for a in arguments], catch_exceptions=False)
@@ -117,8 +117,8 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
         "denoise_4", "light_transport", "oidn", "fill-in",
     ]  # fmt: skip
     assert lines[0].count("|") == lines[-1].count("|")
-    assert [line for line in result.stderr.splitlines() if line.endswith(": 5 samples")][2:] == [
-        "oidn 1/4: 5 samples", "fill-in 1/4: 5 samples",
+    assert [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")][2:] == [
+        "oidn 1/4: 3 samples", "fill-in 1/4: 3 samples",
     ]  # fmt: skip
     documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
     assert documents[0] == documents[1]
@@ -172,7 +172,7 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
     reader.refresh()
     run = trained("run")
     for folder, first in ((None, "radiance"), (references, "reference")):
-        found = compare(store, [run], [("none", 1)], references=folder, most=8)
+        found = compare(store, [run], [("none", 1)], references=folder, most=5)
         sheet = comparison(found)
         assert sheet.shape[1] == 3 * 256 + 2 * 8
         assert len({reader.modification_key(target.row) for target in found.shown}) == len(found.shown) == 4

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.estimate import Estimate
@@ -22,8 +24,16 @@ from photonfarm.trainer.loop import CHECKPOINT, train
 AXES = {"optimiser": ("adam", "rmsprop"), "learning_rate": (1e-4, 2e-3)}
 
 
-def test_every_cell_is_the_run_that_its_settings_make_alone(make_source, tiny, run, tmp_path) -> None:
-    cells = run_grid(lambda: make_source(24), tiny(), run, AXES)
+@pytest.fixture(scope="module")
+def searched(make_source, tiny, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Cell]]:
+    """The folder of a grid of four cells, and what it found."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("searched")
+    return folder, run_grid(lambda: make_source(24), tiny(), folder, AXES)
+
+
+def test_every_cell_is_the_run_that_its_settings_make_alone(make_source, tiny, searched, tmp_path) -> None:
+    run, cells = searched
     assert [cell.changes["optimiser"] for cell in cells] == ["adam", "adam", "rmsprop", "rmsprop"]
     outcome = train(make_source(24), tiny(optimiser="rmsprop", learning_rate=2e-3), tmp_path / "alone")
     states = [checkpoint.load(path / CHECKPOINT) for path in (tmp_path / "alone", run / "rmsprop-0.002")]
@@ -32,8 +42,8 @@ def test_every_cell_is_the_run_that_its_settings_make_alone(make_source, tiny, r
     assert len({cell.error.mean for cell in cells}) == 4
 
 
-def test_all_cells_draw_the_same_samples_in_the_same_order(make_source, tiny, run) -> None:
-    run_grid(lambda: make_source(24), tiny(), run, AXES)
+def test_all_cells_draw_the_same_samples_in_the_same_order(searched) -> None:
+    run, _ = searched
     states = [checkpoint.load(path)["following"] for path in sorted(run.glob(f"*/{CHECKPOINT}"))]
     followed = [json.dumps(state, default=lambda numbers: numbers.tolist()) for state in states]
     assert len(followed) == 4
@@ -59,8 +69,10 @@ def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) 
     assert told[0].startswith("2 of 2: 0.0005: 0.")
 
 
-def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(make_source, tiny, run, tmp_path) -> None:
-    whole = run_grid(lambda: make_source(24), tiny(), run, AXES)
+def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(
+    make_source, tiny, searched, tmp_path
+) -> None:
+    _, whole = searched
     stop, broken = threading.Event(), tmp_path / "broken"
 
     def make():

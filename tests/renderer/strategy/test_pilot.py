@@ -139,7 +139,7 @@ def test_the_spread_holds_how_much_the_views_differ() -> None:
     good = {PLAIN: 0.5, LIGHT: 0.05, JOINED: 0.5}
     bad = {PLAIN: 0.5, LIGHT: 0.5, JOINED: 0.5}
     rng = np.random.default_rng(0)
-    for seed in range(40):
+    for seed in range(24):  # the spread of so many is known to 15 %
         views = [
             gamma_noise(good if rng.random() < 0.5 else bad, dict.fromkeys(CANDIDATES, 0.01), clock) for _ in range(8)
         ]
@@ -253,12 +253,12 @@ def test_the_choice_holds_on_images_that_the_pilot_has_not_seen(name: str) -> No
     """Error × time of the chosen settings is within a fifth of the least, which leaves room for the noise of both."""
     clock = Clock()
     render = sample_count_clock(renderer(mi.load_dict(HARD_SCENES[name](32), optimize=False)), clock)
-    choice = choose(render, CANDIDATES, seconds=1.5, spp=4, clock=clock)
+    choice = choose(render, CANDIDATES, seconds=1.0, spp=4, clock=clock)
     weights = view_weights([render(JOINED, 50_000 + i, 32) for i in range(4)])
     assert weights is not None
     pairs = [
         pair_errors([(render(c, 60_000 + 2 * i, 4), render(c, 60_001 + 2 * i, 4)) for c in CANDIDATES], weights)
-        for i in range(32)
+        for i in range(16)
     ]
     counted = np.array([errors for errors, _ in pairs]) - not_counted([shared for _, shared in pairs])[:, None]
     costs = counted.mean(axis=0) * [1 + c.light_ratio + c.connections for c in CANDIDATES]
@@ -277,10 +277,12 @@ def test_a_ball_under_the_sky_gets_none() -> None:
 def test_chosen_and_unchosen_settings_have_one_mean() -> None:
     scene = mi.load_dict(HARD_SCENES["cove"](32), optimize=False)
     render = renderer(scene)
-    choice = choose(render, [PLAIN, LIGHT, Candidate(0, 0.25), JOINED], seconds=5, spp=4)
-    chosen = np.stack([render(choice.candidate, 500 + i, 64) for i in range(16)])
+    clock, candidates = Clock(), [PLAIN, LIGHT, Candidate(0, 0.25), JOINED]
+    choice = choose(sample_count_clock(render, clock), candidates, seconds=1, spp=4, clock=clock)
+    assert len(choice.measured) == 4
+    chosen = np.stack([render(choice.candidate, 500 + i, 32) for i in range(16)])
     for row in choice.measured:
         if row.candidate != choice.candidate:
-            other = np.stack([render(row.candidate, 900 + i, 64) for i in range(16)])
+            other = np.stack([render(row.candidate, 900 + i, 32) for i in range(16)])
             test = block_z_test(chosen, other, blocks=4, significance=1e-4)
             assert test.passed, f"{row.candidate}: largest |z| {test.z_max:.2f}, mean ratio {test.mean_ratio:.4f}"

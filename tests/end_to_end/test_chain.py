@@ -43,7 +43,8 @@ def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
     assert report["dataset"]["core_seconds_per_sample"] > 0
     (run,) = report["runs"]
     assert run["steps"] == 40
-    assert run["curve"][-1]["error"] < run["curve"][0]["error"]
+    assert [run["curve"][end]["step"] for end in (0, -1)] == [0, 40]  # the first is of the few samples there were then
+    assert run["curve"][-1]["error"] < 0.1 * report["mean_colour"]
     for page in ("out/preview.html", "out/report.html"):
         text = (folder / page).read_text()
         assert text.count("data:image/png;base64,") >= 6

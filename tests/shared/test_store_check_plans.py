@@ -196,12 +196,16 @@ INPUTS = ("modification", "view", "sample_modification", "sample_view", "sample_
 
 
 @pytest.fixture
-def planned_thrice(store: Store, scene: SceneStore) -> SceneStore:
+def planned_thrice(store: Store, tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
     """A plan, one that adds to it, and a top-up."""
-    scene.plan(Request(modifications=7, views_per_modification=3))
-    scene.plan(TopUp.of("+40", ["views=first:4"]))
-    commit_all(scene)
-    return scene
+
+    def make(scene: SceneStore) -> None:
+        scene.write_base(*samples.base())
+        scene.plan(Request(modifications=7, views_per_modification=3))
+        scene.plan(TopUp.of("+40", ["views=first:4"]))
+        commit_all(scene)
+
+    return stores.copied("planned thrice", make, store, tmp_path_factory)
 
 
 @pytest.mark.parametrize(

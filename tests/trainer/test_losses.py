@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -126,42 +124,6 @@ def test_both_optimisers_take_their_settings() -> None:
     assert isinstance(rmsprop, torch.optim.RMSprop)
     assert rmsprop.param_groups[0]["alpha"] == 0.95
     assert {o.param_groups[0]["lr"] for o in (adam, rmsprop)} == {1e-4}
-
-
-@pytest.mark.parametrize("kind", ["adam", "rmsprop"])
-def test_both_optimisers_step_bit_for_bit_as_torch_s(kind: str) -> None:
-    settings = TrainSettings(optimiser=kind, learning_rate=0.01)
-    plain = {"adam": torch.optim.Adam, "rmsprop": torch.optim.RMSprop}[kind]
-    own = {"adam": {"betas": (settings.beta1, settings.beta2), "fused": True}, "rmsprop": {"alpha": settings.alpha}}
-    ends = []
-    for make in (lambda w: build_optimiser(w, settings), lambda w: plain(w, lr=0.01, **own[kind])):
-        weight = torch.nn.Parameter(torch.linspace(-1, 2, 30))
-        optimiser = make([weight])
-        for _ in range(5):
-            optimiser.zero_grad()
-            (weight - 1).pow(4).sum().backward()
-            optimiser.step()
-        ends.append(weight.detach().clone())
-    assert torch.equal(*ends)
-    assert not torch.equal(ends[0], torch.linspace(-1, 2, 30))
-
-
-def test_no_optimiser_loads_torch_s_compiler() -> None:
-    """It takes as long to load as torch itself, and each start of a trainer would wait for it."""
-    code = (
-        "import sys, torch\n"
-        "from photonfarm.trainer.optimisers import build_optimiser\n"
-        "from photonfarm.trainer.settings import TrainSettings\n"
-        "for kind in ('adam', 'rmsprop'):\n"
-        "    weight = torch.nn.Parameter(torch.ones(1))\n"
-        "    optimiser = build_optimiser([weight], TrainSettings(optimiser=kind))\n"
-        "    (weight * 2).backward()\n"
-        "    optimiser.step()\n"
-        "    optimiser.zero_grad()\n"
-        "    optimiser.load_state_dict(optimiser.state_dict())\n"
-        "assert 'torch._dynamo' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_the_rate_falls_with_every_epoch_of_samples_whatever_the_batch() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterable
 
@@ -12,32 +11,6 @@ from torch import nn
 from photonfarm.trainer.settings import TrainSettings
 
 
-class Adam(torch.optim.Adam):
-    """Torch's, but its step does not load torch's compiler, which takes as long as torch itself."""
-
-    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
-
-
-class RMSprop(torch.optim.RMSprop):
-    """Likewise."""
-
-    step = torch.no_grad()(inspect.unwrap(torch.optim.RMSprop.step))
-
-
-def _leave_the_compiler_out() -> None:
-    """Tell torch what its compiler is to make of an optimiser's methods, as it loads that first to be told: the same.
-
-    Nothing here is compiled. Where torch keeps what it is told elsewhere, only the seconds come back.
-    """
-    for method in vars(torch.optim.Optimizer).values():
-        plain = getattr(method, "__wrapped__", None)
-        if inspect.isfunction(method) and inspect.isfunction(plain):
-            plain.__dict__.setdefault("__dynamo_disable", plain)
-
-
-_leave_the_compiler_out()
-
-
 def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) -> torch.optim.Optimizer:
     """Adam or RMSprop over these weights, without weight decay, momentum of RMSprop or gradient clipping.
 
@@ -45,8 +18,8 @@ def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) ->
     bright targets are rarer than that mean is long (bench/firefly.py).
     """
     if settings.optimiser == "rmsprop":
-        return RMSprop(weights, lr=settings.learning_rate, alpha=settings.alpha)
-    return Adam(
+        return torch.optim.RMSprop(weights, lr=settings.learning_rate, alpha=settings.alpha)
+    return torch.optim.Adam(
         weights,
         lr=settings.learning_rate,
         betas=(settings.beta1, settings.beta2),

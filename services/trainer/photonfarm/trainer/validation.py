@@ -140,8 +140,9 @@ def compared(now: Validation, best: Best | None) -> Comparison:
     rows would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
     """
     mine = now.errors
-    same = best is not None and best.by_shown == now.by_shown and not best.errors.keys().isdisjoint(mine)
-    theirs = best.errors if best is not None and same else mine
+    theirs = mine
+    if best is not None and best.by_shown == now.by_shown and not best.errors.keys().isdisjoint(mine):
+        theirs = best.errors
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]
     ours, others = (group_means(np.array([errors[row] for row in rows]), units) for errors in (mine, theirs))

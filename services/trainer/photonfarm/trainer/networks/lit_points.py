@@ -105,7 +105,7 @@ class LitPoints(nn.Module):
     def forward(self, inputs: Inputs) -> list[Tensor]:
         """Diffuse light B₀ as if nothing hid it, all diffuse light, and light by other lobes, (B, H, W, 3) each.
 
-        The last is 0 but for metals.
+        The last is 0 where other lobes reflect less than `GLOSSY`.
         """
         images = [self._of_sample(inputs, place) for place in range(len(inputs.depth))]
         return [torch.stack(parts) for parts in zip(*images, strict=True)]

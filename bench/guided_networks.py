@@ -102,7 +102,6 @@ def measured(name: str, told: argparse.Namespace) -> list[Result]:
     """All candidates in one room."""
     spec = small(name)
     store = Store(told.work / name / "store", create=True)
-    store.add(spec).guides.want(spec.guides)
     where = [f"held-out={HOLD_OUT}", f"views=first:{told.references}"]
     requests = [Request(modifications=told.modifications), TopUp.of(str(told.reference_spp), where)]
     room_study.render(spec, store, requests, told.processes)

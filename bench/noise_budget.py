@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What a budget of core-seconds is best spent on: samples per pixel, views of a configuration, or configurations.
 
-    python bench/noise_budget.py [--rooms movable-living-room-2 movable-dining-room] [--budget 200] [--steps 2000]
+    python bench/noise_budget.py [--rooms movable-living-room-2 movable-dining-room] [--budget 200] [--steps 1000]
                                  [--seeds 0 1] [--plan-seed 1] [--processes 2] [--out docs/results]
 
 A room is a built-in spec, or an experiment of experiments/ in its small size. Costs and noise are measured as by
@@ -45,7 +45,6 @@ from room_study import HELD_OUT, References, Run, in_processes, settings_of
 ROOMS = ["movable-living-room-2", "movable-dining-room"]
 HELD_OUT_VIEWS = 48
 TIMED_VIEWS = 16
-ARCHITECTURE = "light_transport"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +140,7 @@ def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
         slice_ = number, len(told.seeds)
         source = partial(Arm, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
         name = f"{share}-{number}-of-{len(told.seeds)}"
-        found.append(Run(source, settings_of(ARCHITECTURE, seed, told), plan.folder, name))
+        found.append(Run(source, settings_of(told, seed), plan.folder, name))
     return found
 
 
@@ -257,14 +256,13 @@ with references of {room.references.spp} spp.
 
 def page(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
     """The tables as Markdown."""
-    settings = settings_of(ARCHITECTURE, told.seeds[0], told)
+    settings = settings_of(told, told.seeds[0])
     parts = "\n\n".join(room_part(room, found, told) for room in rooms)
     kappas, rhos = in_range(*found.kappa_range, KAPPAS), in_range(*found.rho_range, RHOS)
     return f"""# What a budget of core-seconds is best spent on
 
 Every arm is charged {told.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
-samples per pixel (spp) of a pass. `{ARCHITECTURE}`, preset `small`, for each arm alike {told.steps} steps of
-{settings.batch} samples; {room_study.described(settings)}.
+samples per pixel (spp) of a pass. For each arm alike {room_study.described(settings)}.
 {room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples, each with other configurations.
 
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
@@ -292,7 +290,7 @@ constant is bounded on one side only, and its best value says little.
 
 def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
     """The figures of noise_budget.json."""
-    settings = settings_of(ARCHITECTURE, told.seeds[0], told)
+    settings = settings_of(told, told.seeds[0])
     of_rooms = {
         room.name: room_study.document(settings, told, room.references)
         | {
@@ -316,7 +314,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
     parser.add_argument("--budget", type=float, default=200.0, help="core-seconds of each arm (200)")
     room_study.add_options(parser, "noise_budget")
-    parser.set_defaults(steps=2000, decay=0.88, loss="paired", demodulation=0.2)
+    parser.set_defaults(steps=1000)
     results.add_options(parser)
     return parser
 

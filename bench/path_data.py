@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Training data made by `bdpt` against data made by Mitsuba's `path`, at equal core-seconds of rendering.
 
-    python bench/path_data.py [--experiment fixed-veach-ajar] [--samples 400] [--steps 1500] [--seeds 0 1]
+    python bench/path_data.py [--experiment fixed-veach-ajar] [--samples 400] [--steps 1000] [--seeds 0 1 2 3]
                               [--processes 2] [--out docs/results]
 
 Takes the room of an experiment of experiments/, times both integrators, and renders a store of each kind whose
@@ -36,14 +36,11 @@ from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer.settings import TrainSettings
 from photonfarm.trainer.store_source import StoreSource
-from room_study import ChosenSamples, References, Run
+from room_study import ChosenSamples, References, Run, settings_of
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
-ARCHITECTURE = "light_transport"
 HELD_OUT = 1 / 8  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples
-PICTURE = "path_data.png"
 
 
 class FirstSamples(ChosenSamples):
@@ -90,17 +87,12 @@ def arms(told: argparse.Namespace) -> list[Arm]:
     return [Arm(kind, share, round(share * told.samples)) for kind, shares in BUDGETS.items() for share in shares]
 
 
-def settings_of(seed: int, told: argparse.Namespace) -> TrainSettings:
-    """The same for all arms."""
-    return room_study.settings_of(ARCHITECTURE, seed, told, HELD_OUT)
-
-
 def runs(arm: Arm, made: Rendered, where: tuple[Path, str], told: argparse.Namespace) -> list[Run]:
     """Of one arm, one from each seed; `where` is the folder and the scene's id."""
     folder, scene_id = where
     source = partial(FirstSamples, made.root, scene_id, arm.samples)
     name = f"{arm.kind}-{made.half_spp}-spp-{arm.samples}"
-    return [Run(source, settings_of(seed, told), folder, name) for seed in told.seeds]
+    return [Run(source, settings_of(told, seed, HELD_OUT), folder, name) for seed in told.seeds]
 
 
 def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: References) -> Measured:
@@ -157,7 +149,7 @@ def options() -> argparse.ArgumentParser:
     parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
     parser.add_argument("--samples", type=int, default=400, help="of bdpt, trained on at budget 1 (%(default)s)")
     room_study.add_options(parser, "path_data")
-    parser.set_defaults(steps=1500, decay=0.86, loss="paired", demodulation=0.2)
+    parser.set_defaults(steps=1000, seeds=[0, 1, 2, 3])
     results.add_options(parser)
     return parser
 
@@ -181,12 +173,13 @@ def main() -> int:
     room_study.train_all([run for arm in reversed(networks) for run in networks[arm]], told.processes)
     seen_in = made["bdpt"].root, spec.scene_id
     measured = [measure(arm, of_arm, seen_in, references) for arm, of_arm in networks.items()]
-    study = Study(told, spec, settings_of(told.seeds[0], told), costs, made, references, measured)
+    study = Study(told, spec, settings_of(told, told.seeds[0], HELD_OUT), costs, made, references, measured)
     looked_at = targets(made, spec, references)
     told.out.mkdir(parents=True, exist_ok=True)
-    path_data_page.picture(study, looked_at).save(told.out / PICTURE)
-    values = path_data_page.document(study, looked_at)
-    results.write("path_data", path_data_page.page(study, looked_at, PICTURE), values, told.out)
+    name = f"path_data_{told.experiment.replace('-', '_')}"
+    path_data_page.picture(study, looked_at).save(told.out / f"{name}.png")
+    text, values = path_data_page.page(study, looked_at, f"{name}.png"), path_data_page.document(study, looked_at)
+    results.write("path_data", text, values, told.out, page=name)
     return 0
 
 

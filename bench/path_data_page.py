@@ -160,14 +160,12 @@ ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` 
 each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
 images were seen to be too dark; a sample is meant to cost as much, by times that were taken before. Budgets are told as
 multiples of the samples of `bdpt`'s largest (“× samples”); core-seconds are those in the markers of the stores, medians
-over jobs, with editing, buffers, photons and visibility, and factors are of them. Both
+over jobs, with editing, buffers, guides, photons and visibility, and factors are of them. Both
 stores are of one spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s
 bit by bit, and its first {study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has
 beyond, at budgets above 1, are further configurations.
 
-`{settings.network.architecture}`, preset `small`: width {settings.network.width}, {settings.network.points} points;
-for each arm alike {told.steps} steps of {settings.batch} samples; {room_study.described(settings)}.
-The loss is the same for both kinds; where it weighs a half by the other one, noisier halves are weighed otherwise.
+For each arm alike {room_study.described(settings)}, the same for both kinds of samples.
 {room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples; plan seed {told.plan_seed}.
 All arms are measured after the last step, on {room_study.counted(len(references.rows), "view")} of
 {len(set(references.units))} further configurations.

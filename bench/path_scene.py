@@ -33,7 +33,7 @@ from photonfarm.shared.scene import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.top_up import TopUp
 from photonfarm.shared.view import View, sample_view
-from room_study import in_processes, render_job
+from room_study import in_processes, planned, render_job
 
 SHARD_ROWS = 16  # small jobs: those of both kinds take turns, so that both are timed on the same machine
 TIMED_SEED = 1 << 40  # of configurations that are only timed; no plan has it by chance
@@ -163,10 +163,7 @@ def render(
     half_spp = {"bdpt": spec.transport.half_spp, "path": costs.path_spp}
     jobs: list[tuple[float, tuple[str, str, int, int]]] = []
     for kind, opened in stores.items():
-        scene = opened.add(spec)
-        for request in asked[kind]:
-            scene.plan(request, shard_rows=SHARD_ROWS)
-        missing = scene.missing_jobs()
+        missing = planned(spec, opened, asked[kind], SHARD_ROWS).missing_jobs()
         told = str(opened.root), spec.scene_id, BDPT if kind == "bdpt" else costs.path_spp
         jobs += [(place / len(missing), (*told, job)) for place, job in enumerate(missing)]
     in_processes(render_any, [job for _, job in sorted(jobs)], processes, "rendered")
@@ -192,5 +189,9 @@ def rendered(store: Store, spec: SceneSpec, half_spp: int) -> Rendered:
     plans = [plan for plan in scene.plans() if isinstance(plan.request, Request)]
     jobs = [job for plan in plans for job in range(plan.first_job, plan.end_job)]
     figures = [scene.marker(job)["figures"] for job in jobs]
-    each = [found["core_s"] / len(scene.job_rows(job).samples) for job, found in zip(jobs, figures, strict=True)]
+    guides = [scene.guides.marker(job)["figures"]["core_s"] for job in jobs]
+    each = [
+        (found["core_s"] + guided) / len(scene.job_rows(job).samples)
+        for job, found, guided in zip(jobs, figures, guides, strict=True)
+    ]
     return Rendered(Path(store.root), half_spp, median(each), sum(found["redrawn"] for found in figures))

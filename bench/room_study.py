@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
@@ -34,7 +33,7 @@ from photonfarm.shared.keys import Key
 from photonfarm.shared.plan import Request
 from photonfarm.shared.records import F32
 from photonfarm.shared.scene import SceneSpec, load_spec
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.merge import merge_view
 from photonfarm.shared.store.reader import SceneReader
 from photonfarm.shared.top_up import TopUp
@@ -45,7 +44,7 @@ from photonfarm.trainer.evaluation_samples import Samples
 from photonfarm.trainer.feed import Feed
 from photonfarm.trainer.loop import CHECKPOINT, train
 from photonfarm.trainer.metrics import metric_space
-from photonfarm.trainer.settings import Loss, TrainSettings, preset
+from photonfarm.trainer.settings import Architecture, TrainSettings, preset
 from photonfarm.trainer.store_source import StoreSource
 from photonfarm.trainer.trained import TrainedRun
 
@@ -84,12 +83,19 @@ def in_passes(spec: SceneSpec, half_spp: int) -> SceneSpec:
 
 
 def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], processes: int) -> None:
-    """Plan what is not planned yet of the requests, and render all that is missing."""
-    scene = store.add(spec)
-    for request in requests:
-        scene.plan(request, shard_rows=SHARD_ROWS)
+    """Plan what is not planned yet of the requests, and render all that is missing, with guides of every view."""
+    scene = planned(spec, store, requests, SHARD_ROWS)
     jobs = [(str(store.root), spec.scene_id, job) for job in scene.missing_jobs()]
     in_processes(render_job, jobs, processes, "rendered")
+
+
+def planned(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], shard_rows: int) -> SceneStore:
+    """The scene in a store, with all requests planned and guides wanted."""
+    scene = store.add(spec)
+    scene.guides.want(spec.guides)
+    for request in requests:
+        scene.plan(request, shard_rows=shard_rows)
+    return scene
 
 
 def render_job(root: str, scene_id: str, job: int) -> None:
@@ -167,21 +173,14 @@ class ChosenSamples(StoreSource):
 
 def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     """What is equal for all runs of a study, and where it works; `parser.set_defaults` may change the defaults."""
+    parser.add_argument(
+        "--architecture", choices=get_args(Architecture), default="guided_transport", help="(%(default)s)"
+    )
     parser.add_argument("--processes", type=int, default=2, help="that render or train at a time (%(default)s)")
     parser.add_argument("--steps", type=int, default=1500, help="of each run (%(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="of the networks (%(default)s)")
     parser.add_argument("--plan-seed", type=int, default=1, help="of configurations and views (%(default)s)")
     parser.add_argument("--reference-spp", type=int, default=256, help="of the held-out views (%(default)s)")
-    parser.add_argument("--batch", type=int, default=2, help="samples a step (%(default)s)")
-    parser.add_argument("--rate", type=float, default=5e-4, help="learning rate (%(default)s)")
-    parser.add_argument("--decay", type=float, default=0.93, help="of the rate, per 256 samples (%(default)s)")
-    parser.add_argument("--loss", choices=get_args(Loss), default="relative", help="(%(default)s)")
-    parser.add_argument(
-        "--demodulation", type=float, default=0.0, help="ε; outputs × (albedo + ε) are the images; 0: off (%(default)s)"
-    )
-    parser.add_argument(
-        "--precision", choices=("float32", "bfloat16"), default="float32", help="of the U-Net (%(default)s)"
-    )
     parser.add_argument(
         "--work", type=Path, default=ROOT / "build" / name, help=f"where what is made stays (build/{name})"
     )
@@ -195,28 +194,19 @@ def opened(told: argparse.Namespace, size: str) -> tuple[Path, Store]:
     return folder, Store(folder / "store", create=True)
 
 
-def settings_of(architecture: str, seed: int, told: argparse.Namespace, hold_out: float = HELD_OUT) -> TrainSettings:
-    """Equal in all but the architecture and the seed."""
-    network = {
-        "architecture": architecture, "precision": told.precision, "demodulation": told.demodulation or None,
-        "occlusion": "exact",
-    }  # fmt: skip
+def settings_of(told: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
+    """The preset `small` from a seed, judged after its last step alone."""
     return preset(
-        "small", network=network, seed=seed, loss=told.loss, batch=told.batch, learning_rate=told.rate,
-        schedule="epochs", average=0.0, decay=told.decay, max_steps=told.steps, hold_out=hold_out,
-        validate_every=told.steps, validation_samples=1,
-        minimum_samples=1, checkpoint_every=1000,
+        "small", network={"architecture": told.architecture}, seed=seed, max_steps=told.steps, hold_out=hold_out,
+        recover=False, validate_every=told.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
 
 
 def described(settings: TrainSettings) -> str:
     """Settings of `settings_of` in words, for a page."""
-    network = settings.network
-    demodulated = "not demodulated" if network.demodulation is None else f"× (albedo + {network.demodulation:g})"
     return (
-        f"{settings.optimiser}, rate {settings.learning_rate:g}, times {settings.decay:g} every "
-        f"{settings.epoch_samples} samples; loss `{settings.loss}`; outputs {demodulated}; U-Net in "
-        f"{network.precision}; maxima `{network.maxima}`; occlusion `{network.occlusion}`"
+        f"`{settings.network.architecture}` by the preset `small`, {settings.max_steps} steps of {settings.batch} "
+        f"samples; loss `{settings.loss}`"
     )
 
 
@@ -342,16 +332,6 @@ def images(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F32:
     with Feed(source, run.settings, needs=run.needs) as feed:
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), "cpu")
         return np.concatenate([predict(batch).copy() for batch in batches(feed, rows, run.settings.batch)])
-
-
-def photon_maps(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F32:
-    """What a run's network adds its output to, of complete rows, likewise: nothing in it is learned."""
-    with Feed(source, run.settings, needs=run.needs) as feed, torch.no_grad():
-        network, made = run.network(feed.spec, (feed.geometry, feed.cloud)), []
-        for batch in batches(feed, rows, run.settings.batch):
-            known = torch.as_tensor(network.known(batch.inputs, network.further(batch.inputs)))
-            made.append(known.expand_as(batch.inputs.albedo).numpy())
-        return np.concatenate(made)
 
 
 def counted(count: int, what: str) -> str:

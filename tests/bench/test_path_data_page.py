@@ -161,7 +161,7 @@ def study(seeds: tuple[int, ...] = (0, 1)) -> tuple[Study, Targets]:
         measured.append(Measured(arm, 60.0, images=images, **dict.fromkeys(METRICS.values(), of_seeds)))
     made = {kind: Rendered(Path(kind), spp, 0.8, 0) for kind, spp in (("bdpt", 4), ("path", 22))}
     spec = small_spec(film={"width": SIZE, "height": SIZE})
-    settings = path_data.settings_of(0, told)
+    settings = path_data.settings_of(told, 0, HELD_OUT)
     found = Study(told, spec, settings, Costs(0.5, 0.04, 0.021), made, references, measured)
     mean = np.random.default_rng(6).uniform(0.5, 2, VIEWS)
     return found, Targets(halves(mean, 0.1, 1), halves(mean, 0.2, 2), UNITS, tuple(reversed(range(VIEWS))))

@@ -18,6 +18,7 @@ from photonfarm.shared.scene import SceneSpec, load_spec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.reader import Sample
 from photonfarm.shared.view import sample_view
+from room_study import planned
 
 SIZE, SPP = 16, 72
 
@@ -36,8 +37,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Sample]]
     spec, found = tiny_room(), {}
     for kind, load in (("bdpt", None), ("path", partial(path_scene.load_path, spp=SPP))):
         store = Store(tmp_path_factory.mktemp(kind) / "store", create=True)
-        scene = store.add(spec)
-        scene.plan(Request(modifications=2, seed=3), shard_rows=2)
+        scene = planned(spec, store, [Request(modifications=2, seed=3)], 2)
         renderer = ShardRenderer(store, worker="test", **({"load": load} if load else {}))
         for job in scene.missing_jobs():
             assert renderer.render(spec.scene_id, job)

@@ -133,9 +133,9 @@ def test_what_fails_in_a_process_is_raised_here() -> None:
 def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(root: Root, tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     room_study.add_options(parser, "test")
-    told = parser.parse_args(["--steps", "2"])
+    told = parser.parse_args(["--steps", "2", "--architecture", "cnn"])
     source = partial(Arm, *root, Share(2, 1, 1), 8)
-    runs = [Run(source, room_study.settings_of("cnn", seed, told), tmp_path, "few") for seed in (0, 1)]
+    runs = [Run(source, room_study.settings_of(told, seed), tmp_path, "few") for seed in (0, 1)]
     room_study.train_all(runs[:1], 1)
     assert [run.is_at_its_end() for run in runs] == [True, False]
     (runs[0].folder / "metrics.jsonl").unlink()

@@ -3,12 +3,12 @@
 
     python experiments/tables.py [--size small] [--work build/experiments] [--out docs/results]
 
-Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md and tables.json, for the
-paper's size tables-paper.md and tables-paper.json. Rooms that the JSON in OUT has, and that have no report here, stay,
-and are said on stderr: they may have run elsewhere. Delete a room's entry, and it goes. What was found out beyond the
-figures stands in experiments/findings.md, which becomes the last part of the page of the small size. Exit code 0, 3
-where a report's views are not independent, or 7 where there is neither a report nor a room that stays, or one of
-either is of an earlier version.
+Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md, tables.json
+and tables.png, for the paper's size tables-paper.md and so on. Rooms that the JSON in OUT has, and that have no report
+here, stay, and are said on stderr: they may have run elsewhere. Delete a room's entry, and it goes. What was found out
+beyond the figures stands in experiments/findings.md, which becomes the last part of the page of the small size. Exit
+code 0, 3 where a report's views are not independent, or 7 where there is neither a report nor a room that stays, or one
+of either is of an earlier version.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 
+import equal_time
 from experiment import HERE, Experiment, SizeName, names
 from photonfarm.shared.errors import IncompleteError, PhotonfarmError
 from photonfarm.shared.estimate import Estimate
@@ -195,8 +196,8 @@ def room_table(rooms: Sequence[Room]) -> str:
     """What each room's figures were measured on, what that cost, and whether the machine was quiet."""
     head = (
         "experiment", "title", "images trained on", "held out", "render of images, core-s", "reference passes",
-        "render of passes, core-s", "spp", "references", "noise of targets, linear MSE", "MB in all", "edit, ms",
-        "load average of 1, 5, 15 min", "credits",
+        "render of passes, core-s", "spp", "connections", "light ratio", "references", "noise of targets, linear MSE",
+        "MB in all", "edit, ms", "load average of 1, 5, 15 min", "credits",
     )  # fmt: skip
     return markdown_table(head, [_room_line(room) for room in rooms])
 
@@ -211,6 +212,7 @@ def _room_line(room: Room) -> list[str]:
         room.name, room.document["title"], " or ".join(map(str, trained_on)),
         " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)), f"{images['core_seconds']:.0f}",
         f"{passes['rows']}", f"{passes['core_seconds']:.0f}", f"{card['spp_per_sample']}",
+        f"{card['transport']['connections']}", f"{card['transport']['light_ratio']:g}",
         f"{references['views']} views, {references['spp']} spp" if references else NOT_AVAILABLE,
         f"{evaluation['noise_floor']:.3g}", f"{card['bytes'] / 1e6:.0f}",
         NOT_AVAILABLE if edit is None else f"{1e3 * edit:.0f}",
@@ -241,6 +243,7 @@ def page(found: Sequence[Room], size: SizeName) -> str:
             parts.append(f"## {title}\n\nMeans over: {named}.{lacking(rooms)}\n\n{paper_table(rooms, published)}")
             parts.append(f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}")
             parts.append(f"### The rooms\n\n{room_table(rooms)}")
+    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(found)))
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
@@ -313,6 +316,19 @@ samples per pixel that are rendered for them, here those of one half, and of sma
 costs most."""
 
 
+OF_TIME = """\
+## Error against the time of a frame
+
+![MSE over the time of a frame, room by room]({picture})
+
+Everything is charged: editing the scene, buffers, guides, photons, samples that a denoiser is given, and the network,
+on one core. A denoiser is given one half-estimate of each pixel, or of one of so many; between two of a family the
+error is taken to follow a power of the time. Below 1 ours is ahead of the best that the family reaches in the same
+time. Intervals are a bootstrap over configurations.
+
+{table}"""
+
+
 def options() -> argparse.ArgumentParser:
     """What can be told."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -353,6 +369,8 @@ def main() -> int:
     except PhotonfarmError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
+    told.out.mkdir(parents=True, exist_ok=True)
+    (told.out / f"{page_of(told.size)}.png").write_bytes(equal_time.picture(found))
     told_of = {
         "command": command(told.size),
         "machine": "each room's own",  # and not the one that this runs on

@@ -50,6 +50,7 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
         "edit_seconds": 0.1486,
         "dataset": {
             "width": film, "height": film, "spp_per_sample": 8, "credits": None, "bytes": 694e6,
+            "transport": {"connections": 4, "light_ratio": 0.25},
             "spent": {
                 "samples": {"rows": 896, "core_seconds": 527.2}, "top-up": {"rows": 4032, "core_seconds": 725.4},
             },
@@ -95,6 +96,7 @@ def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> Non
     assert told["title"] == "Movable objects and lights: The White Room"
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
     assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
+    assert (told["connections"], told["light ratio"]) == ("4", "0.25")
     assert told["edit, ms"] == "149"
     assert told["load average of 1, 5, 15 min"] == "0.4, 0.6, 1.2"
 

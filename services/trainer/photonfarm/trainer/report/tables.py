@@ -233,7 +233,7 @@ def _frame_parts(contents: Contents) -> list[Table]:
         for entry in contents.entries
         if entry.time
     )
-    head = ("architecture", "render 1/k", "buffers", "points seen", "photons", "network", "all")
+    head = ("architecture", "render 1/k", "buffers", "guides", "points seen", "photons", "network", "all")
     said = ["milliseconds: the median, and the middle 80 % of the times"]
     if _has_denoisers(contents):
         said.append(

@@ -1,0 +1,154 @@
+"""Error against the time of a frame, everything charged: ours beside denoisers that take as long.
+
+Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family of denoisers is
+the same denoiser, given more or fewer pixels: between two of it the error is taken to follow a power of the time.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.trainer.markdown import markdown_table
+from rooms import Room
+
+F64 = NDArray[np.float64]
+
+OURS = ("guided_transport", "guided_transport_photons")
+NETWORKS = ("cnn", "feature_projection", "light_transport", "light_transport_photons", "guided", *OURS)
+FAMILIES = {"denoise_": "denoisers trained on the room", "oidn ": "OIDN"}
+"""How the names of a family's rows begin, and what it is called."""
+
+COLUMNS = 2
+GREY = "#777777"  # of denoisers; no network has it
+REPLICATES = 4000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A predictor in a room."""
+
+    name: str
+    milliseconds: float
+    errors: F64  # (views,) MSE of each image, the mean of all seeds
+
+    @property
+    def mse(self) -> float:
+        """Over all views."""
+        return float(self.errors.mean())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtTime:
+    """The error that a family has after a time: that of `first` to the power 1 − share, times that of `second`."""
+
+    first: Placed
+    second: Placed
+    share: float
+
+    def of(self, first: F64, second: F64) -> F64:
+        """The error from those of both."""
+        mixed: F64 = first ** (1 - self.share) * second**self.share
+        return mixed
+
+
+def placed(room: Room, names: Sequence[str]) -> list[Placed]:
+    """Those of the rows that were timed and have errors, by ascending time. Raises SpecError as `Room.errors` does."""
+    edit, found = room.document["edit_seconds"], []
+    for name in names:
+        time, errors = room.rows.get(name, {}).get("frame_seconds"), room.errors(name)
+        if edit is not None and time and errors is not None:
+            found.append(Placed(name, 1e3 * (edit + time["total"]), errors.mean(axis=0)))
+    return sorted(found, key=lambda each: each.milliseconds)
+
+
+def family(room: Room, begins: str) -> list[Placed]:
+    """The members of a family, by ascending time."""
+    return placed(room, [name for name in room.rows if name.startswith(begins)])
+
+
+def at(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
+    """The least error of a family after so many milliseconds; None where all of it takes longer."""
+    in_time = [each for each in members if each.milliseconds <= milliseconds]
+    if not in_time:
+        return None
+    best = min(in_time, key=lambda each: each.mse)
+    found = AtTime(best, best, 0.0)
+    if len(in_time) < len(members):
+        last, after = in_time[-1], members[len(in_time)]
+        share = np.log(milliseconds / last.milliseconds) / np.log(after.milliseconds / last.milliseconds)
+        between = AtTime(last, after, float(share))
+        if between.of(np.array(last.mse), np.array(after.mse)) < best.mse:
+            found = between
+    return found
+
+
+def ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
+    """Our error over theirs, and its 95 % interval: a bootstrap over configurations, the same for both."""
+    errors = np.stack([ours.errors, theirs.first.errors, theirs.second.errors])
+    views = errors.shape[1]
+    drawn = np.random.default_rng(0).multinomial(views, np.full(views, 1 / views), size=REPLICATES) @ errors.T / views
+    means = np.concatenate([errors.mean(axis=1)[None], drawn])
+    ratios = means[:, 0] / theirs.of(means[:, 1], means[:, 2])
+    low, high = np.quantile(ratios[1:], (0.025, 0.975))
+    return float(ratios[0]), float(low), float(high)
+
+
+def table(rooms: Sequence[Room]) -> str:
+    """Ours in each room: time, error, and that as a share of each family's after the same time."""
+    head = ["room", "network", "ms a frame", "MSE"]
+    head += [f"MSE over that of {called} at that time (95 %)" for called in FAMILIES.values()]
+    lines = []
+    for room in rooms:
+        for ours in placed(room, OURS):
+            line = [room.name, ours.name, f"{ours.milliseconds:.0f}", f"{ours.mse:.5f}"]
+            lines.append([*line, *(_against(ours, family(room, begins)) for begins in FAMILIES)])
+    return markdown_table(head, lines)
+
+
+def _against(ours: Placed, members: Sequence[Placed]) -> str:
+    theirs = at(members, ours.milliseconds)
+    if theirs is None:
+        return f"all take longer, from {members[0].milliseconds:.0f} ms" if members else "n/a"
+    share, low, high = ratio(ours, theirs)
+    return f"{share:.2f} ({low:.2f} … {high:.2f})"
+
+
+def picture(rooms: Sequence[Room]) -> bytes:
+    """The plot of every room, as PNG."""
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from photonfarm.trainer.report.plots import COLOURS, STYLE
+
+    rows = -(-len(rooms) // COLUMNS)
+    colours = [colour for colour in COLOURS if colour != GREY]
+    with mpl.rc_context(STYLE):
+        figure = Figure((8.4, 2.9 * rows + 0.9), dpi=110, layout="constrained")
+        FigureCanvasAgg(figure)
+        grid = figure.subplots(rows, COLUMNS, squeeze=False).flat
+        for axes, room in zip(grid, rooms, strict=False):
+            for begins, marker, line in zip(FAMILIES, "os", ("-", "--"), strict=True):
+                members = family(room, begins)
+                places = [each.milliseconds for each in members], [each.mse for each in members]
+                axes.plot(*places, marker=marker, linestyle=line, color=GREY, label=FAMILIES[begins])
+            for each in placed(room, NETWORKS):
+                colour = colours[NETWORKS.index(each.name)]
+                axes.plot(each.milliseconds, each.mse, "D", color=colour, label=each.name)
+            axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")
+        for axes in [*grid][len(rooms) :]:
+            axes.set_axis_off()
+        handles = {
+            label: handle
+            for axes in figure.axes
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=3)
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", metadata={"Software": None})
+    return stream.getvalue()

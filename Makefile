@@ -1,12 +1,13 @@
-# make demo   the main job, on embedded defaults      make test   the tests
-# make check  style, types, layers                    make setup  the virtual environment alone
+# make demo   the main job, on embedded defaults      make test       the tests
+# make check  style, types, layers                    make test-slow  those that take long: many kills, many images
+# make setup  the virtual environment alone
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 PROJECTS := shared services/renderer services/trainer
 
-.PHONY: setup demo test test-compose check lock clean
+.PHONY: setup demo test test-slow test-compose check lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -21,8 +22,14 @@ demo: $(STAMP)
 # Three at a time on two cores, as many tests wait; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.
 # Bytecode is kept whatever the environment says: hundreds of processes start, and each would compile photonfarm anew.
+PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest \
+	-n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+
 test: $(STAMP)
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(PYTEST) -m 'not slow'
+
+test-slow: $(STAMP)
+	$(PYTEST) -m slow
 
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)

@@ -17,7 +17,6 @@ from photonfarm.trainer import checkpoint
 ROOT = Path(__file__).parents[2]
 UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
 
-pytestmark = pytest.mark.slow
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
 

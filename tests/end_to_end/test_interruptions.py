@@ -17,7 +17,6 @@ from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.submission import submit
 
 pytestmark = [
-    pytest.mark.slow,
     pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc"),
 ]
 
@@ -46,6 +45,7 @@ def interruptible() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.slow
 def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_behind(
     tmp_path: Path, small_room: Path
 ) -> None:

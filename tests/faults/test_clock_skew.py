@@ -401,6 +401,7 @@ def skewed_worker(
         process.wait()
 
 
+@pytest.mark.slow
 def test_workers_a_year_apart_share_a_queue_and_one_that_dies_is_replaced(
     analytic: ModuleType,
     planned: Callable[..., SceneStore],

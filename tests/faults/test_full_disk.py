@@ -126,7 +126,7 @@ def parts(scene: SceneStore) -> list[str]:
 # ------------------------------------------------------------------------------------------------------------ no worker
 
 
-@pytest.mark.parametrize("kind", ["pages", "files"])
+@pytest.mark.parametrize("kind", ["pages", pytest.param("files", marks=pytest.mark.slow)])
 def test_a_commit_succeeds_as_soon_as_there_is_room_and_shows_nothing_before(
     analytic: ModuleType,
     disk: Disk,

@@ -234,6 +234,7 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
     assert len(told.splitlines()) <= 12 * told.count("starting again") + 3, "its own stack, and of that the innermost"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overdue", "reason"),
     [

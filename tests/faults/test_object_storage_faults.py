@@ -210,6 +210,7 @@ def test_a_submitter_that_sleeps_while_another_submits_mixes_nothing(
 # -------------------------------------------------------------------------------------------------------------- workers
 
 
+@pytest.mark.slow
 def test_workers_behind_a_lossy_way_and_under_kills_lose_and_double_nothing(
     analytic: ModuleType,
     planned: Callable[..., SceneStore],

@@ -15,6 +15,7 @@ from photonfarm.shared.store.markers import name_of
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(tmp_path: Path) -> None:
     wanted = soaking.Toll(kills=4, supervisor_kills=1, races=2, redis_kills=2, flushes=1, submitters=1)

@@ -533,6 +533,7 @@ def test_a_reader_that_did_not_look_while_a_job_was_repaired_and_rendered_again_
     machine.teardown()
 
 
+@pytest.mark.slow
 def test_a_store_under_random_use_is_what_a_dictionary_would_be(tmp_path: Path) -> None:
     number = itertools.count()
     run_state_machine_as_test(

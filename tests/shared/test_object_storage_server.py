@@ -63,6 +63,7 @@ def test_a_server_that_refuses_or_is_not_there_is_a_store_error_that_says_so(
         Store(url)
 
 
+@pytest.mark.slow
 def test_a_server_that_is_away_for_a_while_is_waited_for(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,7 +20,7 @@ def references() -> dict[str, Any]:
     return {}
 
 
-@pytest.mark.parametrize("name", ["cove", "many_lights"])
+@pytest.mark.parametrize("name", ["cove", pytest.param("many_lights", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("connections", "light_ratio"), [(0, 0.0), (0, 0.3), (0, 2.0), (3, 0.5)])
 def test_means_are_equal_for_all_parameters(
     name: str, connections: int, light_ratio: float, renders: Any, references: dict[str, Any], assert_equal_means: Any

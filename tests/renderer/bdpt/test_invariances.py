@@ -13,11 +13,16 @@ from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
 from photonfarm.renderer.stability.invariances import COUNTS, Check, checks
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
-QUICK = [check for check in checks(long=False) if not check.name.startswith("weights-")]
+SLOW = ("seed-many-lights", "counts-many-lights", "counts-plastics")
+QUICK = [
+    pytest.param(check, marks=[pytest.mark.slow] if check.name in SLOW else [], id=check.name)
+    for check in checks(long=False)
+    if not check.name.startswith("weights-")
+]
 
 
 # Each right check fails by chance with probability 4e-6 per comparison; the seeds are fixed.
-@pytest.mark.parametrize("check", QUICK, ids=lambda check: check.name)
+@pytest.mark.parametrize("check", QUICK)
 def test_an_image_does_not_change_with_what_must_not_matter(check: Check) -> None:
     found = check.run()
     assert found.faults == (), f"{check.said}: {found.figures}\nagain: {check.command}"

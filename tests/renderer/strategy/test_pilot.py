@@ -133,6 +133,7 @@ def test_a_cheap_candidate_that_misses_light_is_watched_until_the_time_is_up(see
     assert choice.candidate != PLAIN
 
 
+@pytest.mark.slow
 def test_the_spread_holds_how_much_the_views_differ() -> None:
     """Where light paths are twice as good in half of the views and half as good in the others, 8 views tell little."""
     clock, ratios, spreads = Clock(), [], []
@@ -273,7 +274,6 @@ def test_a_ball_under_the_sky_gets_none() -> None:
     assert choice.candidate == PLAIN
 
 
-@pytest.mark.slow
 def test_chosen_and_unchosen_settings_have_one_mean() -> None:
     scene = mi.load_dict(HARD_SCENES["cove"](32), optimize=False)
     render = renderer(scene)

@@ -289,7 +289,6 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return command
 
 
-@pytest.mark.slow
 def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
     code, out, err = run("box.toml", "--seconds", "2", "--json")
     assert code == 0

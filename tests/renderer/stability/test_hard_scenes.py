@@ -11,15 +11,14 @@ from photonfarm.renderer.stability.rows import REFUSALS, ROWS, SCENES
 from photonfarm.renderer.stability.runner import message_of, run
 
 SLOW = ("18-mask-veils", "25-hundred-lights-at-once")
-QUICK = [
-    pytest.param(scene, marks=[pytest.mark.slow] if scene.label in SLOW else [], id=scene.label)
-    for scene in SCENES
-    if scene.quick is not None
-]
+QUICK = [scene for scene in SCENES if scene.quick is not None]
 
 
 # One right scene fails by chance with probability 4e-6 per settings; the seeds are fixed.
-@pytest.mark.parametrize("scene", QUICK)
+@pytest.mark.parametrize(
+    "scene",
+    [pytest.param(scene, marks=[pytest.mark.slow] if scene.label in SLOW else [], id=scene.label) for scene in QUICK],
+)
 def test_a_hard_scene_looks_like_its_truth(scene: HardScene) -> None:
     for outcome in run(scene, quick=True):
         if outcome.result.faults:

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import ViewBuffers, arrays_of
-from photonfarm.shared.store.reader import SceneReader
-from photonfarm.trainer.store_source import StoredSample
+from photonfarm.shared.core.records import ViewBuffers, arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store.read.reader import SceneReader
+from photonfarm.trainer.data.store_source import StoredSample
 from room_study import HELD_OUT, ChosenSamples
 
 HALF_SPP = 1  # of what is rendered

@@ -3,8 +3,8 @@
 
     python bench/compare_with_path.py [--scene cornell glass_caustic kitchen] [--out DIR] [--pictures DIR]
 
-A scene is a name of `photonfarm.renderer.bdpt.hard_scenes`, a folder under $PHOTONFARM_SCENES, or a path of a Mitsuba
-XML file. Per scene, independent renders of either integrator are compared: block z-test (16×16 blocks), ratio of the
+A scene is a name of `photonfarm.renderer.verify.scenes.hard_scenes`, a folder under $PHOTONFARM_SCENES, or a path of a
+Mitsuba XML file. Per scene, independent renders of either integrator are compared: block z-test (16×16 blocks), ratio of the
 means. Verdict: |z| < 4.5 in every block, and means within 0.5 % (or within 3 standard errors where these are wider,
 marked «noisy»). Exit code 0 if every scene passes, 1 otherwise, 2 if a scene is unknown
 (the others are compared all the same).
@@ -104,7 +104,7 @@ def render(scene: Any, integrator: dict[str, Any], seeds: range, spp: int) -> An
 
 def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[Row, dict[str, Any]]:
     """(line of the table, pictures) of one scene."""
-    from photonfarm.shared.statistics import block_z_test
+    from photonfarm.shared.core.statistics import block_z_test
 
     scene = load(name, plan.size)
     common = {"max_depth": plan.max_depth, "rr_depth": 5}
@@ -187,7 +187,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> int:
     arguments = parse()
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(arguments.threads)
     rows = []

@@ -103,12 +103,12 @@ def main() -> int:
     results.add_options(parser)
     told = parser.parse_args()
 
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
     import mitsuba as mi
 
-    from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
+    from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
     if told.scene not in HARD_SCENES:
         parser.error(f"--scene {told.scene}: is none of {', '.join(sorted(HARD_SCENES))}")

@@ -78,10 +78,10 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
     """The spec, and what its modifications cost."""
     import drjit as dr
 
-    from photonfarm.renderer.scenes import LoadedScene, integrator_of
-    from photonfarm.shared.modification import rest, sample_modification
-    from photonfarm.shared.pointcloud import rebuild
-    from photonfarm.shared.view import sample_view
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
+    from photonfarm.shared.scene.modification import rest, sample_modification
+    from photonfarm.shared.scene.pointcloud import rebuild
+    from photonfarm.shared.scene.view import sample_view
 
     spec = load_spec_of(name)
     seen: set[str] = set()
@@ -126,7 +126,7 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
 
 def load_spec_of(name: str) -> Any:
     """The built-in spec of this name, else the one under scenes/."""
-    from photonfarm.shared.scene import load_spec
+    from photonfarm.shared.scene.spec import load_spec
 
     path = Path(__file__).parents[1] / "scenes" / f"{name}.toml"
     return load_spec(path if path.is_file() else name)
@@ -226,7 +226,7 @@ def main() -> int:
     options = parser.parse_args()
     if not 0 <= options.warm_up < options.modifications:
         parser.error(f"--warm-up is {options.warm_up}; allowed are numbers from 0 below --modifications")
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
     measured = [measure(name, options.modifications, options.warm_up) for name in options.spec]

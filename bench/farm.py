@@ -21,8 +21,8 @@ from pathlib import Path
 import results
 from farm_account import PARTS, Account, account
 from farm_pairs import Pair, pairs
-from photonfarm.shared.plan import SHARD_ROWS
-from photonfarm.shared.scene import load_spec
+from photonfarm.shared.plan.request import SHARD_ROWS
+from photonfarm.shared.scene.spec import load_spec
 
 QUICK = {"jobs": 8, "rows": 4, "repetitions": 1}
 QUEUE_TARGET = 0.01

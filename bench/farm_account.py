@@ -13,13 +13,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from photonfarm.renderer import jobs
-from photonfarm.renderer.worker_child import RenderWorker
-from photonfarm.renderer.worker_settings import WorkerSettings
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker.child import RenderWorker
+from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared import queue
-from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.store import JobWriter, SceneStore, Store
-from photonfarm.shared.submission import submit
 
 WRITER = "writer of job"  # how a JobWriter's thread is named
 

@@ -18,11 +18,12 @@ from typing import Any, NamedTuple
 
 import workers
 from farm_account import planned
-from photonfarm.renderer import jobs
-from photonfarm.shared.processes import tied
-from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import load_spec
-from photonfarm.shared.store import SceneStore, markers
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.shared.core.processes import tied
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.store import SceneStore
+from photonfarm.shared.store.format import markers
 
 SPINS = 12_000_000  # of a loop: about a second
 

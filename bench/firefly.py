@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import results
-from photonfarm.trainer.optimisers import build_optimiser
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.optimisers import build_optimiser
 
 MEAN = 0.9
 COUNTS = (4, 16, 256)  # samples a target

@@ -25,18 +25,18 @@ from numpy.typing import NDArray
 
 import results
 import room_study
-from photonfarm.shared.estimate import Estimate, group_means
-from photonfarm.shared.plan import Request
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.estimate import Estimate, group_means
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
-from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer.evaluation import by_turns
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.learner import Learner
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval, mssim
 from photonfarm.trainer.metrics.metric_space import metric_space
-from photonfarm.trainer.settings import TrainSettings, preset
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.predict.evaluation import by_turns
+from photonfarm.trainer.runs.settings import TrainSettings, preset
+from photonfarm.trainer.training.learner import Learner
 
 CANDIDATES: dict[str, dict[str, Any]] = {
     "cnn": {"architecture": "cnn"},

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.records import F32
-from photonfarm.trainer.animation import enlarged
+from photonfarm.shared.core.records import F32
+from photonfarm.trainer.predict.animation import enlarged
 
 if TYPE_CHECKING:
     from PIL import Image

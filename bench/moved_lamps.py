@@ -30,26 +30,26 @@ import room_study
 from explained import Change, Explained
 from moved_lights import same_surface
 from network_errors import F64, Errors
-from photonfarm.renderer.jobs import SceneRenderer, load_scene, located
-from photonfarm.renderer.path_buffers import frames_of
-from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError
-from photonfarm.shared.keys import Key, seed_of, view_key
-from photonfarm.shared.modification import Modification, sample_modification
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
-from photonfarm.shared.scene import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
-from photonfarm.shared.scene_files import BUILTIN_EMITTING, SceneFile
+from photonfarm.renderer.jobs.path_buffers import frames_of
+from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
+from photonfarm.shared.core.keys import Key, seed_of, view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
+from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
-from photonfarm.shared.view import View
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import Batch, fill, fill_photons, units_of
-from photonfarm.trainer.evaluation import Predictor
-from photonfarm.trainer.evaluation_samples import Samples
-from photonfarm.trainer.loop import CHECKPOINT
+from photonfarm.trainer.compare.evaluation_samples import Samples
+from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, units_of
+from photonfarm.trainer.data.store_source import StoredSample, StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
-from photonfarm.trainer.store_source import StoredSample, StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.predict.evaluation import Predictor
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
 
 Base = tuple[Geometry, BasePointCloud]
 

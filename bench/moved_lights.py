@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 import results
 import room_study
-from photonfarm.renderer.jobs import SceneRenderer, load_scene, located
-from photonfarm.shared.errors import PhotonfarmError
-from photonfarm.shared.estimate import Estimate
-from photonfarm.shared.modification import Modification, sample_modification
-from photonfarm.shared.records import ViewBuffers
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.view import View, sample_view
+from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
+from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.metrics.intervals import confidence_interval
 

@@ -7,8 +7,8 @@
 A room is a built-in spec, or an experiment of experiments/ in its small size. Costs and noise are measured as by
 `photonfarm scene cost`, best on a quiet machine; each arm of `budget_arms.SHARES` gets as many configurations as the
 budget pays for, is trained on from each seed, on other configurations each time, and measured on the same held-out
-views. The constants of `photonfarm.shared.allocation` are fitted to all arms of all rooms. What is rendered and trained
-stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene
+views. The constants of `photonfarm.shared.plan.allocation` are fitted to all arms of all rooms. What is rendered and
+trained stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene
 files. Exit code 0, whatever comes out.
 """
 
@@ -32,14 +32,14 @@ from budget_arms import HALF_SPP, SHARES, Arm, Share, requests
 from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from network_errors import F64, Errors, each_seed, of_intervals, stated, within
 from photonfarm.renderer.strategy.cache import write_whole
-from photonfarm.shared.allocation import Allocation, Terms, seconds
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.sample_costs import SampleCosts
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.allocation import Allocation, Terms, seconds
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
-from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.data.store_source import StoreSource
 from room_study import HELD_OUT, References, Run, in_processes, settings_of
 
 ROOMS = ["movable-living-room-2", "movable-dining-room"]
@@ -105,7 +105,7 @@ def planned(name: str, told: argparse.Namespace) -> Planned:
 
 def measured_costs(room: SceneSpec) -> SampleCosts:
     """Times at the samples per pixel that the room has, and the noise of the passes that samples are made of."""
-    from photonfarm.renderer.sample_costs import measured_costs
+    from photonfarm.renderer.measure.sample_costs import measured_costs
 
     passes = measured_costs(room_study.in_passes(room, HALF_SPP), frames=TIMED_VIEWS)
     return replace(measured_costs(room, frames=TIMED_VIEWS), relative_variance=passes.relative_variance)
@@ -268,13 +268,13 @@ samples per pixel (spp) of a pass. For each arm alike {room_study.described(sett
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
 {2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
 charged what it would cost rendered at once, by a line through the times of two numbers of spp; the variance given
-below, relative to squared brightness (`photonfarm.shared.sample_costs.relative_variance`), is that of the
+below, relative to squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), is that of the
 passes. Passes of a view are samples of their own. **MSE** is in the metric space, the references' noise taken out;
 **linear MSE** in exposed linear radiance.
 {of_intervals(len(told.seeds))}
 
-**The model** is that of `photonfarm.shared.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b of
-each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
+**The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b
+of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
 with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms of a room have in
 common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 % intervals of a
 bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with replacement, the same

@@ -31,12 +31,12 @@ import room_study
 from network_errors import Errors, each_seed
 from path_data_study import BLOCK, Arm, Measured, Study, Targets
 from path_scene import Rendered
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.data.store_source import StoreSource
 from room_study import ChosenSamples, References, Run, settings_of
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}

@@ -16,7 +16,7 @@ from mosaic import Column, mosaic
 from network_errors import Errors, each_seed, of_intervals, stated
 from path_data_study import BLOCK, METRICS, Study, Targets
 from path_statistics import Bias, Found
-from photonfarm.trainer.losses import RELATIVE_EPSILON
+from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 SHOWN = (0.3, 0.6, 0.8, 0.95)  # quantiles of the error of bdpt at budget 1: these views are shown
 

@@ -9,10 +9,10 @@ import path_statistics
 from network_errors import Errors, seed_spread
 from path_scene import Costs, Rendered
 from path_statistics import Found
-from photonfarm.shared.keys import Key
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.runs.settings import TrainSettings
 from room_study import References
 
 BLOCK = 8  # px

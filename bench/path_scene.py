@@ -22,17 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy.cache import write_whole
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.shared.store import Store
-from photonfarm.shared.top_up import TopUp
-from photonfarm.shared.view import View, sample_view
 from room_study import in_processes, planned, render_job
 
 SHARD_ROWS = 16  # small jobs: those of both kinds take turns, so that both are timed on the same machine
@@ -66,7 +66,7 @@ def _stratified(spec: SceneSpec) -> Any:
     """The spec's sensor with a stratified sampler: `bdpt`, which has points of its own, does not ask it."""
     import mitsuba as mi
 
-    from photonfarm.renderer.sensor import AimedSensor, describe
+    from photonfarm.renderer.scene.sensor import AimedSensor, describe
 
     class Stratified(AimedSensor):
         def __init__(self) -> None:

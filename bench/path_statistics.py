@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from network_errors import F64, Errors, replicates, within
-from photonfarm.shared.keys import Key
-from photonfarm.shared.records import F32
-from photonfarm.trainer.losses import RELATIVE_EPSILON
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32
+from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,15 +24,15 @@ import torch
 import results
 import room_study
 from network_errors import Errors, stated
-from photonfarm.renderer.jobs import SceneRenderer, load_scene, located, photons_of, visibility_of
-from photonfarm.shared.errors import PhotonfarmError
-from photonfarm.shared.records import F32, BasePointCloud, Visibility
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located, photons_of, visibility_of
+from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.shared.core.records import F32, BasePointCloud, Visibility
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
-from photonfarm.trainer.dataset import Batch, fill, fill_photons
+from photonfarm.trainer.data.dataset import Batch, fill, fill_photons
+from photonfarm.trainer.data.store_source import StoredSample, StoreSource
 from photonfarm.trainer.networks.inputs import given
-from photonfarm.trainer.store_source import StoredSample, StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.predict.trained import TrainedRun
 from room_study import References
 
 NAME = "photon_noise"
@@ -149,8 +149,8 @@ def page(rooms: Sequence[Room]) -> str:
 The networks of `make experiments-small`, as they were trained: with the photons of × 1. Further lines show the same
 networks more photons of the same held-out configurations; a photon's power is that of its light path over their number,
 so that only the noise differs. The photon map is the image that the network's output is added to
-(`photonfarm.trainer.photon_map`): albedo times what the wider window gathers. Nothing is trained: what a network would
-reach that had learned from so many photons is not measured, and can be less. Photons seen are medians over views, and
+(`photonfarm.trainer.networks.photon_map`): albedo times what the wider window gathers. Nothing is trained: what a
+network would reach that had learned from so many photons is not measured, and can be less. Photons seen are medians over views, and
 so are those of equal power that would make as noisy a sum, (Σ p)² / Σ p². MSE is in the metric space, the references'
 noise taken out. Intervals are over configurations, of a static room over views, for these networks (one seed).
 

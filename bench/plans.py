@@ -72,7 +72,7 @@ Steps = Iterable[tuple[str, Callable[[], Any]]]
 
 
 def submit(options: argparse.Namespace) -> Steps:
-    from photonfarm.shared import submission
+    from photonfarm.shared.farm import submission
 
     request = {"modifications": options.samples // options.views, "views": options.views, "passes": 1, "seed": 0}
     yield "submit", lambda: submission.submit(options.spec, options.folder / "store", options.redis, **request)
@@ -113,8 +113,8 @@ def read(options: argparse.Namespace) -> Steps:
 
 
 def again(options: argparse.Namespace) -> Steps:
+    from photonfarm.shared.plan.top_up import TopUp
     from photonfarm.shared.store import Store
-    from photonfarm.shared.top_up import TopUp
 
     scene = Store(options.folder / "store").scenes()[0]
     (plan,) = scene.plans()
@@ -126,7 +126,8 @@ class Markers:
     """Markers as commits would place them, of shards that are not there."""
 
     def __init__(self, root: Path) -> None:
-        from photonfarm.shared.store import Store, schema
+        from photonfarm.shared.store import Store
+        from photonfarm.shared.store.format import schema
 
         self.scene = Store(root).scenes()[0]
         (self.plan,) = self.scene.plans()
@@ -135,7 +136,8 @@ class Markers:
 
     def place(self, job: int) -> None:
         """Write one marker, not synced."""
-        from photonfarm.shared.store import Figures, markers
+        from photonfarm.shared.store import Figures
+        from photonfarm.shared.store.format import markers
 
         files = {self.plan.shard(name, array, job): array for name, array in self._arrays.items()}
         described = {
@@ -154,7 +156,7 @@ class Markers:
 def measure(options: argparse.Namespace, folder: Path) -> tuple[list[Row], dict[str, int]]:
     """Every step in its process, and what Redis holds."""
     from photonfarm.shared import queue
-    from photonfarm.shared.redis_server import EmbeddedRedis
+    from photonfarm.shared.farm.redis_server import EmbeddedRedis
 
     rows, sizes = [], {}
     with EmbeddedRedis(folder / "redis") as server:

@@ -21,8 +21,8 @@ from typing import Any, get_args
 import torch
 
 import results
-from photonfarm.shared.errors import SpecError
-from photonfarm.trainer.settings import Occlusion
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.runs.settings import Occlusion
 from projection_rooms import Counts, Room, Viewed
 
 TARGET_ROOMS = ("living-room", "living-room-2", "dining-room", "veach-ajar")
@@ -147,7 +147,7 @@ def main() -> int:
     parser.add_argument("--judged", type=int, default=512, help="points of each view (512)")
     results.add_options(parser)
     options = parser.parse_args()
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
     torch.set_num_threads(1)

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, STATIC, BasePointCloud, Geometry, ViewBuffers
-from photonfarm.shared.scene import BUILTIN_ROOMS, SceneSpec, load_spec
-from photonfarm.shared.view import Camera, View, sample_view
-from photonfarm.trainer.projection import Optics, footprint
-from photonfarm.trainer.settings import Occlusion
+from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry, ViewBuffers
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import BUILTIN_ROOMS, SceneSpec, load_spec
+from photonfarm.shared.scene.view import Camera, View, sample_view
+from photonfarm.trainer.networks.projection import Optics, footprint
+from photonfarm.trainer.runs.settings import Occlusion
 from projection_oracle import in_image, sees, triangles
 
 READY = Path(__file__).parents[1] / "scenes"
@@ -91,7 +91,7 @@ class Room:
     @classmethod
     def load(cls, name: str, points: int, size: int) -> Room:
         """A built-in room, or one of `scenes/`, with a square film; SpecError where it is not in PHOTONFARM_SCENES."""
-        from photonfarm.renderer.scenes import LoadedScene
+        from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
         spec = load_spec(name if name in BUILTIN_ROOMS else READY / f"{name}.toml")
         film = spec.film.model_copy(update={"width": size, "height": size})

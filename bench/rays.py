@@ -252,7 +252,7 @@ def main() -> int:
     parser.add_argument("--max-depth", type=int, default=8)
     results.add_options(parser)
     options = parser.parse_args()
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
     rows = []

@@ -93,7 +93,7 @@ def run(pending: list[str], settings: Settings, folder: Path, key: dict[str, Any
     commit = results.commit()  # before measuring: others may commit meanwhile
     with tempfile.TemporaryDirectory(prefix="kernels-", ignore_cleanup_errors=True) as cache:
         os.environ["DRJIT_CACHE_DIR"] = cache  # an empty cache: compile times are those of a first use
-        from photonfarm.renderer import backend
+        from photonfarm.renderer.scene import backend
 
         backend.load(settings.threads)
         for name in pending:

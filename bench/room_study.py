@@ -28,28 +28,29 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
-from photonfarm.shared.estimate import clean_error
-from photonfarm.shared.keys import Key
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.core.estimate import clean_error
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.merge import merge_view
-from photonfarm.shared.store.reader import SceneReader
-from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import SampleSource, rows_held_out, units_of
-from photonfarm.trainer.evaluation import batches
-from photonfarm.trainer.evaluation_samples import Samples
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import CHECKPOINT, train
+from photonfarm.shared.store.read.merge import merge_view
+from photonfarm.shared.store.read.reader import SceneReader
+from photonfarm.trainer.compare.evaluation_samples import Samples
+from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import metric_space
-from photonfarm.trainer.settings import Architecture, TrainSettings, preset
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.predict.evaluation import batches
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import Architecture, TrainSettings, preset
+from photonfarm.trainer.training.loop import train
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.jobs import ShardRenderer
+    from photonfarm.renderer.jobs.render import ShardRenderer
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ROOT / "experiments"
@@ -105,7 +106,7 @@ def render_job(root: str, scene_id: str, job: int) -> None:
 
 @cache
 def _renderer(root: str) -> ShardRenderer:
-    from photonfarm.renderer.jobs import ShardRenderer
+    from photonfarm.renderer.jobs.render import ShardRenderer
 
     return ShardRenderer(Store(root), worker="bench")
 

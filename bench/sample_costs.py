@@ -4,7 +4,7 @@
     python bench/sample_costs.py [--budget 2000] [--views 12] [--out DIR]
 
 Measures the scenes of experiments/ in their small size as `photonfarm scene cost` does, and puts costs and noise into
-`photonfarm.shared.allocation`. PHOTONFARM_SCENES names the folder of the scene files. Exit code 0.
+`photonfarm.shared.plan.allocation`. PHOTONFARM_SCENES names the folder of the scene files. Exit code 0.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import asdict, dataclass
 
 import results
 import room_study
-from photonfarm.shared.allocation import KAPPA, RHO, Allocation, Terms
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.sample_costs import SampleCosts
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.allocation import KAPPA, RHO, Allocation, Terms
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import SceneSpec
 
 NAME = "sample_costs"
 SPP = (2, 4, 8, 32, 128)
@@ -46,7 +46,7 @@ class Room:
 
 def measured(name: str, views: int) -> Room:
     """Costs and noise of one experiment's scene. Raises SpecError."""
-    from photonfarm.renderer.sample_costs import measured_costs
+    from photonfarm.renderer.measure.sample_costs import measured_costs
 
     spec = room_study.named_room(name)
     room = Room(name, spec, measured_costs(spec, frames=views))
@@ -86,11 +86,11 @@ def page(rooms: list[Room], budget: float, views: int) -> str:
     return f"""# What samples cost, how noisy they are, and how many samples per pixel that asks for
 
 Scenes of `experiments/` in their small size; core-milliseconds, medians over {views} views. ν is the
-variance of one sample per pixel over squared brightness (`photonfarm.shared.sample_costs.relative_variance`), from
+variance of one sample per pixel over squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), from
 halves of the scene's samples per pixel, which are stratified: with fewer it is somewhat more. s* is the samples per
 pixel, both halves together, of least excess error with one view of each configuration, a guide to a factor of two
 ([choosing-spp.md](../choosing-spp.md)), and “best” the best of all shares with 2 spp and more
-(`photonfarm.shared.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
+(`photonfarm.shared.plan.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
 core-seconds spent on single views of so many spp, over that of the best.
 
 {results.table(header, (line(room, budget) for room in rooms))}

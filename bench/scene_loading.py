@@ -32,7 +32,7 @@ def scene_loaders() -> dict[str, Callable[[int], Any]]:
     """Name → function of the image size that loads the scene. Other packages' scenes are added here."""
     import mitsuba as mi
 
-    from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
+    from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
     def loader(build: Callable[[int], Any]) -> Callable[[int], Any]:
         return lambda size: mi.load_dict(build(size), optimize=False)
@@ -44,7 +44,7 @@ def _room(size: int) -> dict[str, Any]:
     """The built-in room as modelled, seen from a corner."""
     import mitsuba as mi
 
-    from photonfarm.renderer import rooms
+    from photonfarm.renderer.scene import rooms
 
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     to_world = mi.ScalarTransform4f().look_at(origin=[2.3, 1.6, 1.9], target=[-0.8, 0.8, -0.8], up=[0, 1, 0])

@@ -21,7 +21,7 @@ from typing import Any
 
 
 def settings(text: str) -> Any:
-    from photonfarm.renderer.stability.case import Settings
+    from photonfarm.renderer.verify.scenes.case import Settings
 
     connections, light_ratio = text.split(",")
     return Settings(int(connections), float(light_ratio))
@@ -39,10 +39,10 @@ def main() -> int:
     parser.add_argument("--invariances", nargs="*", help="these alone (names or how they begin), or all of them")
     options = parser.parse_args()
 
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(options.threads)
-    from photonfarm.renderer.stability import invariances, report, rows
+    from photonfarm.renderer.verify import invariances, report, rows
 
     try:
         checks = invariances.chosen(options.invariances or [], long=not options.quick)
@@ -71,7 +71,7 @@ def main() -> int:
 
 def hold(checks: Any) -> bool:
     """Run the checks, print their table; whether all of them hold."""
-    from photonfarm.renderer.stability import invariances
+    from photonfarm.renderer.verify import invariances
 
     found = []
     for check in checks:

@@ -74,7 +74,7 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
     from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 
     from photonfarm.shared.store import SceneReader
-    from photonfarm.shared.store.batch import Batch
+    from photonfarm.shared.store.read.batch import Batch
 
     reader = SceneReader(store, scene_id)
     rows = reader.refresh()
@@ -375,8 +375,8 @@ def main() -> int:
 
 def run(folder: Path, options: argparse.Namespace) -> tuple[list[Row], Any, Any]:
     """All measurements: the bytes, which renders the contents, then reading and writing."""
-    from photonfarm.shared.plan import Request
-    from photonfarm.shared.scene import load_spec
+    from photonfarm.shared.plan.request import Request
+    from photonfarm.shared.scene.spec import load_spec
 
     spec = load_spec(options.spec)
     spec = spec.model_copy(

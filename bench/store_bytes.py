@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.keys import Key
-from photonfarm.shared.plan import Request
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store import SceneStore, Store, schema
-from photonfarm.shared.store.schema import ArraySchema
-from photonfarm.shared.store.shards import ShardWriter, encode
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.format.schema import ArraySchema
+from photonfarm.shared.store.format.shards import ShardWriter, encode
 from store_contents import Contents, Pool, commit, commit_guides, view_row
 
 COUNTS = (1, 2, 4, 8)

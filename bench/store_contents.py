@@ -11,15 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.keys import Key, view_key
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.keys import Key, view_key
+from photonfarm.shared.core.records import (
+    F32,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+    arrays_of,
+)
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
-from photonfarm.shared.store.schema import Kind, output_arrays
-from photonfarm.shared.store.shards import encode
-from photonfarm.shared.view import View
+from photonfarm.shared.store.format.schema import Kind, output_arrays
+from photonfarm.shared.store.format.shards import encode
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 
@@ -28,10 +37,10 @@ class Contents:
     """What a worker renders, kept. All passes of a view have the same half-estimates: noise is stored raw."""
 
     def __init__(self, spec: SceneSpec) -> None:
-        from photonfarm.renderer import backend
+        from photonfarm.renderer.scene import backend
 
         backend.load(threads=1)
-        from photonfarm.renderer.scenes import LoadedScene
+        from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
         self.spec = spec
         self._scene = LoadedScene.load(spec)
@@ -49,7 +58,7 @@ class Contents:
 
     def visibility(self, modification: Modification, view: View) -> Visibility:
         """What the view sees."""
-        from photonfarm.renderer.jobs import visibility_of
+        from photonfarm.renderer.jobs.render import visibility_of
 
         photons = self.photons(modification) if self.spec.photons.paths else None
         points = rebuild(self.base[1], modification)
@@ -61,7 +70,7 @@ class Contents:
 
     def guides(self, modification: Modification, view: View) -> Guides:
         """What is known of a view beside its buffers."""
-        from photonfarm.renderer.jobs import lit_points
+        from photonfarm.renderer.jobs.render import lit_points
 
         key, lit = modification.key(self.spec.scene_id), lit_points(self.base[1], modification)
         make = partial(self._scene.guides, view, view_key(key, view.vector), self.spec.guides, lit)

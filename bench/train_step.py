@@ -26,21 +26,22 @@ from torch import Tensor
 
 import results
 import store_contents
-from photonfarm.shared.plan import Request
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.trainer import metrics_log
-from photonfarm.trainer.dataset import Batch
-from photonfarm.trainer.device import usable_device
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.learner import Learner
-from photonfarm.trainer.loop import METRICS, train
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.light_transport import LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import TrainSettings, preset
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.runs import metrics_log
+from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.run_folder import METRICS
+from photonfarm.trainer.runs.settings import TrainSettings, preset
+from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.loop import train
 
 RENDERED = 8  # configurations, of two views each
 SAMPLES = 256

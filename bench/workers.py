@@ -38,10 +38,10 @@ class Row:
 
 def serve(pipe: Any, name: str, size: int, threads: int) -> None:
     """A worker: loads the scene, then renders the samples it is sent the numbers of, and says when they are done."""
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=threads)
-    from photonfarm.renderer.scenes import LoadedScene
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
     scene = LoadedScene.load(spec_of(name, size))
     for number in range(WARM_UP):
@@ -55,7 +55,7 @@ def serve(pipe: Any, name: str, size: int, threads: int) -> None:
 
 def spec_of(name: str, size: int) -> Any:
     """The spec with a film of size × size."""
-    from photonfarm.shared.scene import load_spec
+    from photonfarm.shared.scene.spec import load_spec
 
     spec = load_spec(name)
     return spec.model_copy(update={"film": spec.film.model_copy(update={"width": size, "height": size})})
@@ -63,8 +63,8 @@ def spec_of(name: str, size: int) -> Any:
 
 def make_sample(scene: Any, number: int) -> None:
     """All that a worker renders for one sample; sample n is the same in every process."""
-    from photonfarm.shared.modification import sample_modification
-    from photonfarm.shared.view import sample_view
+    from photonfarm.shared.scene.modification import sample_modification
+    from photonfarm.shared.scene.view import sample_view
 
     modification = sample_modification(scene.spec, 0, number)
     view = sample_view(scene.spec, modification.key(scene.spec.scene_id), 0, 0)
@@ -165,7 +165,7 @@ def main() -> int:
     parser.add_argument("--repetitions", type=int, default=5)
     results.add_options(parser)
     options = parser.parse_args()
-    from photonfarm.shared.scene import load_spec
+    from photonfarm.shared.scene.spec import load_spec
 
     own = load_spec(options.spec).film.width
     rows = [measure(options.spec, size, options) for size in (own, options.size)]

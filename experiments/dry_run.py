@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Self
 
 from experiment import Experiment, Run
-from photonfarm.shared.sample_costs import SampleCosts
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import SceneSpec
 
 FRAMES = 4
 """Views that a scene's costs are measured on."""
@@ -54,7 +54,7 @@ class Need:
 
 def measured(experiment: Experiment) -> Need:
     """What an experiment needs, its scene's costs measured here. Raises SpecError."""
-    from photonfarm.renderer.sample_costs import measured_costs
+    from photonfarm.renderer.measure.sample_costs import measured_costs
 
     return Need.of(experiment, measured_costs(experiment.spec(), frames=FRAMES))
 
@@ -62,7 +62,7 @@ def measured(experiment: Experiment) -> Need:
 def operations(spec: SceneSpec, run: Run) -> float:
     """Floating-point operations of a run's convolutions and matrix products."""
     from photonfarm.trainer.networks.summary import summary
-    from photonfarm.trainer.settings import NetworkSettings, preset
+    from photonfarm.trainer.runs.settings import NetworkSettings, preset
 
     told = {key: value for key, value in run.train.items() if key != "preset"}
     network = {key: told.pop(key) for key in [*told] if key in NetworkSettings.model_fields}

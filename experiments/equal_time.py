@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.trainer.markdown import markdown_table
+from photonfarm.trainer.compare.markdown import markdown_table
 from rooms import Room
 
 F64 = NDArray[np.float64]

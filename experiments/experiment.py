@@ -9,8 +9,8 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import Frozen, Name, SceneSpec, parse_spec, sentences
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import Frozen, Name, SceneSpec, parse_spec, sentences
 
 HERE = Path(__file__).parent
 SIZES = "sizes.toml"

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiment import Experiment, seeded
-from photonfarm.shared.errors import IncompleteError, SpecError
-from photonfarm.shared.estimate import Estimate
+from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.estimate import Estimate
 from stages import EVALUATION
 
 

@@ -19,7 +19,7 @@ from typing import get_args
 
 import dry_run
 from experiment import Experiment, SizeName, names
-from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
 from stages import Stages, tell
 
 ROOT = Path(__file__).parents[1]

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from experiment import Experiment, Run
-from photonfarm.shared.errors import IncompleteError
-from photonfarm.shared.hold_out import are_held_out
-from photonfarm.shared.processes import tied
+from photonfarm.shared.core.commands import command
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.processes import tied
+from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.markers import COMMITTED
-from photonfarm.shared.verbs import command
+from photonfarm.shared.store.format.markers import COMMITTED
 
 EVALUATION = "evaluation.json"  # what `evaluate` leaves in each run's folder
 PREVIEW = "preview.html"  # what `up` makes last
@@ -139,7 +139,7 @@ class Stages:
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
-        from photonfarm.trainer.settings import PRESETS
+        from photonfarm.trainer.runs.settings import PRESETS
 
         preset = PRESETS[run.train["preset"]]().model_dump(mode="json", exclude_unset=True)
         return {**preset.pop("network"), **preset, **self._settings(run)}
@@ -160,7 +160,7 @@ class Stages:
         return self.folder / "runs" / run.name
 
     def _checkpoint(self, run: Run) -> Path:
-        from photonfarm.trainer.loop import CHECKPOINT
+        from photonfarm.trainer.runs.run_folder import CHECKPOINT
 
         return self._folder(run) / CHECKPOINT
 

@@ -26,9 +26,9 @@ import numpy as np
 
 import equal_time
 from experiment import HERE, Experiment, SizeName, names
-from photonfarm.shared.errors import IncompleteError, PhotonfarmError
-from photonfarm.shared.estimate import Estimate
-from photonfarm.trainer.markdown import markdown_table
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, Table

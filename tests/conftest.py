@@ -10,8 +10,8 @@ import pytest
 import redis
 import s3_server
 
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import connect
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import Store
 
 # Read where torch is loaded, also by processes that tests start: threads that turn while they wait would take from

@@ -7,7 +7,7 @@ import pytest
 
 from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from network_errors import Errors, own_errors
-from photonfarm.shared.allocation import Allocation, excess
+from photonfarm.shared.plan.allocation import Allocation, excess
 
 KAPPA, RHO = 40.0, 2.0
 ARMS = [

@@ -11,7 +11,7 @@ import pytest
 
 import tables
 from experiment import Experiment, SizeName
-from photonfarm.shared.errors import IncompleteError, SpecError
+from photonfarm.shared.core.errors import IncompleteError, SpecError
 from rooms import Room
 
 NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")

@@ -14,9 +14,9 @@ import experiment
 import run
 from dry_run import Need
 from experiment import Experiment, SizeName, merged, names
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.sample_costs import SampleCosts
-from photonfarm.shared.scene import SCENES_VARIABLE, Emitters
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, Emitters
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from rooms import Room
 from stages import PREVIEW, StageError, Stages, _is_done
@@ -102,7 +102,7 @@ loss = "relative"
 
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
-    from photonfarm.shared.scene import find_spec
+    from photonfarm.shared.scene.spec import find_spec
 
     monkeypatch.setattr(experiment, "HERE", tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY)
@@ -223,8 +223,8 @@ def test_training_that_ends_early_without_an_error_is_not_taken_for_done(tiny: E
 
 def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
     """The stages of an experiment of one network, of which a checkpoint of some step is there."""
-    from photonfarm.trainer import checkpoint
-    from photonfarm.trainer.settings import preset
+    from photonfarm.trainer.runs import checkpoint
+    from photonfarm.trainer.runs.settings import preset
 
     told = {key: experiment.size.train[key] for key in ("max_steps", "loss")}
     network = {"architecture": "light_transport", "width": 4, "points": 128}

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES, camera, grey, rectangle  # noqa: E402
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera, grey, rectangle  # noqa: E402
 from render_peers.luxcore import LuxCoreMethod, installed, settings  # noqa: E402 - after the variant is set
 from render_peers.luxcore_scene import NotExpressibleError, translate  # noqa: E402
 from render_peers.methods import MitsubaMethod, integrator  # noqa: E402

@@ -12,20 +12,20 @@ import pytest
 import moved_lamps
 import room_study
 from moved_lamps import KNOWN, Candidate, Row, Stage, Views, held_out, lamps, stays, trained_runs
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.errors import IncompleteError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.processes import Stop
-from photonfarm.shared.records import F32, ViewBuffers
-from photonfarm.shared.scene import Emitters, SceneSpec, load_spec
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.records import F32, ViewBuffers
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import Emitters, SceneSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.trainer.dataset import Batch
-from photonfarm.trainer.evaluation import Predictor, constant_predictor
-from photonfarm.trainer.loop import train
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import POINTS_ONLY
-from photonfarm.trainer.settings import preset
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs.settings import preset
+from photonfarm.trainer.training.loop import train
 
 HOLD_OUT = 0.5
 SIZE = 16

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from moved_lights import Change, Image, Room, half_square, measured, mixed, page, same_surface
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.records import ViewBuffers
-from photonfarm.shared.scene import load_spec
+from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.spec import load_spec
 
 
 def buffers(depth: float = 2.0) -> ViewBuffers:

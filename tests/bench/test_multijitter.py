@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES, camera  # noqa: E402 - after the variant is set
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera  # noqa: E402 - after the variant is set
 from render_peers.methods import MitsubaMethod, integrator, multijittered  # noqa: E402
 
 SEEDS = 16

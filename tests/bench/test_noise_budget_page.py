@@ -13,8 +13,8 @@ from budget_arms import SHARES
 from budget_fit import KAPPAS, RHOS, RoomErrors, fit
 from network_errors import Errors
 from noise_budget import Measured, Room
-from photonfarm.shared.allocation import excess
-from photonfarm.shared.sample_costs import SampleCosts
+from photonfarm.shared.plan.allocation import excess
+from photonfarm.shared.plan.sample_costs import SampleCosts
 from room_study import References
 
 VIEWS, SIZE, BUDGET = 12, 16, 200.0

@@ -19,8 +19,8 @@ from path_data import BUDGETS, HELD_OUT, FirstSamples
 from path_data_study import METRICS, Measured, Study, Targets
 from path_scene import Costs, Rendered
 from path_statistics import Found, bias, crossing, factor, noise, ratio, relative_noise
-from photonfarm.shared.hold_out import are_held_out
-from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.store import Store
 from room_study import References
 from store_contents import Pool, commit

@@ -11,13 +11,13 @@ import pytest
 
 import path_scene
 from path_scene import Costs
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32, arrays_of
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.core.records import F32, arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import sample_view
 from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.reader import Sample
-from photonfarm.shared.view import sample_view
+from photonfarm.shared.store.read.reader import Sample
 from room_study import planned
 
 SIZE, SPP = 16, 72

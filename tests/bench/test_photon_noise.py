@@ -10,14 +10,14 @@ import pytest
 import photon_noise
 from network_errors import Errors
 from photon_noise import Room, Shown, page
-from photonfarm.renderer.jobs import ShardRenderer, load_scene
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.scene import load_spec
+from photonfarm.renderer.jobs.render import ShardRenderer, load_scene
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import Store
-from photonfarm.trainer.dataset import Batch
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import Needs, PhotonInputs, given
-from photonfarm.trainer.store_source import StoreSource
 from room_study import References
 
 ROW = 1

@@ -7,20 +7,20 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.plan import Request
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import Store
-from photonfarm.shared.view import Camera
-from photonfarm.trainer.dataset import Batch, read_into
+from photonfarm.trainer.data.dataset import Batch, read_into
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import PhotonInputs, PointInputs
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import NetworkSettings
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.runs.settings import NetworkSettings
 from projection_oracle import in_camera, sees, triangles
 
 SIZE, POINTS = 32, 1024

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.records import STATIC, Geometry
-from photonfarm.shared.scene import SceneSpec, load_spec
-from photonfarm.shared.view import Camera, View
+from photonfarm.shared.core.records import STATIC, Geometry
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import Camera, View
 from projection_oracle import first_met, in_image, sees, triangles
 
 NEAR, FAR = 0.5, 20.0

@@ -3,8 +3,8 @@
 import pytest
 
 import projection
-from photonfarm.renderer import backend
-from photonfarm.shared.errors import SpecError
+from photonfarm.renderer.scene import backend
+from photonfarm.shared.core.errors import SpecError
 from projection import Found
 from projection_rooms import Counts, Room
 

@@ -12,7 +12,7 @@ import pytest
 
 import compare_with_path
 import results
-from photonfarm.shared.statistics import block_z_test
+from photonfarm.shared.core.statistics import block_z_test
 
 
 def git(folder: Path, *arguments: str) -> str:

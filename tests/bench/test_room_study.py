@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 import room_study
 from budget_arms import HALF_SPP, Arm, Share, requests
 from network_errors import Errors
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
-from photonfarm.trainer.dataset import rows_held_out
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics.intervals import t_975
-from photonfarm.trainer.store_source import StoreSource
 from room_study import HELD_OUT, References, Run
 from store_contents import Pool, commit
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from analytic_scene import small_spec
 
-from photonfarm.shared.allocation import Allocation
-from photonfarm.shared.sample_costs import SampleCosts
+from photonfarm.shared.plan.allocation import Allocation
+from photonfarm.shared.plan.sample_costs import SampleCosts
 from sample_costs import SPP, Room, line, page, shared_out
 
 BUDGET = 200.0

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from analytic_scene import small_spec
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.records import Photons, ViewBuffers, Visibility
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from store_contents import EncodedPool, Pool, commit, commit_encoded
 

@@ -10,15 +10,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared import cli
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.hold_out import check_hold_out
-from photonfarm.shared.scene import load_spec
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.farm.hold_out_check import check_hold_out
+from photonfarm.shared.farm.submission import request_of, submit
+from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import Store
-from photonfarm.shared.submission import request_of, submit
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.store_source import StoreSource
 
 Ended = subprocess.CompletedProcess[str]
 

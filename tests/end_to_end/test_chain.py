@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonfarm.trainer import checkpoint
+from photonfarm.trainer.runs import checkpoint
 
 ROOT = Path(__file__).parents[2]
 UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.submission import submit
 
 pytestmark = [
     pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc"),

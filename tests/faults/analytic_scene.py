@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.errors import BackendError
-from photonfarm.shared.modification import Modification, rest
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
-from photonfarm.shared.scene import GuideSpec, SceneSpec, parse_spec
-from photonfarm.shared.store.guides import NOISY
-from photonfarm.shared.store.schema import guide_arrays
-from photonfarm.shared.view import View
+from photonfarm.shared.core.errors import BackendError
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
+from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store.format.schema import guide_arrays
+from photonfarm.shared.store.write.guides import NOISY
 
 FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
 
@@ -114,8 +114,8 @@ def start_worker(
     """A supervisor in a process of its own; its exit code is that of the command line. It talks to `log` or a pipe."""
     code = """
 import json, sys
-from photonfarm.renderer.worker import run_worker
-from photonfarm.shared.errors import PhotonfarmError
+from photonfarm.renderer.worker.worker import run_worker
+from photonfarm.shared.core.errors import PhotonfarmError
 store, url, child, settings = json.loads(sys.argv[1])
 try:
     run_worker(store, url, child=child, **settings)
@@ -148,7 +148,7 @@ def refuse_to_load(spec: SceneSpec) -> AnalyticScene:
 
 
 def main() -> int:
-    from photonfarm.renderer import worker_child
+    from photonfarm.renderer.worker import child as worker_child
 
     pause_s, purpose = sys.argv[1:]
     AnalyticScene.pause_s = float(pause_s)

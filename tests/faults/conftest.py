@@ -4,7 +4,7 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.shared.plan import Request
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
 
 
@@ -23,7 +23,7 @@ def planned(tmp_path: Path, analytic: ModuleType) -> Callable[..., SceneStore]:
 @pytest.fixture
 def clean_bytes(planned: Callable[..., SceneStore], analytic: ModuleType) -> Callable[[int], dict[str, bytes]]:
     """What one process leaves that renders all jobs in order, undisturbed: bytes by path within the scene."""
-    from photonfarm.renderer.jobs import ShardRenderer
+    from photonfarm.renderer.jobs.render import ShardRenderer
 
     def render(jobs: int) -> dict[str, bytes]:
         scene = planned(jobs, "clean")

@@ -15,13 +15,14 @@ import analytic_scene as analytic
 import numpy as np
 import zarr
 
-from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.markers import name_of
+from photonfarm.shared.store.format.markers import name_of
 
 CHILD = """
 import os, sys
-from photonfarm.renderer import jobs, worker_child
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker import child as worker_child
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
 analytic.AnalyticScene.pause_s = float(sys.argv[3])

@@ -21,10 +21,10 @@ import analytic_scene as analytic
 import redis
 import soak_evidence as evidence
 
-from photonfarm.renderer.worker_settings import GRACE_S
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.worker.settings import GRACE_S
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
 HEARTBEAT_TTL_S = 2.0

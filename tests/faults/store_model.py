@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import store_samples as samples
 
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.plan import UNUSED, Known, Request, expand, sample_key
-from photonfarm.shared.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.scene import GuideSpec, SceneSpec
+from photonfarm.shared.core.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.plan.request import UNUSED, Known, Request, expand, sample_key
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.guides import NOISY, rounded
+from photonfarm.shared.store.write.guides import NOISY, rounded
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
 

@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 import store_samples as samples
 
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import beat, connect, hosts, queue_status, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check import check_store
-from photonfarm.shared.store.storage import FOREIGN_AGE_S, STRAY_AGE_S
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
 
@@ -69,12 +69,12 @@ time_t time(time_t *now) {
 MACHINE = """
 import contextlib, io, json, sys, traceback
 from pathlib import Path
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import beat, connect, queue_status, reconcile
 from photonfarm.shared.store import Store
-from photonfarm.shared.store.check import check_store
-from photonfarm.shared.top_up import TopUp
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.plan.top_up import TopUp
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
 

@@ -11,18 +11,18 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, job_name, open_queue, put_back, queue_status, reconcile
 from photonfarm.shared.queue.job import queued_names, running_names, taken_names
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """
 import os, sys
 from photonfarm.shared.store import JobWriter, Store
-from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.jobs.render import ShardRenderer
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
 
@@ -45,7 +45,7 @@ if sys.argv[3] != "base":
     Store(sys.argv[2]).scenes()[0].write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
 setattr(owner, function, dying)
 if sys.argv[3] == "plan":
-    from photonfarm.shared.plan import Request
+    from photonfarm.shared.plan.request import Request
     Store(sys.argv[2]).plan(analytic.small_spec(), Request(modifications=9))
 else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)
@@ -110,7 +110,8 @@ def test_a_writer_killed_at_any_point_leaves_all_or_nothing(
 
 CHILD = """
 import os, sys
-from photonfarm.renderer import jobs, worker_child
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker import child as worker_child
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
 plain = jobs.ShardRenderer.render

@@ -9,13 +9,13 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer.backpressure import TrainerPace
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared import cli
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.worker.backpressure import TrainerPace
+from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store, store_status
 
 

@@ -14,14 +14,14 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer.backpressure import is_full
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.worker.backpressure import is_full
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check import check_store
+from photonfarm.shared.store.check.check import check_store
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="mounts a tmpfs")
 
@@ -250,7 +250,7 @@ def test_a_store_that_is_read_only_refuses_to_be_written_with_a_sentence_and_rea
 
 SHORT_WAIT = """
 import runpy, sys
-from photonfarm.renderer import backpressure
+from photonfarm.renderer.worker import backpressure
 backpressure.FULL_S = 0.5  # s instead of 30, between tries
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")

@@ -27,9 +27,9 @@ from rq.registry import ScheduledJobRegistry
 from rq.serializers import JSONSerializer
 from rq.webhook import Webhook
 
-from photonfarm.shared.plan import Request
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import ALIVE, QUEUE, connect, job_name, open_queue, queue_status, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks /proc for the memory of processes")

@@ -13,9 +13,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer.worker_settings import GRACE_S
+from photonfarm.renderer.worker.settings import GRACE_S
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import OVERDUE, STARTS, connect, queue_status, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 Bytes = Callable[[SceneStore], dict[str, bytes]]

@@ -20,14 +20,15 @@ import s3_server
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
-from photonfarm.renderer import doctor
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.plan import PlannedRows, Request
+from photonfarm.renderer.tools import doctor
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import PlannedRows, Request
 from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.store import SceneStore, Store, object_requests
-from photonfarm.shared.store.objects import ObjectStorage
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.io import object_requests
+from photonfarm.shared.store.io.objects import ObjectStorage
+from photonfarm.trainer.data.store_source import StoreSource
 
 
 def stored(url: str) -> dict[str, bytes]:

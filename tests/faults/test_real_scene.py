@@ -9,11 +9,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer.worker import CHILD, run_worker
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.worker.worker import CHILD, run_worker
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import parse_spec
+from photonfarm.shared.scene.spec import parse_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 

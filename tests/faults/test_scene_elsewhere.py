@@ -6,11 +6,11 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer import jobs
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.errors import QueueError, SceneNotHereError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.core.errors import QueueError, SceneNotHereError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
 
 XML = '<scene version="3.0.0"><shape type="cube" id="tall-block"/></scene>'
@@ -40,7 +40,7 @@ def test_files_that_come_later_are_found_by_a_worker_that_is_at_work(
 ) -> None:
     code = """
 import runpy, sys
-from photonfarm.renderer import worker_child
+from photonfarm.renderer.worker import child as worker_child
 worker_child.NOT_HERE_S = 3.0
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")

@@ -29,13 +29,13 @@ from hypothesis.stateful import (
 )
 from store_model import Model, Planned, Reader, Writer, base_of, compare
 
-from photonfarm.shared.errors import CorruptError, IncompleteError, SpecError, StoreError
-from photonfarm.shared.plan import UNUSED, Request
-from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, SpecError, StoreError
+from photonfarm.shared.plan.request import UNUSED, Request
+from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check import check_store
-from photonfarm.shared.store.guides import beside
-from photonfarm.shared.top_up import TopUp, spp_per_pass
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.write.guides import beside
 
 EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
 STEPS = int(os.environ.get("PHOTONFARM_MODEL_STEPS", "30"))

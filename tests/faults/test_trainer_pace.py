@@ -9,14 +9,14 @@ import pytest
 import redis
 from pydantic import ValidationError
 
-from photonfarm.renderer import backpressure
-from photonfarm.renderer.backpressure import AHEAD_LOOK_S, TrainerPace
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.shared import show
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.worker import backpressure
+from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace
+from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.shared.cli import show
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status, tell_consumed
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
 
@@ -107,7 +107,7 @@ def test_a_worker_leaves_a_scene_that_is_ahead_says_so_and_renders_the_others(
     """One scene with 6 samples that nobody has used, and a new one; 2 of each may be committed in any case."""
     code = """
 import runpy, sys
-from photonfarm.renderer import backpressure
+from photonfarm.renderer.worker import backpressure
 backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0  # a look before each job, however fast they are
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")

@@ -14,15 +14,15 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backpressure
-from photonfarm.renderer.backpressure import TrainerPace
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.plan import Request
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.worker import backpressure
+from photonfarm.renderer.worker.backpressure import TrainerPace
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.upgrade import upgrade
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.declarations import GUIDES
-from photonfarm.shared.upgrade import upgrade
+from photonfarm.shared.store.format.declarations import GUIDES
 
 JOBS = 6
 
@@ -90,9 +90,9 @@ RENDER = """
 import os, sys
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
-from photonfarm.renderer import backpressure
-from photonfarm.renderer.backpressure import TrainerPace
-from photonfarm.renderer.jobs import ShardRenderer
+from photonfarm.renderer.worker import backpressure
+from photonfarm.renderer.worker.backpressure import TrainerPace
+from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.store import Store
 
 def die():

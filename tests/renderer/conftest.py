@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
-from photonfarm.shared.view import View
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.view import View
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.shared.errors import BackendError
+from photonfarm.renderer.scene import backend
+from photonfarm.shared.core.errors import BackendError
 
 LOAD = "from photonfarm.renderer import backend; print(backend.load(1).variant())"
 

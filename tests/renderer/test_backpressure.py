@@ -10,12 +10,13 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer import backpressure, cli
-from photonfarm.renderer.backpressure import FULL_S, DiskReserve, is_full
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.plan import Request
+from photonfarm.renderer import cli
+from photonfarm.renderer.worker import backpressure
+from photonfarm.renderer.worker.backpressure import FULL_S, DiskReserve, is_full
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
 
@@ -94,7 +95,7 @@ def test_a_full_disk_is_told_from_other_refusals(number: int, full: bool) -> Non
 
 
 def test_the_trainers_first_samples_are_never_held_back() -> None:
-    from photonfarm.trainer.settings import TrainSettings, small
+    from photonfarm.trainer.runs.settings import TrainSettings, small
 
     for settings in (TrainSettings(), small()):
         assert settings.minimum_samples + settings.validation_samples < backpressure.AHEAD_MINIMUM
@@ -131,8 +132,8 @@ def test_a_commit_that_finds_the_disk_full_fails_no_job_and_ends_no_worker(
     """The first two commits find no space, whatever the reserve."""
     code = """
 import errno, runpy, sys
-from photonfarm.renderer import backpressure
-from photonfarm.shared.store.local import LocalStorage
+from photonfarm.renderer.worker import backpressure
+from photonfarm.shared.store.io.local import LocalStorage
 backpressure.FULL_S = 0.5
 plain, refusals = LocalStorage.adopt, [2]
 def adopt(self, part, name, *, replace=False):

@@ -3,16 +3,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.base_cloud import cloud_of, geometry_of
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.renderer.tessellation import triangles_of
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.keys import make_key
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import STATIC
-from photonfarm.shared.scene import load_spec
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.tessellation import triangles_of
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import make_key
+from photonfarm.shared.core.records import STATIC
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import load_spec
 
 CHECKS = {
     "type": "checkerboard",

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.scenes import LoadedScene
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy import content, light_reach
-from photonfarm.renderer.strategy.stage import Stage
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
-from photonfarm.shared.scene_files import BUILTIN_EMITTING
-from photonfarm.shared.statistics import block_z_test
-from photonfarm.shared.view import View
+from photonfarm.renderer.strategy.pilot_scene import Stage
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.statistics import block_z_test
+from photonfarm.shared.scene.files import BUILTIN_EMITTING
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.view import View
 
 Loader = Callable[..., LoadedScene]
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.renderer import exposure
 from photonfarm.renderer.cli import scene_exposure
-from photonfarm.renderer.exposure import Pictures, propose
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.pictures import display_values
-from photonfarm.shared.scene import Film, SceneSpec, load_spec
+from photonfarm.renderer.measure import exposure
+from photonfarm.renderer.measure.exposure import Pictures, propose
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.pictures import display_values
+from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec
 
 
 def pictures(values: np.ndarray, noise: float = 0.0) -> Pictures:

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer import backend
 from photonfarm.renderer.cli import measure_frames
-from photonfarm.renderer.frame_costs import WARM_UPS, Frame, frame_costs, in_turn
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.renderer.partial_film import PartialFilm, part_of
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.renderer.surfaces import surface_kinds
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.frame_costs import PARTS, FrameCosts, Surface
-from photonfarm.shared.modification import Modification, rest
-from photonfarm.shared.plan import Request
-from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.measure.frame_costs import WARM_UPS, Frame, frame_costs, in_turn
+from photonfarm.renderer.measure.partial_film import PartialFilm, part_of
+from photonfarm.renderer.measure.surfaces import surface_kinds
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Surface
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.view import View
 
 DIFFUSE = {"type": "diffuse"}
 MIRROR = {"type": "conductor"}
@@ -191,7 +191,7 @@ def test_each_part_is_charged_with_its_own_seconds(
 
         return work
 
-    monkeypatch.setattr("photonfarm.renderer.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr("photonfarm.renderer.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
     monkeypatch.setattr(room, "guides", takes(lambda *_: 1000, lambda *_: None))

@@ -3,11 +3,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.gbuffer import view_buffers
-from photonfarm.shared.records import ViewBuffers
-from photonfarm.shared.scene import SceneSpec, parse_spec
-from photonfarm.shared.view import Camera, View
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.gbuffer import view_buffers
+from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+from photonfarm.shared.scene.view import Camera, View
 
 COLOUR = (0.2, 0.4, 0.6)
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(COLOUR)}}
@@ -87,7 +87,7 @@ def test_albedo_of_a_large_image_is_that_of_a_small_one(monkeypatch: pytest.Monk
     """Its rays are traced in several goes."""
     checks = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
     at_once = of(checks).albedo
-    monkeypatch.setattr("photonfarm.renderer.gbuffer.RAYS", 5 * 24 * 16)
+    monkeypatch.setattr("photonfarm.renderer.scene.gbuffer.RAYS", 5 * 24 * 16)
     np.testing.assert_allclose(of(checks).albedo, at_once, atol=1e-6)
     assert len(np.unique(at_once)) > 2
 

@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.gbuffer import GRID, view_buffers
-from photonfarm.renderer.jobs import lit_points
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.keys import make_key, seed_of, view_key
-from photonfarm.shared.modification import rest
-from photonfarm.shared.records import Guides, arrays_of
-from photonfarm.shared.scene import GuideSpec, SceneSpec, parse_spec
-from photonfarm.shared.statistics import block_z_test
-from photonfarm.shared.store.guides import NOISY
-from photonfarm.shared.view import Camera, View
+from photonfarm.renderer.jobs.render import lit_points
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.gbuffer import GRID, view_buffers
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.keys import make_key, seed_of, view_key
+from photonfarm.shared.core.records import Guides, arrays_of
+from photonfarm.shared.core.statistics import block_z_test
+from photonfarm.shared.scene.modification import rest
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.shared.store.write.guides import NOISY
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer import guides  # noqa: E402 - after the variant is set
+from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
-from photonfarm.renderer.guides import point_light, view_guides  # noqa: E402
-from photonfarm.renderer.materials import Materials  # noqa: E402
+from photonfarm.renderer.scene.guides import point_light, view_guides  # noqa: E402
+from photonfarm.renderer.scene.materials import Materials  # noqa: E402
 
 Images = NDArray[np.float64]
 Shape = dict[str, Any]
@@ -515,7 +515,7 @@ def test_images_that_are_traced_in_several_goes_are_those_of_one(
     room: LoadedScene, somewhere: View, lit: Lit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = room.guides(somewhere, KEY, GuideSpec(), lit)
-    monkeypatch.setattr("photonfarm.renderer.guides.images.RAYS", 100 * GRID * GRID)
+    monkeypatch.setattr("photonfarm.renderer.scene.guides.images.RAYS", 100 * GRID * GRID)
     arrives = point_light(room.scene, *lit, KEY, GuideSpec())
     parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
     for name, values in arrays_of(whole).items():

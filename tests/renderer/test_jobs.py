@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import jobs
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.shared.errors import BackendError, IncompleteError, QueueError
-from photonfarm.shared.keys import seed_of
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Visibility
-from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
-from photonfarm.shared.store.check import check_store
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError
+from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.core.records import Visibility
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.format import markers
 
 
 @pytest.fixture
@@ -249,7 +250,7 @@ def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded
 def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: type
 ) -> None:
-    from photonfarm.shared.scene import SceneSpec, parse_spec
+    from photonfarm.shared.scene.spec import SceneSpec, parse_spec
 
     folders = [tmp_path / "planned", tmp_path / "here"]
     for i, folder in enumerate(folders):

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer.jobs import ShardRenderer
-from photonfarm.renderer.path_buffers import frames_of
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import IncompleteError, SpecError
-from photonfarm.shared.frames import Frames
-from photonfarm.shared.modification import rest
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.renderer.jobs.path_buffers import frames_of
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.modification import rest
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.store import SceneReader, Store
 
 

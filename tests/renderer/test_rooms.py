@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import BUILTIN_ROOMS, load_spec, parse_spec
-from photonfarm.shared.scene_files import BUILTIN_SHAPES
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.files import BUILTIN_SHAPES
+from photonfarm.shared.scene.spec import BUILTIN_ROOMS, load_spec, parse_spec
 
 
 @pytest.fixture(scope="module", params=BUILTIN_ROOMS)
@@ -36,9 +36,8 @@ def test_an_unknown_shape_id_of_a_built_in_room_is_refused_without_mitsuba() -> 
         SpecError, match=r"table.shapes: 'table-woood' is not a shape id of the scene; nearest: table-wood"
     ):
         parse_spec(described, where="test")
-    code = (
-        "import sys; from photonfarm.shared.scene import load_spec; load_spec('room'); exit('mitsuba' in sys.modules)"
-    )
+    code = "import sys; from photonfarm.shared.scene.spec import load_spec; "
+    code += "load_spec('room'); exit('mitsuba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

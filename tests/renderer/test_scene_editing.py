@@ -5,12 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from photonfarm.renderer import acceleration, backend
-from photonfarm.renderer.gbuffer import view_buffers
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene import SceneSpec, load_spec
-from photonfarm.shared.view import View, sample_view
+from photonfarm.renderer.scene import acceleration, backend
+from photonfarm.renderer.scene.gbuffer import view_buffers
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import View, sample_view
 
 
 def mesh_state(loaded: LoadedScene) -> dict[str, bytes]:

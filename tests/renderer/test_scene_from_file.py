@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.view import View
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.view import View
 
 LAMP = '<emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>'
 

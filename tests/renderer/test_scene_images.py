@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.modification import rest, sample_modification
-from photonfarm.shared.scene import SceneSpec, load_spec
-from photonfarm.shared.view import Camera, View
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.scene.modification import rest, sample_modification
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import Camera, View
 
 
 def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene, somewhere: View) -> None:

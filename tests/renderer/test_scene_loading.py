@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.scene import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec
-from photonfarm.shared.view import sample_view
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.view import sample_view
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.jobs import visibility_of
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.renderer.visibility import seen_points
-from photonfarm.shared.modification import Modification, rest, sample_modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
-from photonfarm.shared.scene import SceneSpec, load_spec, parse_spec
-from photonfarm.shared.view import View, sample_view
+from photonfarm.renderer.jobs.render import visibility_of
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.visibility import seen_points
+from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.view import View, sample_view
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]

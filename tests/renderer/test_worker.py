@@ -9,16 +9,17 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer.heartbeat import Heart
-from photonfarm.renderer.worker import check, render_job, run_worker
-from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.shared import queue, show
-from photonfarm.shared.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.processes import process_space
+from photonfarm.renderer.worker.heartbeat import Heart
+from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.renderer.worker.worker import check, render_job, run_worker
+from photonfarm.shared import queue
+from photonfarm.shared.cli import show
+from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
+from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, job_name, queue_status
-from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import Source
+from photonfarm.shared.scene.spec import Source
 from photonfarm.shared.store import SceneStore, Store, store_status
 
 
@@ -231,7 +232,7 @@ def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jo
     code = f"""
 import runpy, sys
 from pathlib import Path
-from photonfarm.renderer import jobs
+from photonfarm.renderer.jobs import render as jobs
 from photonfarm.shared.store import Store
 plain = jobs.ShardRenderer.render
 def render(self, *job):

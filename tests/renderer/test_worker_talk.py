@@ -2,8 +2,8 @@
 
 import pytest
 
-from photonfarm.renderer.worker_settings import WorkerSettings
-from photonfarm.renderer.worker_talk import Talk, Tally
+from photonfarm.renderer.worker.log import Talk, Tally
+from photonfarm.renderer.worker.settings import WorkerSettings
 
 
 def settings_of(**changes: object) -> WorkerSettings:

@@ -7,9 +7,9 @@ from typing import Any
 
 import store_samples as samples
 
-from photonfarm.shared.plan import Request
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.objects import ObjectStorage
+from photonfarm.shared.store.io.objects import ObjectStorage
 
 
 def planned(place: str | Path, **request: int) -> SceneStore:

@@ -1,6 +1,6 @@
 import pytest
 
-from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec, parse_spec
 
 DESCRIBED = {
     "name": "test-room",

@@ -4,7 +4,7 @@ import pytest
 import redis
 import store_samples as samples
 
-from photonfarm.shared.plan import Request
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import open_queue
 from photonfarm.shared.store import SceneStore, Store
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene import SceneSpec, parse_spec
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import SceneSpec, parse_spec
 from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
-from photonfarm.shared.store.schema import guide_arrays
+from photonfarm.shared.store.format.schema import guide_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
 

@@ -11,9 +11,10 @@ import pytest
 import store_samples as samples
 from obstore.store import from_url
 
-from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
+from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.format import markers
 
 
 @pytest.fixture

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store, markers
-from photonfarm.shared.store.check import check_store
-from photonfarm.shared.store.local import LocalStorage
-from photonfarm.shared.store.quarantine import Quarantine
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.shared.store.write.quarantine import Quarantine
 
 
 @pytest.fixture

@@ -12,11 +12,12 @@ import plain_reader
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.keys import seed_of
-from photonfarm.shared.plan import Request, sample_key
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.store import SceneReader, SceneStore, Store, schema
-from photonfarm.shared.view import Camera
+from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request, sample_key
+from photonfarm.shared.scene.view import Camera
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.format import schema
 
 ROOT = Path(__file__).parents[2]
 PLAIN_READER = Path(__file__).with_name("plain_reader.py")

@@ -12,16 +12,16 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner, Result
 
-from photonfarm.shared import dry_run
-from photonfarm.shared.allocation import KAPPA, Allocation, excess, seconds
-from photonfarm.shared.cli import submit
-from photonfarm.shared.dry_run import DryRun, measured_costs, rehearse
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.plan import Extent
-from photonfarm.shared.sample_costs import SampleCosts
-from photonfarm.shared.show import bytes_per_sample
+from photonfarm.shared.cli.farm_verbs import submit
+from photonfarm.shared.cli.show import bytes_per_sample
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.farm import dry_run
+from photonfarm.shared.farm.dry_run import DryRun, measured_costs, rehearse
+from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
+from photonfarm.shared.plan.request import Extent
+from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.store import Store
-from photonfarm.shared.store.schema import bytes_of_rows
+from photonfarm.shared.store.format.schema import bytes_of_rows
 
 COSTS = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 1000.0 * KAPPA)  # so noisy that 8 spp are too few
 STATIC_NOISE = 50**2 * KAPPA * 0.0625 / 0.375  # for which 50 spp are best

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import Emitters, SceneSpec, find_spec, load_spec, parse_spec
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import Emitters, SceneSpec, find_spec, load_spec, parse_spec
 from photonfarm.shared.store import Store
 
 ROOT = Path(__file__).parents[2]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.frame_costs import PARTS, FrameCosts, Seconds, Surface
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds, Surface
 
 
 def made() -> FrameCosts:

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.configuration import named_configuration
-from photonfarm.shared.errors import SpecError, StoreError
-from photonfarm.shared.frames import Frames
-from photonfarm.shared.modification import Modification, rest, sample_modification
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Photons
-from photonfarm.shared.scene import load_spec
+from photonfarm.shared.core.errors import SpecError, StoreError
+from photonfarm.shared.core.records import Photons
+from photonfarm.shared.farm.configuration import named_configuration
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
-from photonfarm.shared.view import View
 
 
 def made(*, photons: bool) -> Frames:

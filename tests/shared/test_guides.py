@@ -13,20 +13,20 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner
 
-from photonfarm.shared import cli
-from photonfarm.shared.errors import CorruptError, IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.shared.plan import Request
+from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, QueueError, SpecError, StoreError
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.submission import submit
+from photonfarm.shared.farm.upgrade import upgrade
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.queue import connect
 from photonfarm.shared.queue.job import open_queue, queued_names
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.redis_server import EmbeddedRedis
-from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.declarations import GUIDES
-from photonfarm.shared.store.guides import NOISY, rounded
-from photonfarm.shared.submission import submit
-from photonfarm.shared.top_up import TopUp
-from photonfarm.shared.upgrade import upgrade
+from photonfarm.shared.store.format.declarations import GUIDES
+from photonfarm.shared.store.write.guides import NOISY, rounded
 
 REQUEST = Request(modifications=5, views_per_modification=2)
 
@@ -389,7 +389,7 @@ def test_status_tells_how_many_views_have_guides_and_counts_what_they_take(store
 
 def test_the_verb_needs_neither_mitsuba_nor_torch_nor_redis_for_its_help() -> None:
     code = (
-        "import sys; from photonfarm.shared.cli import main\n"
+        "import sys; from photonfarm.shared.cli.main import main\n"
         "try: main(['store', 'upgrade', '--help'])\n"
         "except SystemExit: pass\n"
         "assert not {'mitsuba', 'drjit', 'torch', 'zarr', 'rq'} & sys.modules.keys(), sys.modules.keys()"

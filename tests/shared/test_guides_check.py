@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared import cli
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Guides
-from photonfarm.shared.scene import GuideSpec
+from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.core.records import Guides
+from photonfarm.shared.farm.upgrade import upgrade
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.commit import RowWriter
-from photonfarm.shared.store.declarations import GUIDES
-from photonfarm.shared.store.guides import GuideWriter
-from photonfarm.shared.upgrade import upgrade
+from photonfarm.shared.store.format.declarations import GUIDES
+from photonfarm.shared.store.write.commit import RowWriter
+from photonfarm.shared.store.write.guides import GuideWriter
 
 samples, checked, found, noted, flip = stores.samples, stores.checked, stores.found, stores.noted, stores.flip
 
@@ -136,7 +136,7 @@ def test_values_that_are_not_finite_and_rows_that_are_not_the_plans_are_found(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No writer of ours stores them. The last job has rows 8 and 9."""
-    monkeypatch.setattr("photonfarm.shared.store.commit._stays_finite", lambda *_: True)
+    monkeypatch.setattr("photonfarm.shared.store.write.commit._stays_finite", lambda *_: True)
     monkeypatch.setattr(RowWriter, "_claim", lambda *_: None)
     monkeypatch.setattr(RowWriter, "_check_complete", lambda _: None)
     monkeypatch.setattr(GuideWriter, "_check_readable", lambda _: None)

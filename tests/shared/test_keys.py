@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from photonfarm.shared import sampling
-from photonfarm.shared.keys import Stream, make_key, seed_of, view_key
+from photonfarm.shared.core.keys import Stream, make_key, seed_of, view_key
+from photonfarm.shared.plan import sampling
 
 
 def test_a_key_is_the_same_on_every_machine_and_in_every_version() -> None:

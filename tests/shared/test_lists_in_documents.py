@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.store.findings import Cause
+from photonfarm.shared.store.write.findings import Cause
 
 ROOT = Path(__file__).parents[2]
 

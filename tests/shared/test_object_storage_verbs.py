@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.store.storage import open_storage
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.store.io.storage import open_storage
 
 
 def test_verbs_take_a_url_and_the_plan_they_write_is_found_again(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +39,7 @@ def test_without_the_library_a_url_is_refused_with_what_to_install() -> None:
     code = """
 import sys
 sys.modules["obstore"] = None
-from photonfarm.shared.cli import main
+from photonfarm.shared.cli.main import main
 main(["status", "--store", "s3://bucket/store"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -13,14 +13,14 @@ import store_samples as samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonfarm.shared import sampling
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.keys import Stream, make_key
-from photonfarm.shared.modification import Modification, rest, sample_modification
-from photonfarm.shared.plan import MAX_SAMPLES, UNUSED, Known, PlannedRows, Request, expand, sample_key
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.shared.plan import sampling
+from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, Known, PlannedRows, Request, expand, sample_key
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import sample_view
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.view import sample_view
 
 Triple = tuple[bytes, bytes, int]
 
@@ -170,7 +170,7 @@ def test_a_request_larger_than_memory_should_hold_is_refused() -> None:
 def test_racing_submitters_plan_every_sample_exactly_once(store: Store) -> None:
     code = """
 import importlib.util, sys
-from photonfarm.shared.plan import Request
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
 spec = importlib.util.spec_from_file_location("store_samples", sys.argv[1])
 samples = importlib.util.module_from_spec(spec)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.shared.keys import Stream, make_key
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.pointcloud import draw, rebuild, sample_surface
-from photonfarm.shared.records import STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.pointcloud import draw, rebuild, sample_surface
+from photonfarm.shared.scene.spec import SceneSpec
 
 COUNT = 40_000
 

@@ -11,9 +11,9 @@ from rq.job import Callback, Job
 from rq.serializers import JSONSerializer
 from rq.webhook import Webhook
 
-from photonfarm.renderer.jobs import render_shard
+from photonfarm.renderer.jobs.render import render_shard
 from photonfarm.shared import queue
-from photonfarm.shared.errors import IncompleteError, QueueError
+from photonfarm.shared.core.errors import IncompleteError, QueueError
 from photonfarm.shared.queue import FUNCTION, QUEUE, RenderArguments, RenderJob, open_queue
 
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
@@ -44,7 +44,7 @@ def test_a_job_is_what_its_name_tells(connection: redis.Redis) -> None:
     assert_is_ours(stored(connection, kwargs=KWARGS))
 
 
-@pytest.mark.parametrize("function", ["os.system", "photonfarm.renderer.jobs.serve", "builtins.eval"])
+@pytest.mark.parametrize("function", ["os.system", "photonfarm.renderer.jobs.render.serve", "builtins.eval"])
 def test_another_function_in_redis_is_not_looked_at(connection: redis.Redis, function: str) -> None:
     assert_is_ours(stored(connection, function, args=["true"], kwargs={"command": "true"}))
 

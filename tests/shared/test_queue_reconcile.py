@@ -16,8 +16,9 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from photonfarm.shared import queue
-from photonfarm.shared.errors import QueueError
-from photonfarm.shared.plan import Request
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import (
     FUNCTION,
     QUEUE_LIMIT,
@@ -29,7 +30,6 @@ from photonfarm.shared.queue import (
     reconcile,
     reconciliation,
 )
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene

@@ -16,10 +16,11 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from photonfarm.shared import queue, submission
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.farm import submission
+from photonfarm.shared.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.queue import connect, open_queue, queue_status, reconcile, with_password_of
-from photonfarm.shared.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene

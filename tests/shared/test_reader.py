@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import arrays_of
-from photonfarm.shared.store import SceneReader, SceneStore, Store, reader
-from photonfarm.shared.store.batch import Batch
+from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.read import reader
+from photonfarm.shared.store.read.batch import Batch
 
 WIDE = (5, 6)  # rows with a value beyond float16
 BRIGHT = np.float32(1e9)

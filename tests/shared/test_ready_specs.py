@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import BUILTIN_ROOMS, SCENES_VARIABLE, Emitters, Light, load_spec
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import BUILTIN_ROOMS, SCENES_VARIABLE, Emitters, Light, load_spec
 
 ROOT = Path(__file__).parents[2]
 READY = sorted((ROOT / "scenes").glob("*.toml"))

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared import show
-from photonfarm.shared.cli import main
+from photonfarm.shared.cli import show
+from photonfarm.shared.cli.main import main
 from photonfarm.shared.queue import has_password
 
 SECRET = "hunter2"

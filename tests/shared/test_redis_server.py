@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import connect
-from photonfarm.shared.redis_server import EmbeddedRedis
 
 
 def alive(pid: int) -> bool:
@@ -86,7 +86,7 @@ def test_a_folder_that_cannot_be_made_is_a_queue_error(tmp_path: Path) -> None:
 def test_it_does_not_outlive_a_killed_parent_and_its_folder_can_be_used_again(tmp_path: Path) -> None:
     code = """
 import sys, time
-from photonfarm.shared.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 with EmbeddedRedis(sys.argv[1]) as server:
     print(server.pid, flush=True)
     time.sleep(60)

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.scene import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec, sentences
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec, sentences
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>

@@ -9,8 +9,8 @@ import pytest
 import redis
 
 from photonfarm.shared import queue
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import connect
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import Store
 
 

@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.settings import file_defaults
+from photonfarm.shared.cli.settings import file_defaults
+from photonfarm.shared.core.errors import SpecError
 
 OPTIONS = {"work": {"store": "store", "redis": "redis_url"}, "train": {"store": "store", "steps": "max_steps"}}
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.errors import IncompleteError, StoreError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.core.errors import IncompleteError, StoreError
+from photonfarm.shared.core.records import ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 
 scene, reader_of = samples.scene, samples.reader_of

@@ -8,11 +8,12 @@ import checked_store as stores
 import numpy as np
 import pytest
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import ViewBuffers
-from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store, repeated_seeds
-from photonfarm.shared.store.check import StoreReport, said
-from photonfarm.shared.view import Camera
+from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.view import Camera
+from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store
+from photonfarm.shared.store.check import repeated_seeds
+from photonfarm.shared.store.check.check import StoreReport, said
 
 scene = stores.scene
 samples, outputs, checked, found = stores.samples, stores.outputs, stores.checked, stores.found

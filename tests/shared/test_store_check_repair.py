@@ -14,9 +14,10 @@ import checked_store as stores
 import numpy as np
 import pytest
 
-from photonfarm.shared.plan import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store, check
-from photonfarm.shared.store.quarantine import Quarantine
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.check import check
+from photonfarm.shared.store.write.quarantine import Quarantine
 
 scene, outputs = stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data
@@ -51,7 +52,7 @@ def test_repair_sets_damaged_jobs_aside_with_a_record_and_rendering_them_again_g
 def test_workers_render_again_what_a_repair_has_set_aside_bit_for_bit_and_with_it_the_base(
     store: Store, analytic: ModuleType
 ) -> None:
-    from photonfarm.renderer.jobs import ShardRenderer
+    from photonfarm.renderer.jobs.render import ShardRenderer
 
     scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=8), shard_rows=4).scene_id)
     worker = ShardRenderer(store, worker="worker", load=analytic.AnalyticScene.load)
@@ -180,9 +181,8 @@ def test_two_repairs_at_once_set_each_job_aside_once(store: Store, scene: SceneS
     clean = data(scene)
     for job in range(3):
         flip(shard(scene, "depth", job), 20)
-    code = (
-        "import sys; from photonfarm.shared.store import Store; from photonfarm.shared.store.check import check_store\n"
-    )
+    code = "import sys; from photonfarm.shared.store import Store\n"
+    code += "from photonfarm.shared.store.check.check import check_store\n"
     code += "check_store(Store(sys.argv[1]), when='then', repair=True)"
     both = [subprocess.Popen([sys.executable, "-c", code, str(store.root)]) for _ in range(2)]
     assert [process.wait(60) for process in both] == [0, 0]

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.errors import CorruptError
-from photonfarm.shared.plan import Request
+from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 

@@ -11,15 +11,15 @@ import store_samples as samples
 import zarr
 from click.testing import CliRunner
 
-from photonfarm.shared import cli
-from photonfarm.shared.errors import SpecError, StoreError
-from photonfarm.shared.plan import PlannedRows, Request
-from photonfarm.shared.scene import GuideSpec
-from photonfarm.shared.show_store import commands
+from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.show_store import commands
+from photonfarm.shared.core.errors import SpecError, StoreError
+from photonfarm.shared.plan.request import PlannedRows, Request
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.find import Matches, Query, find_samples, scene_named
-from photonfarm.shared.store.plans import StoredPlan
-from photonfarm.shared.store.schema import guide_arrays
+from photonfarm.shared.store.format.schema import guide_arrays
+from photonfarm.shared.store.read.find import Matches, Query, find_samples, scene_named
+from photonfarm.shared.store.write.plans import StoredPlan
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 import store_samples as samples
 import zarr
 
-from photonfarm.shared.plan import Request
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.errors import CorruptError, StoreError
-from photonfarm.shared.plan import Request
+from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
 
 scene, reader_of = samples.scene, samples.reader_of

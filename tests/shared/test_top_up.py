@@ -11,13 +11,13 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.hold_out import are_held_out
-from photonfarm.shared.plan import MAX_SAMPLES, Request, sample_key
-from photonfarm.shared.scene import load_spec
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.request import MAX_SAMPLES, Request, sample_key
+from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.top_up import TopUp, spp_per_pass
 
 SPP = 8  # of a pass of the small spec: two halves of half_spp = 4
 
@@ -141,7 +141,7 @@ def test_racing_top_ups_plan_no_pass_twice_and_leave_none_out(scene: SceneStore)
     code = """
 import sys
 from photonfarm.shared.store import Store
-from photonfarm.shared.top_up import TopUp
+from photonfarm.shared.plan.top_up import TopUp
 scene = Store(sys.argv[1]).scene(sys.argv[2])
 sys.stdin.readline()
 for spp in ("+8", "40", "+8", "40", "+8", "40", "40"):

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import store_samples as samples
 
-from photonfarm.shared import up
-from photonfarm.shared.plan import Request
+from photonfarm.shared.farm import up
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import Store
-from photonfarm.shared.top_up import TopUp
 
 
 def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path) -> None:

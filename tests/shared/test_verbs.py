@@ -6,8 +6,8 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.shared import verbs
-from photonfarm.shared.cli import umbrella
+from photonfarm.shared.cli import verbs
+from photonfarm.shared.cli.main import umbrella
 
 
 @click.command()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.shared.keys import make_key
-from photonfarm.shared.scene import SceneSpec, parse_spec
-from photonfarm.shared.view import Camera, View, sample_view
+from photonfarm.shared.core.keys import make_key
+from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+from photonfarm.shared.scene.view import Camera, View, sample_view
 
 COUNT = 4000
 

@@ -10,12 +10,12 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.keys import Stream, make_key
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.pointcloud import rebuild, sample_surface
-from photonfarm.shared.records import F32, STATIC, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.view import Camera, View
+from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild, sample_surface
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import Camera, View
 
 CUBE_HALF = 0.3
 CUBE_REST = np.array([0.0, -0.7, 0.0])

@@ -8,10 +8,8 @@ import numpy as np
 from analytic_room import analytic_base, render, sees, trace, visibility
 from numpy.typing import NDArray
 
-from photonfarm.shared.keys import Key, make_key
-from photonfarm.shared.modification import Modification, sample_modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import (
+from photonfarm.shared.core.keys import Key, make_key
+from photonfarm.shared.core.records import (
     F32,
     LIT_POINTS,
     BasePointCloud,
@@ -21,9 +19,11 @@ from photonfarm.shared.records import (
     ViewBuffers,
     Visibility,
 )
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.shared.store import Figures, SceneStore
-from photonfarm.shared.view import View, sample_view
 
 
 @dataclass(frozen=True)

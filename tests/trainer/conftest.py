@@ -10,10 +10,10 @@ import torch
 from analytic_room import analytic_base, analytic_spec
 from analytic_room_samples import AnalyticSource, ScarceSource, commit_job
 
-from photonfarm.shared.records import BasePointCloud, Geometry
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 
 
 @pytest.fixture(autouse=True)

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.trainer.dataset import SampleSource
-from photonfarm.trainer.evaluation import batches, measure, network_predictor
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.report.gauges import Gauges
-from photonfarm.trainer.settings import MOST_HELD_OUT
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.data.dataset import SampleSource
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.predict.evaluation import batches, measure, network_predictor
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.report.baselines import Gauges
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import connect, consumed_samples, serve
-from photonfarm.shared.redis_server import EmbeddedRedis
 from photonfarm.shared.store import Store
-from photonfarm.trainer import service
-from photonfarm.trainer.loop import train
-from photonfarm.trainer.settings import TrainSettings
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.loop import train
 
 SCENE_ID = "0123456789abcdef" * 2
 

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import CorruptError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import ViewBuffers, Visibility
+from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.core.records import ViewBuffers, Visibility
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import Figures, Store
-from photonfarm.shared.store.check import check_store
-from photonfarm.shared.view import Camera
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import CHECKPOINT, train
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.training.loop import train
 
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:

@@ -5,11 +5,12 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.device import described, usable_device
-from photonfarm.trainer.loop import CHECKPOINT, train
-from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.training.loop import train
 
 HAS_CUDA = torch.cuda.is_available()
 

@@ -17,15 +17,16 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
-from photonfarm.shared.plan import Request
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer import distributed as processes
-from photonfarm.trainer.assist import assist
-from photonfarm.trainer.distributed import Ranks, leading, ranks
-from photonfarm.trainer.learner import Learner
-from photonfarm.trainer.loop import CHECKPOINT, METRICS, train
-from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
+from photonfarm.shared.plan.request import Request
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs import distributed as processes
+from photonfarm.trainer.runs.distributed import Ranks, leading, ranks
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.training.assist import assist
+from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.loop import train
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 

@@ -11,24 +11,24 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import IncompleteError, SpecError
-from photonfarm.shared.pictures import display
-from photonfarm.shared.plan import Request
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.pictures import display
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.merge import Merged, merge_view
-from photonfarm.trainer.comparison import COMPARISON, comparison
-from photonfarm.trainer.dataset import kept_count, kept_pixels, rows_held_out
-from photonfarm.trainer.evaluate import EVALUATION, compare
-from photonfarm.trainer.evaluation import TIMED_ROUNDS, WARM_ROUNDS, DevicePredictor, batches, by_turns
-from photonfarm.trainer.evaluation_samples import References
-from photonfarm.trainer.evaluation_table import notes, told
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import train
+from photonfarm.shared.store.read.merge import Merged, merge_view
+from photonfarm.trainer.compare.comparison import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluate import EVALUATION, compare
+from photonfarm.trainer.compare.evaluation_samples import References
+from photonfarm.trainer.compare.evaluation_table import notes, told
+from photonfarm.trainer.data.dataset import kept_count, kept_pixels, rows_held_out
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import find_weights, metric_space, mse
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS, WARM_ROUNDS, DevicePredictor, batches, by_turns
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.training.loop import train
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.trainer.fill_in import LEAST_ALBEDO, REACH, SPREAD, fill_in
 from photonfarm.trainer.networks.inputs import NoisyColour
+from photonfarm.trainer.predict.fill_in import LEAST_ALBEDO, REACH, SPREAD, fill_in
 
 
 def dropped(colour: Tensor, of: int, seed: int = 0) -> NoisyColour:

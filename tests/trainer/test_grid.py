@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.estimate import Estimate
-from photonfarm.shared.plan import Request
-from photonfarm.trainer import checkpoint, grid, service
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.evaluation import HeldOut
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.plan.request import Request
+from photonfarm.trainer import grid
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.grid import Cell, run_grid, table
-from photonfarm.trainer.learner import DivergedError
-from photonfarm.trainer.loop import CHECKPOINT, train
+from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.training.learner import DivergedError
+from photonfarm.trainer.training.loop import train
 
 AXES = {"optimiser": ("adam", "rmsprop"), "learning_rate": (1e-4, 2e-3)}
 

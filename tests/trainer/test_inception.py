@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.shared.errors import SpecError
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.metrics import FIDInceptionV3, InceptionWeights, find_weights, inception_weights, load_inception
 from photonfarm.trainer.metrics.inception import network_input
 

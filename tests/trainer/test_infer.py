@@ -12,20 +12,20 @@ from analytic_room_samples import commit_job
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.shared.camera_path import orbit
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import PhotonfarmError, SpecError, StoreError
-from photonfarm.shared.frames import Frames
-from photonfarm.shared.modification import Modification
-from photonfarm.shared.pictures import display
-from photonfarm.shared.plan import Request
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError
+from photonfarm.shared.core.pictures import display
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.camera_path import orbit
+from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.view import View
-from photonfarm.trainer import animation, infer
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.loop import train
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.predict import animation, infer
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.training.loop import train
 
 
 @pytest.fixture

@@ -18,23 +18,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.renderer import backend
-from photonfarm.renderer.jobs import lit_points, photons_of, visibility_of
-from photonfarm.renderer.scenes import LoadedScene
-from photonfarm.shared.keys import view_key
-from photonfarm.shared.modification import sample_modification
-from photonfarm.shared.pointcloud import rebuild
-from photonfarm.shared.records import F32, BasePointCloud, Geometry, Photons
-from photonfarm.shared.scene import SceneSpec, load_spec
-from photonfarm.shared.view import View, sample_view
-from photonfarm.trainer.dataset import Batch, fill, fill_photons
-from photonfarm.trainer.losses import LOSSES, paired_loss
+from photonfarm.renderer.jobs.render import lit_points, photons_of, visibility_of
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.keys import view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.trainer.data.dataset import Batch, fill, fill_photons
+from photonfarm.trainer.data.store_source import StoredSample
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.optimisers import build_optimiser
-from photonfarm.trainer.settings import Architecture, NetworkSettings, TrainSettings
-from photonfarm.trainer.store_source import StoredSample
+from photonfarm.trainer.runs.settings import Architecture, NetworkSettings, TrainSettings
+from photonfarm.trainer.training.losses import LOSSES, paired_loss
+from photonfarm.trainer.training.optimisers import build_optimiser
 
 SIZE, POINTS = 32, 1024
 K = 336  # noisy targets, of one sample in each half

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
-from photonfarm.trainer.projection import Optics
+from photonfarm.trainer.networks.projection import Optics
 
 POINTS, ALBEDO, SENT = 1024, 0.6, 0.3
 

@@ -12,15 +12,16 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.trainer import biased, service
-from photonfarm.trainer.dataset import Batch, fill
-from photonfarm.trainer.evaluation import network_predictor
-from photonfarm.trainer.loop import train
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.data.dataset import Batch, fill
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.optimisers import build_optimiser, rate_at
-from photonfarm.trainer.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.predict.evaluation import network_predictor
+from photonfarm.trainer.runs import biased
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
 BENCH = Path(__file__).parents[2] / "bench"
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.estimate import Estimate, clean_error, clean_error_having_seen_a
-from photonfarm.trainer.dataset import Batch, kept_pixels, read_into
-from photonfarm.trainer.evaluation import batches, measure
-from photonfarm.trainer.feed import Feed
+from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_having_seen_a
+from photonfarm.trainer.data.dataset import Batch, kept_pixels, read_into
+from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.predict.evaluation import batches, measure
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from photonfarm.shared.scene import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.trainer.networks.summary import Part, summary, table
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 def spec_of(size: int, points: int = 16384) -> SceneSpec:

@@ -9,20 +9,21 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.plan import Request
-from photonfarm.shared.records import Photons, arrays_of
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.records import Photons, arrays_of
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import Batch, read_into
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import CHECKPOINT, train
+from photonfarm.trainer.data.dataset import Batch, read_into
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import Architecture, NetworkSettings
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import Architecture, NetworkSettings
+from photonfarm.trainer.training.loop import train
 
 PHOTONS = ["light_transport_photons", "light_transport_photons, transport"]
 """What the two are made of: gathered in the image, and projected after a layer of their own."""

@@ -7,12 +7,12 @@ import sys
 import numpy as np
 import pytest
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.trainer.evaluation import batches, measure
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.fill_in import fill_in
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.oidn import Oidn
+from photonfarm.trainer.predict.evaluation import batches, measure
+from photonfarm.trainer.predict.fill_in import fill_in
+from photonfarm.trainer.predict.oidn import Oidn
 
 pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
 
@@ -75,7 +75,7 @@ def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
 def test_it_needs_no_mitsuba_and_no_gpu() -> None:
     lines = (
         "import sys, torch",
-        "from photonfarm.trainer.oidn import Oidn",
+        "from photonfarm.trainer.predict.oidn import Oidn",
         "Oidn()",
         "assert not {'mitsuba', 'drjit'} & set(sys.modules)",
         "assert not torch.cuda.is_initialized()",

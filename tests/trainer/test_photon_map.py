@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.view import Camera
-from photonfarm.trainer.dataset import Batch, read_into
+from photonfarm.shared.scene.view import Camera
+from photonfarm.trainer.data.dataset import Batch, read_into
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
-from photonfarm.trainer.projection import Footprint, Optics
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
+from photonfarm.trainer.networks.projection import Footprint, Optics
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 ARCHITECTURE = "light_transport_photons"
 B, H, W, K = 2, 24, 32, 40

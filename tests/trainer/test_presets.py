@@ -8,11 +8,11 @@ import torch
 from click.testing import CliRunner
 from pydantic import ValidationError
 
-from photonfarm.shared.cli import umbrella
-from photonfarm.shared.errors import SpecError
-from photonfarm.trainer import service
-from photonfarm.trainer.losses import paired_loss
-from photonfarm.trainer.settings import PRESETS, TrainSettings, preset, small
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, small
+from photonfarm.trainer.training.losses import paired_loss
 
 
 def test_the_papers_presets_are_what_the_supplement_states() -> None:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.view import Camera, View
-from photonfarm.trainer.dataset import Batch, read_into
-from photonfarm.trainer.light_transport import LightTransportLayer
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.trainer.data.dataset import Batch, read_into
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.projection import Footprint, Optics, footprint, project_mean
-from photonfarm.trainer.settings import NetworkSettings, Occlusion
+from photonfarm.trainer.networks.point_layers import LightTransportLayer
+from photonfarm.trainer.networks.projection import Footprint, Optics, footprint, project_mean
+from photonfarm.trainer.runs.settings import NetworkSettings, Occlusion
 
 W, H, NEAR, FAR = 12, 8, 0.1, 20.0
 

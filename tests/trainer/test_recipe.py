@@ -8,13 +8,15 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.trainer import checkpoint, loop, metrics_log
-from photonfarm.trainer.evaluation import batches
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
-from photonfarm.trainer.optimisers import rate_at
-from photonfarm.trainer.settings import PRESETS, TrainSettings
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.predict.evaluation import batches
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings
+from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.optimisers import rate_at
 
 Weights = dict[str, torch.Tensor]
 

@@ -12,15 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.estimate import Estimate, group_means
-from photonfarm.trainer import checkpoint, loop, metrics_log, service
-from photonfarm.trainer.evaluation import HeldOut
-from photonfarm.trainer.learner import DivergedError
-from photonfarm.trainer.loop import CHECKPOINT, METRICS, train
-from photonfarm.trainer.recovery import GOOD, NEXT
-from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.validation import Best, Validation, compared, validate
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.estimate import Estimate, group_means
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
+from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.learner import DivergedError
+from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.recovery import GOOD, NEXT
+from photonfarm.trainer.training.validation import Best, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""

@@ -17,27 +17,28 @@ from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.frame_costs import PARTS, FrameCosts, Seconds
-from photonfarm.shared.plan import Request
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import Store, store_status
-from photonfarm.shared.store.find import Query
-from photonfarm.shared.store.merge import merge_views
-from photonfarm.shared.top_up import TopUp
-from photonfarm.trainer import checkpoint
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.loop import CHECKPOINT, SETTINGS, train
+from photonfarm.shared.store.read.find import Query
+from photonfarm.shared.store.read.merge import merge_views
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predict.untrained import Untrained
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
 from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.untrained import Untrained
-from photonfarm.trainer.waits import bottleneck
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
+from photonfarm.trainer.runs.wait_times import bottleneck
+from photonfarm.trainer.training.loop import train
 
 
 def write_report(store, run, out, **asked):

@@ -15,15 +15,16 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.plan import Request
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
-from photonfarm.trainer import checkpoint, metrics_log
-from photonfarm.trainer.following import Growth
-from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
-from photonfarm.trainer.recovery import GOOD, NEXT
-from photonfarm.trainer.sampler import RoundSampler
-from photonfarm.trainer.store_source import StoreSource
+from photonfarm.trainer.data.growth import Growth
+from photonfarm.trainer.data.sampler import RoundSampler
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
+from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.recovery import GOOD, NEXT
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 

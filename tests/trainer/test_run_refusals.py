@@ -7,12 +7,15 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.trainer import checkpoint, cli, metrics_log, service
-from photonfarm.trainer.loop import CHECKPOINT, INITIAL, METRICS, train
-from photonfarm.trainer.run_folder import held
-from photonfarm.trainer.settings import NetworkSettings
-from photonfarm.trainer.trained import TrainedRun, read_settings
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.cli import train_verb as cli
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, held
+from photonfarm.trainer.runs.run_settings import read_settings
+from photonfarm.trainer.runs.settings import NetworkSettings
+from photonfarm.trainer.training.loop import train
 
 
 def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:

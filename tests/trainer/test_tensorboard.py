@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.trainer import loop, metrics_log
-from photonfarm.trainer import tensorboard as boards
-from photonfarm.trainer.loop import METRICS, train
+from photonfarm.trainer.runs import metrics_log
+from photonfarm.trainer.runs import tensorboard as boards
+from photonfarm.trainer.runs.run_folder import METRICS
+from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.loop import train
 
 pytest.importorskip("tensorboard", reason="TensorBoard is an optional extra")
 

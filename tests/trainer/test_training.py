@@ -12,14 +12,17 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.scene import load_spec
-from photonfarm.trainer import checkpoint, loop, metrics_log, service
-from photonfarm.trainer.dataset import rows_held_out
-from photonfarm.trainer.device import described, usable_device
-from photonfarm.trainer.following import Growth
-from photonfarm.trainer.learner import DivergedError
-from photonfarm.trainer.loop import CHECKPOINT, METRICS, stop_on_signals, train
-from photonfarm.trainer.settings import NetworkSettings, small
+from photonfarm.shared.scene.spec import load_spec
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer.data.growth import Growth
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
+from photonfarm.trainer.runs.settings import NetworkSettings, small
+from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.learner import DivergedError
+from photonfarm.trainer.training.loop import stop_on_signals, train
 
 
 def weights(run) -> dict[str, torch.Tensor]:

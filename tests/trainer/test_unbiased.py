@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.estimate import Estimate, clean_error, group_means, noise_floor
-from photonfarm.trainer.losses import LOSSES, linear_loss
+from photonfarm.shared.core.estimate import Estimate, clean_error, group_means, noise_floor
+from photonfarm.trainer.training.losses import LOSSES, linear_loss
 
 
 def test_the_relative_loss_is_least_at_the_mean_of_the_noisy_targets() -> None:

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.trainer import checkpoint, metrics_log, service
-from photonfarm.trainer.loop import METRICS, train
-from photonfarm.trainer.waits import Stopwatch, bottleneck, samples_per_used, stated, waits
+from photonfarm.trainer.cli import service
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.run_folder import METRICS
+from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, waits
+from photonfarm.trainer.training.loop import train
 
 BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
 

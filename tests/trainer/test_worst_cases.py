@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonfarm.shared.frame_costs import Surface
-from photonfarm.shared.records import ViewBuffers
+from photonfarm.shared.core.frame_costs import Surface
+from photonfarm.shared.core.records import ViewBuffers
 from photonfarm.trainer.report.worst_cases import View, kinds, shadow_edges, squared_error, worst_cases
 
 SIZE = 16

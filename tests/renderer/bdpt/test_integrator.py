@@ -11,7 +11,7 @@ import pytest
 
 from photonfarm.renderer import bdpt
 from photonfarm.renderer.bdpt import emission, variant
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 SIZE = 16
 

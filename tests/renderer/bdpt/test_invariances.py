@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt import launches
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES
-from photonfarm.renderer.stability.invariances import COUNTS, Check, checks
+from photonfarm.renderer.verify.invariances import COUNTS, Check, checks
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
 SLOW = ("seed-many-lights", "counts-many-lights", "counts-plastics")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from photonfarm.renderer.stability import weight_check
-from photonfarm.renderer.stability.case import Settings
-from photonfarm.renderer.stability.oracle import F64
-from photonfarm.renderer.stability.weight_check import SCENES, compare_weights
+from photonfarm.renderer.verify.scenes.case import Settings
+from photonfarm.renderer.verify.weights import weight_check
+from photonfarm.renderer.verify.weights.oracle import F64
+from photonfarm.renderer.verify.weights.weight_check import SCENES, compare_weights
 
 LANES = 256
 

@@ -12,7 +12,7 @@ from scipy import stats
 
 from photonfarm.renderer.bdpt import selection
 from photonfarm.renderer.bdpt.emission import read_lights
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
 
 SIGNIFICANCE = 1e-5  # of each test over all its comparisons; the seeds are fixed
 CELLS = selection.CELLS**3

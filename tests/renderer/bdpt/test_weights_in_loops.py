@@ -14,12 +14,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.bdpt import eye_paths, hard_scenes, light_paths, weights
+from photonfarm.renderer.bdpt import eye_paths, light_paths, weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
 from photonfarm.renderer.bdpt.integrator import connection_count
-from photonfarm.renderer.stability import oracle
-from photonfarm.renderer.stability.joined_paths import Bounce, Joined, Pinhole, stored
+from photonfarm.renderer.verify.scenes import hard_scenes
+from photonfarm.renderer.verify.weights import oracle
+from photonfarm.renderer.verify.weights.joined_paths import Bounce, Joined, Pinhole, stored
 
 EDGES, SIZE, SPP = 5, 16, 8
 CONNECTIONS, LIGHT_RATIO = 1, 0.5

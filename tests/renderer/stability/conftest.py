@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from photonfarm.renderer.stability.case import HardScene, Refusal
-from photonfarm.renderer.stability.pictures import keep
-from photonfarm.renderer.stability.report import FAILURES
-from photonfarm.renderer.stability.rows import REFUSALS, ROWS, SCENES
-from photonfarm.renderer.stability.runner import message_of, run
+from photonfarm.renderer.verify.pictures import keep
+from photonfarm.renderer.verify.report import FAILURES
+from photonfarm.renderer.verify.rows import REFUSALS, ROWS, SCENES
+from photonfarm.renderer.verify.runner import message_of, run
+from photonfarm.renderer.verify.scenes.case import HardScene, Refusal
 
 SLOW = ("18-mask-veils", "25-hundred-lights-at-once")
 QUICK = [scene for scene in SCENES if scene.quick is not None]

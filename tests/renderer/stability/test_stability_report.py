@@ -10,11 +10,11 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.renderer.cli import report_stability
-from photonfarm.renderer.stability import report, rows
-from photonfarm.renderer.stability.case import Settings
-from photonfarm.renderer.stability.pictures import FULL_Z, SIDE, of_z, sheet
-from photonfarm.renderer.stability.runner import Result, plus_minus, run
-from photonfarm.renderer.stability.truths import known
+from photonfarm.renderer.verify import report, rows
+from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
+from photonfarm.renderer.verify.runner import Result, plus_minus, run
+from photonfarm.renderer.verify.scenes.case import Settings
+from photonfarm.renderer.verify.scenes.truths import known
 
 
 def call(tmp_path: Path, *arguments: str) -> Any:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.stability import runner
-from photonfarm.renderer.stability.case import FIRST, QUICK, Settings
-from photonfarm.renderer.stability.rows import SCENES
-from photonfarm.renderer.stability.runner import Outcome, compare, run, seen_bias
-from photonfarm.renderer.stability.truths import rendered
+from photonfarm.renderer.verify import runner
+from photonfarm.renderer.verify.rows import SCENES
+from photonfarm.renderer.verify.runner import Outcome, compare, run, seen_bias
+from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, Settings
+from photonfarm.renderer.verify.scenes.truths import rendered
 
 
 def scene(label: str) -> Any:

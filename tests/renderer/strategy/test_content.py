@@ -3,15 +3,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy import content, light_reach  # noqa: E402
 from photonfarm.renderer.strategy.candidate import PLAIN  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID  # noqa: E402
-from photonfarm.shared.scene import Box, PhotonSpec, ViewSpec  # noqa: E402
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
+from photonfarm.shared.scene.spec import Box, PhotonSpec, ViewSpec  # noqa: E402
 
 MIRROR = {"type": "sphere", "bsdf": {"type": "conductor"}}
 BULB = {"type": "point", "intensity": {"type": "rgb", "value": 1.0}}

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.noise import Tally, missed
-from photonfarm.shared.records import F32
+from photonfarm.shared.core.records import F32
 
 SIDE, CANDIDATES, CONNECTED = 64, 6, 0.15
 WEIGHTS = np.ones((SIDE, SIDE, 3), np.float32)

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.bdpt.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render  # noqa: E402
 from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
-from photonfarm.shared.statistics import block_z_test  # noqa: E402
+from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
+from photonfarm.shared.core.statistics import block_z_test  # noqa: E402
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
 CANDIDATES = [PLAIN, LIGHT, JOINED]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer import backend
+from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)
 
@@ -15,11 +15,11 @@ from photonfarm.renderer.strategy import cache, plan  # noqa: E402 - after the v
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.comparison import Errors  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, Measurement, Row  # noqa: E402
+from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
 from photonfarm.renderer.strategy.plan import Plan, _knows, plan_of  # noqa: E402
-from photonfarm.renderer.strategy.printed import lines  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
-from photonfarm.shared.cli import main  # noqa: E402
-from photonfarm.shared.scene import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
+from photonfarm.shared.cli.main import main  # noqa: E402
+from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
 
 SPEC = """
 name = "small-box"  # the box

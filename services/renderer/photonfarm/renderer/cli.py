@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli import json_option, redis_option, store_option
+from photonfarm.shared.cli.options import json_option, redis_option, store_option
 
 
 @click.command()
@@ -20,8 +20,8 @@ from photonfarm.shared.cli import json_option, redis_option, store_option
 @json_option
 def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Try each part on this machine, and say what to do about what does not work."""
-    from photonfarm.renderer.doctor import examine
-    from photonfarm.shared import show
+    from photonfarm.renderer.tools.doctor import examine
+    from photonfarm.shared.cli import show
 
     sys.exit(show.findings(examine(store, redis_url), as_json))
 
@@ -76,7 +76,7 @@ def work(
     A store that does not exist is waited for; --until-complete ends with exit code 4 then. One Redis serves one store.
     Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.
     """
-    from photonfarm.renderer import worker
+    from photonfarm.renderer.worker import worker
 
     if check:
         worker.check(redis_url)
@@ -96,9 +96,9 @@ def work(
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
 def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
     """Write a contact sheet of SPEC's samples: A, B, albedo, normal, depth, photons."""
-    from photonfarm.renderer.preview import write_contact_sheet
-    from photonfarm.shared.scene import load_spec
-    from photonfarm.shared.store.reader import SceneReader
+    from photonfarm.renderer.tools.preview import write_contact_sheet
+    from photonfarm.shared.scene.spec import load_spec
+    from photonfarm.shared.store.read.reader import SceneReader
 
     write_contact_sheet(SceneReader(store, load_spec(spec).scene_id), count, out)
     click.echo(out)
@@ -126,8 +126,8 @@ def buffers(
 
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
     """
-    from photonfarm.renderer.path_buffers import write_buffers
-    from photonfarm.shared.camera_path import CameraPath
+    from photonfarm.renderer.jobs.path_buffers import write_buffers
+    from photonfarm.shared.scene.camera_path import CameraPath
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")
@@ -160,10 +160,10 @@ def measure_frames(
 
     Nothing is written to the store. Rows of at least two configurations make edits what they are between samples.
     """
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
-    from photonfarm.renderer.frame_costs import write_frame_costs
+    from photonfarm.renderer.measure.frame_costs import write_frame_costs
 
     costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
     parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
@@ -185,14 +185,14 @@ def measure_frames(
 @json_option
 def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
-    from photonfarm.renderer import backend
-    from photonfarm.shared.scene import find_spec, load_spec
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.strategy import spec_file
+    from photonfarm.renderer.strategy.output import spec_file
+    from photonfarm.renderer.strategy.output.printed import lines
     from photonfarm.renderer.strategy.plan import make_plan
-    from photonfarm.renderer.strategy.printed import lines
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     plan = make_plan(loaded, file.parent, seconds=seconds, again=again, talk=partial(click.echo, err=True))
@@ -216,12 +216,12 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
     Half a minute for a small room, minutes for a large one. `configuration` is taken by each configuration, `view` by
     each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
     """
-    from photonfarm.renderer import backend
-    from photonfarm.shared.scene import find_spec, load_spec
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.sample_costs import find_or_measure
+    from photonfarm.renderer.measure.sample_costs import find_or_measure
 
     talk = partial(click.echo, err=True)
     costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, talk=talk)
@@ -240,12 +240,12 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 
     How far views differ in brightness decides how well it is known; more of them help.
     """
-    from photonfarm.renderer import backend
-    from photonfarm.shared.scene import find_spec, load_spec
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.exposure import propose
+    from photonfarm.renderer.measure.exposure import propose
 
     talk = partial(click.echo, err=True)
     found = propose(loaded, find_spec(spec).parent, talk, target=target, frames=frames)
@@ -261,10 +261,10 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
               help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
 def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
     """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
-    from photonfarm.renderer import backend
+    from photonfarm.renderer.scene import backend
 
     backend.load(threads)
-    from photonfarm.renderer.stability import report, rows
+    from photonfarm.renderer.verify import report, rows
 
     try:
         scenes = rows.chosen(only, quick=quick)

@@ -19,21 +19,20 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from photonfarm.shared.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.estimate import Estimate, group_means, stated
-from photonfarm.shared.keys import Key, make_key
-from photonfarm.shared.processes import Stop
-from photonfarm.shared.scene import sentences
-from photonfarm.shared.store import store_errors
-from photonfarm.trainer.dataset import SampleSource, rows_held_out, units_of
-from photonfarm.trainer.evaluation import HeldOut, batches, measure
-from photonfarm.trainer.feed import Feed
-from photonfarm.trainer.learner import DivergedError
-from photonfarm.trainer.loop import train
-from photonfarm.trainer.markdown import markdown_table
-from photonfarm.trainer.run_folder import held
-from photonfarm.trainer.settings import MOST_HELD_OUT, TrainSettings
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.estimate import Estimate, group_means, stated
+from photonfarm.shared.core.keys import Key, make_key
+from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.scene.spec import sentences
+from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.predict.evaluation import HeldOut, batches, measure
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import held
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings
+from photonfarm.trainer.training.learner import DivergedError
+from photonfarm.trainer.training.loop import train
 
 Axes = Mapping[str, Sequence[Any]]
 """The values that each key of the settings takes."""

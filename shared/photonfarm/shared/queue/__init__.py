@@ -34,7 +34,7 @@ from photonfarm.shared.queue.failures import (
     repeating_command,
 )
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
-from photonfarm.shared.queue.held_up import HeldUp, forget_held_up, tell_held_up
+from photonfarm.shared.queue.idle_workers import HeldUp, forget_held_up, tell_held_up
 from photonfarm.shared.queue.job import (
     FUNCTION,
     OVERDUE,
@@ -48,7 +48,7 @@ from photonfarm.shared.queue.job import (
     take,
 )
 from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
-from photonfarm.shared.queue.served import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
 
 __all__ = [
     "ALIVE",

@@ -10,7 +10,7 @@ from redis import Redis
 from redis.backoff import ExponentialBackoff, NoBackoff
 from redis.retry import Retry
 
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared.core.errors import QueueError
 
 SOCKET_TIMEOUT_S = 30
 PASSWORD_VARIABLE = "PHOTONFARM_REDIS_PASSWORD_FILE"  # noqa: S105 - the name of a variable

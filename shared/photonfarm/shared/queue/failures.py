@@ -14,7 +14,7 @@ from pathlib import Path
 
 from redis import Redis
 
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.job import FAILURE_TTL_S, OVERDUE, STARTS, RenderArguments
 from photonfarm.shared.queue.untrusted import batches, beginnings, names_below, printable, remove_others
 

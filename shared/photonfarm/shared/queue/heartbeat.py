@@ -8,7 +8,7 @@ from itertools import count
 
 from redis import Redis
 
-from photonfarm.shared.processes import process_space
+from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.queue.untrusted import beginnings, names_below, remove_lasting
 
 ALIVE = "alive:"

@@ -19,12 +19,12 @@ from rq.serializers import JSONSerializer
 from rq.utils import as_text, import_attribute, now
 from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
-from photonfarm.shared.errors import IncompleteError, QueueError
+from photonfarm.shared.core.errors import IncompleteError, QueueError
 from photonfarm.shared.queue.untrusted import remove_others
-from photonfarm.shared.scene import Frozen, sentences
+from photonfarm.shared.scene.spec import Frozen, sentences
 
 QUEUE = "photonfarm"
-FUNCTION = "photonfarm.renderer.jobs.render_shard"
+FUNCTION = "photonfarm.renderer.jobs.render.render_shard"
 """The one function that a job runs; a string, since whoever submits needs no renderer."""
 
 FAILURE_TTL_S = 3600

@@ -15,10 +15,10 @@ from rq import Queue
 from rq.job import Job
 from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
-from photonfarm.shared.errors import QueueError
+from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
-from photonfarm.shared.queue.held_up import HeldUp, read_held_up
+from photonfarm.shared.queue.idle_workers import HeldUp, read_held_up
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
@@ -33,7 +33,7 @@ from photonfarm.shared.queue.job import (
     running_names,
     taken_names,
 )
-from photonfarm.shared.queue.served import serve
+from photonfarm.shared.queue.served_store import serve
 from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
 from photonfarm.shared.store import SceneStore, Store
 

@@ -14,11 +14,11 @@ errors raised while rendering (a ValueError that says what is refused) in a Runt
 …)`` raises them as they are.
 """
 
-from .variant import require_variant
+from photonfarm.renderer.bdpt.variant import require_variant
 
 require_variant()
 
-from .integrator import BidirectionalPathTracer  # noqa: E402
-from .photons import Photons, trace_photons  # noqa: E402
+from photonfarm.renderer.bdpt.integrator import BidirectionalPathTracer  # noqa: E402
+from photonfarm.renderer.bdpt.photons import Photons, trace_photons  # noqa: E402
 
 __all__ = ["BidirectionalPathTracer", "Photons", "trace_photons"]

@@ -25,8 +25,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .randomness import along_curve
-from .selection import Selection, read_selection
+from photonfarm.renderer.bdpt.randomness import along_curve
+from photonfarm.renderer.bdpt.selection import Selection, read_selection
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
 """How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""

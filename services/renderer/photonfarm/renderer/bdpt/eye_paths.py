@@ -12,12 +12,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import weights
-from .camera import EyeStart
-from .emission import Lights, hit_densities, sample_direct
-from .light_paths import LightVertices, PathOptions
-from .loops import traced_once
-from .randomness import SHIFTS
+from photonfarm.renderer.bdpt import weights
+from photonfarm.renderer.bdpt.camera import EyeStart
+from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
+from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.bdpt.randomness import SHIFTS
 
 _MAX_THROUGHPUT_KEPT = 0.95
 _NEAR_VERTICES = 2

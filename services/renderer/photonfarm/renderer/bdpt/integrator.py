@@ -8,15 +8,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import randomness
-from .camera import check_sensor, primary_rays
-from .emission import Lights, read_lights
-from .eye_paths import Connectable, trace_eye_paths
-from .film import Images, Splat
-from .launches import Lanes, Launch, launches
-from .light_paths import PathOptions, trace_light_paths
-from .recording import Recorder
-from .scenes import UNBOUNDED, check_scene, depth_limit
+from photonfarm.renderer.bdpt import randomness
+from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
+from photonfarm.renderer.bdpt.emission import Lights, read_lights
+from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
+from photonfarm.renderer.bdpt.film import Images, Splat
+from photonfarm.renderer.bdpt.launches import Lanes, Launch, launches
+from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
+from photonfarm.renderer.bdpt.recording import Recorder
+from photonfarm.renderer.bdpt.scenes import UNBOUNDED, check_scene, depth_limit
 
 
 class BidirectionalPathTracer(mi.SamplingIntegrator):

@@ -21,12 +21,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import weights
-from .camera import sample_sensor
-from .emission import AREA, Emission, Lights, sample_emission
-from .film import Splat
-from .loops import traced_once
-from .randomness import Sampler
+from photonfarm.renderer.bdpt import weights
+from photonfarm.renderer.bdpt.camera import sample_sensor
+from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
+from photonfarm.renderer.bdpt.film import Splat
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.bdpt.randomness import Sampler
 
 _MAX_THROUGHPUT_KEPT = 0.95
 

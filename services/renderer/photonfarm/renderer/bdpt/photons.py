@@ -11,12 +11,12 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from . import randomness
-from .emission import Lights, read_lights, sample_emission
-from .light_paths import LightState, PathOptions, first_state, scatter
-from .loops import traced_once
-from .recording import Recorder
-from .scenes import check_scene
+from photonfarm.renderer.bdpt import randomness
+from photonfarm.renderer.bdpt.emission import Lights, read_lights, sample_emission
+from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.bdpt.recording import Recorder
+from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
 

@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .launches import Launch
+from photonfarm.renderer.bdpt.launches import Launch
 
 LIGHT, EYE, PAIRING, PHOTONS = range(4)
 

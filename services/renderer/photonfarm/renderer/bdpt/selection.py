@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import randomness
+from photonfarm.renderer.bdpt import randomness
 
 CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from photonfarm.renderer.jobs import versions
+from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.strategy.measurement import GRID, Measurement
-from photonfarm.shared.keys import make_key
-from photonfarm.shared.scene import PhotonSpec, SceneSpec, Transport
+from photonfarm.shared.core.keys import make_key
+from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
 
 _DECIDED = ("connections", "light_ratio", "half_spp")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from photonfarm.shared.records import F32
+from photonfarm.shared.core.records import F32
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.scene import PhotonSpec, ViewSpec
+from photonfarm.shared.scene.spec import PhotonSpec, ViewSpec
 
 PATHS = 4096
 DEPTH = 16

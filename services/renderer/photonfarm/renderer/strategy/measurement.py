@@ -13,9 +13,9 @@ from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
 from photonfarm.renderer.strategy.comparison import Errors, Measured
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
+from photonfarm.renderer.strategy.pilot_scene import SEED, Stage
 from photonfarm.renderer.strategy.rounds import SCOUTS
-from photonfarm.renderer.strategy.stage import SEED, Stage
-from photonfarm.shared.scene import Film, Frozen, SceneSpec
+from photonfarm.shared.scene.spec import Film, Frozen, SceneSpec
 
 GRID = tuple(
     Candidate(c, r)

@@ -56,8 +56,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.records import F32
-from photonfarm.shared.statistics import block_means
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import block_means
 
 EPSILON = 0.01
 BLOCKS = (1, 4, 16)

@@ -9,10 +9,10 @@ from typing import Any
 
 from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
+from photonfarm.renderer.strategy.choices import Offer, offers, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Measurement, Talk, measure, present
-from photonfarm.renderer.strategy.offers import Offer, offers, settled
-from photonfarm.shared.scene import PhotonSpec, SceneSpec
+from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
 """Times as long a half-estimate, or as short, to which a measurement is taken to apply: what an image costs whatever

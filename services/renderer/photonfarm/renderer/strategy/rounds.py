@@ -13,7 +13,7 @@ from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import Errors, Measured
 from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
-from photonfarm.shared.records import F32
+from photonfarm.shared.core.records import F32
 
 SCOUTS = 8
 """Images of each view at least that only serve to weight the others."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.estimate import Estimate
+from photonfarm.shared.core.estimate import Estimate
 
 FULL_RANK = 2048
 """Images that FID needs at the least to be compared with published figures [method §4]."""

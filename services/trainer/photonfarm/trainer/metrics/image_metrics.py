@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.shared.estimate import Estimate
-from photonfarm.shared.records import F32
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.records import F32
 from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
 from photonfarm.trainer.metrics.fid import FEWEST, Fid, fid, kid
 from photonfarm.trainer.metrics.flip import flip

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.shared.processes import usable_cores
+from photonfarm.shared.core.processes import usable_cores
 from photonfarm.trainer.metrics.inception_weights import InceptionWeights, find_weights, read_weights
 
 SIDE = 299  # pixels

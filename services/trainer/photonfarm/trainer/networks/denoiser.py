@@ -10,7 +10,7 @@ from torch import Tensor
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 SHARE = 2
 """A light U-Net is half as wide, so about a quarter of the work. Published times fit 1.50 s / k + 0.005 s, where the

@@ -10,7 +10,7 @@ from torch import Tensor
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 class FeatureProjection(Network):

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonfarm.shared.records import F32, BasePointCloud, Geometry
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.trainer.projection import Optics
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.networks.projection import Optics
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,8 +19,8 @@ from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, given
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_light import PhotonLight
-from photonfarm.trainer.photon_map import WINDOWS
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.networks.photon_map import WINDOWS
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 GUIDE_CHANNELS = 27
 """Beside view ray 3, depth 1, albedo 3 and normal 3: emission, direct light, gloss, specular, mean normal, throughput,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from photonfarm.shared.scene import SceneSpec
-from photonfarm.shared.store.schema import guide_arrays
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store.format.schema import guide_arrays
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -8,13 +8,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from photonfarm.trainer.light_transport import WIDTH, LightTransportLayer
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
 from photonfarm.trainer.networks.photon_light import PhotonLight
-from photonfarm.trainer.photon_map import WINDOWS
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.networks.photon_map import WINDOWS
+from photonfarm.trainer.networks.point_layers import WIDTH, LightTransportLayer
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 PHOTON_NUMBERS = 10
 """Of each photon, beside its coordinates: direction 3, normal 3, power 3, bounce 1."""

@@ -10,11 +10,11 @@ import math
 import torch
 from torch import Tensor, nn
 
-from photonfarm.trainer.image_synthesis import ImageSynthesisLayer
 from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.image_synthesis import ImageSynthesisLayer
 from photonfarm.trainer.networks.inputs import Inputs
-from photonfarm.trainer.projection import footprint, project_mean
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.networks.projection import footprint, project_mean
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 IMAGE_CHANNELS = 10
 """View ray 3, depth 1, albedo 3, normal 3 [supplement 1.3]."""

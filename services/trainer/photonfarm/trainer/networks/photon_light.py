@@ -9,11 +9,11 @@ import math
 
 from torch import Tensor
 
-from photonfarm.shared.errors import SpecError
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
-from photonfarm.trainer.photon_map import arrives_on_seen_side, gathered, seen_area
-from photonfarm.trainer.projection import footprint
+from photonfarm.trainer.networks.photon_map import arrives_on_seen_side, gathered, seen_area
+from photonfarm.trainer.networks.projection import footprint
 
 
 class PhotonLight:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.projection import Optics
-from photonfarm.trainer.settings import NetworkSettings
+from photonfarm.trainer.networks.projection import Optics
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 MODULES = {
     "light_transport": "point branch",

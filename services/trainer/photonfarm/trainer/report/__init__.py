@@ -11,17 +11,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.store import store_errors
-from photonfarm.trainer.animation import write_png
-from photonfarm.trainer.comparison import COMPARISON, comparison
-from photonfarm.trainer.evaluate import Tell
+from photonfarm.shared.core.errors import store_errors
+from photonfarm.trainer.compare.comparison import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluate import Tell
+from photonfarm.trainer.predict.animation import write_png
+from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.markdown_page import markdown
 from photonfarm.trainer.report.page import page
 from photonfarm.trainer.report.pictures import OVERVIEW, overview
 from photonfarm.trainer.report.plots import plots
-from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
-from photonfarm.trainer.trained import TrainedRun
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 def write_report(

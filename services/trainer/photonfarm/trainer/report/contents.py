@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.frame_costs import FrameCosts
-from photonfarm.shared.records import F32, ViewBuffers, arrays_of
-from photonfarm.trainer import evaluate
-from photonfarm.trainer.evaluate import Evaluation, Row, Tell
-from photonfarm.trainer.evaluation_samples import Reference
+from photonfarm.shared.core.frame_costs import FrameCosts
+from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
+from photonfarm.trainer.compare import evaluate
+from photonfarm.trainer.compare.evaluate import Evaluation, Row, Tell
+from photonfarm.trainer.compare.evaluation_samples import Reference
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.report.baselines import Gauges
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
-from photonfarm.trainer.report.gauges import Gauges
 from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.report.worst_cases import View, WorstCase, worst_cases
-from photonfarm.trainer.settings import MOST_HELD_OUT, UntrainedDenoiser
-from photonfarm.trainer.store_source import StoreSource
-from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.untrained import Untrained
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True, eq=False)

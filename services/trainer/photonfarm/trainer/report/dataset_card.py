@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.errors import StoreError
-from photonfarm.shared.plan import UNUSED
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.plan.request import UNUSED
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStatus, SceneStore, Store, store_status
 
 SAMPLES = "samples"

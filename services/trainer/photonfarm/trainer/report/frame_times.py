@@ -12,10 +12,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.frame_costs import FrameCosts, Seconds
-from photonfarm.shared.verbs import command, is_installed
-from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.untrained import Untrained
+from photonfarm.shared.core.commands import command, is_installed
+from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predict.untrained import Untrained
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photonfarm.trainer.markdown import markdown_table
+from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.report.contents import Contents
 from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables

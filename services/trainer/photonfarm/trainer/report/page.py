@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 from html import escape
 
-from photonfarm.shared.pictures import Picture, png_uri
-from photonfarm.trainer.evaluation_table import views_of
+from photonfarm.shared.core.pictures import Picture, png_uri
+from photonfarm.trainer.compare.evaluation_table import views_of
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents
 from photonfarm.trainer.report.pictures import Case, Panel, cases, first_row, legend_of_cases

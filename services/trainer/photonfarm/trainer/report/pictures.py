@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonfarm.shared.pictures import Picture, display, display_values
-from photonfarm.shared.records import F32
-from photonfarm.trainer.evaluation_samples import Target
+from photonfarm.shared.core.pictures import Picture, display, display_values
+from photonfarm.shared.core.records import F32
+from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import Contents
 
 OVERVIEW = "overview.png"

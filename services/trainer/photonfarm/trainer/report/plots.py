@@ -10,7 +10,7 @@ from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
-from photonfarm.shared.estimate import Estimate
+from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import Contents, Entry
 from photonfarm.trainer.report.trained_runs import Point, RunStory

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from photonfarm.shared.scene import SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
 
 
 @dataclass(frozen=True, slots=True)

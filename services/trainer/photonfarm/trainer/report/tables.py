@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from photonfarm.shared.estimate import Estimate
-from photonfarm.shared.frame_costs import Seconds
-from photonfarm.trainer.evaluation import TIMED_ROUNDS
-from photonfarm.trainer.evaluation_table import counted, notes, place_of_networks
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of_networks
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.report.contents import Contents, Entry
 from photonfarm.trainer.report.plots import measures
 

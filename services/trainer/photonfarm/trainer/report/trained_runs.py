@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.trainer import checkpoint, metrics_log
-from photonfarm.trainer.device import AUTO, usable_device
-from photonfarm.trainer.loop import CHECKPOINT, METRICS
-from photonfarm.trainer.trained import TrainedRun
-from photonfarm.trainer.waits import bottleneck, samples_per_used, waits
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.device import AUTO, usable_device
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
+from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, waits
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.frame_costs import Surface
-from photonfarm.shared.pictures import display_values
-from photonfarm.shared.records import F32, ViewBuffers
+from photonfarm.shared.core.frame_costs import Surface
+from photonfarm.shared.core.pictures import display_values
+from photonfarm.shared.core.records import F32, ViewBuffers
 
 Mask = NDArray[np.bool_]
 

@@ -1,0 +1,1 @@
+"""Jobs: what a render job computes, and the buffers along a camera path."""

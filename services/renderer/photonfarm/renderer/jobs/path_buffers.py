@@ -1,0 +1,89 @@
+"""`photonfarm buffers`: what a network needs to show views that nobody rendered, such as those of a camera path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from photonfarm.renderer.jobs.render import (
+    SceneLoader,
+    SceneRenderer,
+    lit_points,
+    load_scene,
+    located,
+    photons_of,
+    visibility_of,
+)
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.keys import view_key
+from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
+from photonfarm.shared.farm.configuration import named_configuration
+from photonfarm.shared.scene.camera_path import CameraPath, orbit
+from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.read.find import scene_named
+
+
+def write_buffers(store: str | Path, scene: str, modification: str | None, path: CameraPath | int, out: Path) -> int:
+    """Render what a camera path shows, or an orbit of so many frames, into a file; how many frames it has.
+
+    Raises StoreError for a scene that the store does not hold, SceneNotHereError where its files are not here,
+    SpecError for a configuration that the scene cannot have.
+    """
+    opened = Store(store)
+    stored = opened.scene(scene_named(opened, scene))
+    configuration = named_configuration(opened, stored, modification)
+    spec = located(stored.spec)
+    views = orbit(spec, path) if isinstance(path, int) else path.sampled()
+    cloud = stored.base()[1] if stored.has_base() else None
+    frames_of(spec, configuration, views, cloud, guides=stored.guides.settings()).write(out)
+    return len(views)
+
+
+def frames_of(
+    spec: SceneSpec,
+    modification: Modification,
+    views: Sequence[View],
+    cloud: BasePointCloud | None = None,
+    load: SceneLoader = load_scene,
+    guides: GuideSpec | None = None,
+) -> Frames:
+    """The buffers of views of one configuration, its photons if the scene has some, and what the views see of them.
+
+    With their guides, rendered as is told; None: without.
+
+    The photons are those that the store holds of the configuration, or would: their seed follows from its key. `cloud`
+    is the stored base cloud; without one it is sampled, as a job would. Raises IncompleteError for values that are not
+    finite.
+    """
+    scene = load(spec)
+    scene.apply(modification)
+    buffers = [scene.buffers(view) for view in views]
+    depth, albedo, normal = (np.stack([getattr(b, name) for b in buffers]) for name in ("depth", "albedo", "normal"))
+    photons, _ = photons_of(scene, modification.key(spec.scene_id))
+    arrays = {"depth": depth, "albedo": albedo, "normal": normal}
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise IncompleteError(f"{name} of these views came out non-finite; move the camera a little")
+    cloud = cloud or scene.base()[1]
+    points = rebuild(cloud, modification)
+    known = None if guides is None else _guides(scene, modification, views, (spec.scene_id, guides, cloud))
+    seen = [visibility_of(scene, view, points, photons) for view in views]
+    arrays |= {"point_seen": np.stack([s.points for s in seen]), "photon_seen": np.stack([s.photons for s in seen])}
+    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=known, **arrays)
+
+
+def _guides(
+    scene: SceneRenderer, modification: Modification, views: Sequence[View], told: tuple[str, GuideSpec, BasePointCloud]
+) -> Guides:
+    """The guides of all views, stacked; `told` is the scene's id, how they are rendered, and its base cloud."""
+    scene_id, wanted, cloud = told
+    key, lit = modification.key(scene_id), lit_points(cloud, modification)
+    found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]
+    return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

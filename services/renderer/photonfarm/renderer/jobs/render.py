@@ -1,0 +1,359 @@
+"""One job: one shard of samples, rendered in the order that edits the scene least, and committed.
+
+Seeds are functions of content keys: sample key and "half A" or "half B", modification key and "photons". A render with
+a non-finite value is thrown away and drawn again with the next seed of its kind; nothing is replaced or clamped.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count, groupby, islice
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
+from photonfarm.shared.core.keys import Key, seed_of, view_key
+from photonfarm.shared.core.records import (
+    F32,
+    LIT_POINTS,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+    arrays_of,
+)
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
+
+ATTEMPTS = 3
+"""Seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
+
+SCENES_KEPT = 2
+"""Loaded scenes kept warm: jobs of two scenes may alternate in the queue."""
+
+_PACKAGES = ("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "numpy", "zarr")
+
+log = logging.getLogger(__name__)
+
+
+class SceneRenderer(Protocol):
+    """A loaded scene that is edited in place: what a job needs of `LoadedScene` in `renderer.scene.loaded_scene`."""
+
+    def apply(self, modification: Modification) -> None:
+        """Put the scene into a configuration."""
+
+    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
+        """Independent noisy estimates of radiance, one for each seed, (K, H, W, 3) linear."""
+
+    def buffers(self, view: View) -> ViewBuffers:
+        """The image-space buffers of a view."""
+
+    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
+        """What is known of a view beside its buffers, rendered as is wanted; `key` is the view's.
+
+        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        """
+
+    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
+        """Whether a view sees points (N, 3) of the current configuration, (N,)."""
+
+    def photons(self, seed: int) -> Photons | None:
+        """Light sub-paths of the current configuration; None if the spec wants none."""
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """Geometry and base point cloud of the scene at rest."""
+
+
+SceneLoader = Callable[[SceneSpec], SceneRenderer]
+
+
+def load_scene(spec: SceneSpec) -> SceneRenderer:
+    """The scene of a spec, loaded into Mitsuba with a thread pool of one."""
+    from photonfarm.renderer.scene import backend
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
+
+    backend.load(threads=1)
+    return LoadedScene.load(spec)
+
+
+# ------------------------------------------------------------------------------------------- the function in the queue
+
+_serving: ShardRenderer | None = None
+
+
+def serve(renderer: ShardRenderer) -> None:
+    """Make `render_shard` work in this process; the store is the worker's own choice and never comes from the queue."""
+    global _serving  # RQ calls a module's function, and what is loaded lives as long as the process
+    _serving = renderer
+
+
+def render_shard(scene_id: str, job: int) -> None:
+    """Render and commit one job: the one function that the queue may name."""
+    if _serving is None:
+        raise IncompleteError("render_shard runs inside `photonfarm work` only, which says where the store is")
+    _serving.render(scene_id, job)
+
+
+@dataclass(slots=True, eq=False)
+class _Loaded:
+    """A scene that is loaded, and what the store has of it."""
+
+    stored: SceneStore
+    scene: SceneRenderer
+    _cloud: BasePointCloud | None = None
+
+    def cloud(self) -> BasePointCloud:
+        """The base point cloud that is stored; it is written first, with the geometry, where it is not there."""
+        if not self.stored.has_base():
+            self.stored.write_base(*self.scene.base())
+            self._cloud = None
+        if self._cloud is None:
+            self._cloud = self.stored.base()[1]
+        return self._cloud
+
+
+class ShardRenderer:
+    """Renders jobs of a store, keeping the scenes it has loaded last."""
+
+    def __init__(self, store: Store, *, worker: str, load: SceneLoader = load_scene) -> None:
+        """Take a store; `worker` is the name that markers get."""
+        self._store = store
+        self._worker = worker
+        self._load = load
+        self._scenes: dict[str, _Loaded] = {}  # last used last
+
+    def render(self, scene_id: str, job: int) -> bool:
+        """Render and commit what one job lacks; False if it lacked nothing, or another worker was first meanwhile.
+
+        That is its guides, where the scene has some, and then its samples. False too if a repair took its files
+        meanwhile: it is missing then, and comes again.
+
+        Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
+        the planned one, IncompleteError if renders stay non-finite or buffers are.
+        """
+        if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
+            raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
+        if stored.is_done(job):
+            return False
+        loaded = self._scene(scene_id)
+        stored = loaded.stored
+        guided = stored.guides.lacks_job(stored.job_rows(job)) and self._render_guides(loaded, job)
+        return self._render_samples(loaded, job) if not stored.is_committed(job) else guided
+
+    def _render_guides(self, loaded: _Loaded, job: int) -> bool:
+        """Render and commit the guides of a job's new views; False if another worker was first."""
+        stored, scene, began = loaded.stored, loaded.scene, self._now()
+        rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
+        cloud = loaded.cloud()
+        with stored.guide_writer(job) as out:
+            for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
+                modification = rows.modifications[modification_row]
+                scene.apply(modification)
+                key, lit = modification.key(stored.scene_id), lit_points(cloud, modification)
+                for row in sorted(rows.new_views.intersection(sample.view_row for sample in group)):
+                    view = rows.views[row]
+                    guides = scene.guides(view, view_key(key, view.vector), wanted, lit)
+                    _check_finite(arrays_of(guides), f"view {row}")
+                    out.guides(row, guides)
+            return out.commit(self._figures(began, 0))
+
+    def _render_samples(self, loaded: _Loaded, job: int) -> bool:
+        stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
+        cloud = loaded.cloud()
+        with stored.job_writer(job) as out:
+            redrawn = _Rendering(loaded.scene, cloud, scene_id, out).run(stored.job_rows(job))
+            committed = out.commit(self._figures(began, redrawn))
+        if not committed:
+            what = "was committed by another worker while it was rendered here; that one stays"
+            if not stored.is_committed(job):
+                what = "its files were set aside by a repair while it was committed here; it will be rendered again"
+            log.warning("scene %s, job %d: %s", scene_id, job, what)
+        return committed
+
+    def _now(self) -> tuple[float, float]:
+        return time.monotonic(), time.process_time()
+
+    def _figures(self, began: tuple[float, float], redrawn: int) -> Figures:
+        """What was done since `began`, for a marker."""
+        wall, core = self._now()
+        return Figures(
+            core_s=core - began[1],
+            wall_s=wall - began[0],
+            redrawn=redrawn,
+            worker=self._worker,
+            versions=versions(),
+        )
+
+    def _scene(self, scene_id: str) -> _Loaded:
+        if scene_id in self._scenes:
+            self._scenes[scene_id] = self._scenes.pop(scene_id)
+        else:
+            stored = self._store.scene(scene_id)
+            spec = located(stored.spec)  # before another scene is let go for it
+            while len(self._scenes) >= SCENES_KEPT:
+                self._scenes.pop(next(iter(self._scenes)))
+            gc.collect()  # Dr.Jit finds no kernel in its cache while an older scene is still half alive
+            self._scenes[scene_id] = _Loaded(stored, self._load(spec))
+        return self._scenes[scene_id]
+
+
+def located(spec: SceneSpec) -> SceneSpec:
+    """The spec, once its scene file has been found on this machine and is the one that was planned.
+
+    Raises SceneNotHereError otherwise: that is the machine's fault and not the job's, which others may do.
+    """
+    try:
+        here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
+    except SpecError as error:
+        raise SceneNotHereError(f"this machine cannot render {error}") from error
+    if here.scene_id != spec.scene_id:
+        raise SceneNotHereError(
+            f"scene {spec.scene_id} ({spec.name}): the scene file here is another one than was planned (its files' "
+            f"digest is {here.content[:12]}…, planned was {spec.content[:12]}…); give every worker the same files"
+        )
+    return here
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Versions of what renders, by package."""
+    found = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:  # run from a checkout
+            continue
+    return found
+
+
+# -------------------------------------------------------------------------------------------------------- rendering
+
+
+def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, F32]:
+    """Positions and normals (L, 3) of the points of a configuration whose irradiance is among the guides."""
+    return rebuild(cloud, modification)[0][:LIT_POINTS], cloud.normal[:LIT_POINTS]
+
+
+def visibility_of(
+    scene: SceneRenderer, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
+) -> Visibility:
+    """What a view sees of the current configuration: of its cloud, as `rebuild` gives it, and of its photons."""
+    position, present = points
+    if photons is None:
+        return Visibility(scene.sees(view, position) & present, np.zeros(0, np.bool_))
+    seen = scene.sees(view, np.concatenate([position, photons.position]))
+    return Visibility(seen[: len(position)] & present, seen[len(position) :] & (photons.bounce >= 0))
+
+
+class _Rendering:
+    """One pass over a job's samples: each modification applied once, each new view looked at once."""
+
+    def __init__(self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter) -> None:
+        self._scene = scene
+        self._cloud = cloud
+        self._scene_id = scene_id
+        self._out = out
+        self._redrawn = 0
+
+    def run(self, rows: JobRows) -> int:
+        """Hand every row of the job to its writer; how many renders were thrown away.
+
+        Photons that another job stores, with the modification, are traced for the views that are new here: their seed
+        follows from the modification's key, so that they come out the same. That job counts what it throws away.
+        """
+        new_views = set(rows.new_views)
+        for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
+            modification, samples = rows.modifications[modification_row], list(group)
+            self._scene.apply(modification)
+            is_new = modification_row in rows.new_modifications
+            wants_photons = is_new or any(sample.view_row in new_views for sample in samples)
+            photons, thrown = photons_of(self._scene, modification.key(self._scene_id)) if wants_photons else (None, 0)
+            if is_new:
+                self._redrawn += thrown
+                if photons is not None:
+                    self._out.photons(modification_row, photons)
+            points = rebuild(self._cloud, modification)
+            for sample in samples:
+                view = rows.views[sample.view_row]
+                if sample.view_row in new_views:
+                    visibility = visibility_of(self._scene, view, points, photons)
+                    self._out.view(sample.view_row, self._buffers(sample, view), visibility)
+                    new_views.remove(sample.view_row)
+                self._out.radiance(sample.row, self._halves(sample, view))
+        return self._redrawn
+
+    def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
+        """They know no seed, so that another try would not help."""
+        buffers = self._scene.buffers(view)
+        _check_finite(arrays_of(buffers), f"view {sample.view_row}", f" (sample {sample.key.hex()})")
+        return buffers
+
+    def _halves(self, sample: SampleRow, view: View) -> F32:
+        """Two independent estimates, (2, H, W, 3)."""
+        purposes = ("half A", "half B")
+        seed_a = next(_seeds(sample.key, purposes[0], ()))
+        seed_b = next(_seeds(sample.key, purposes[1], (seed_a,)))
+        halves = self._scene.render_halves(view, (seed_a, seed_b))
+        for half, purpose in enumerate(purposes):
+            if not np.isfinite(halves[half]).all():
+                halves[half] = self._again(sample.key, purpose, view, (seed_a, seed_b))
+        return halves
+
+    def _again(self, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> F32:
+        """Another estimate for one that came out non-finite; other seeds than those that are `taken`."""
+        self._throw_away(key, purpose)
+        for seed in islice(_seeds(key, purpose, taken), ATTEMPTS - 1):
+            image = self._scene.render_halves(view, (seed,))[0]
+            if np.isfinite(image).all():
+                return image
+            self._throw_away(key, purpose)
+        raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
+
+    def _throw_away(self, key: Key, purpose: str) -> None:
+        self._redrawn += 1
+        _tell_thrown_away(key, purpose)
+
+
+def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
+    """Raise IncompleteError unless all values of what knows no seed are finite."""
+    for name, values in arrays.items():
+        if not np.isfinite(values.astype(np.float32)).all():
+            raise IncompleteError(f"{name} of {what} came out non-finite{more}")
+
+
+def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:
+    """The photons of the current configuration, by its key, and how often they were not finite before.
+
+    None if the spec wants none. Raises IncompleteError if they stay non-finite.
+    """
+    for thrown, seed in enumerate(islice(_seeds(key, "photons", ()), ATTEMPTS)):
+        photons = scene.photons(seed)
+        if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
+            return photons, thrown
+        _tell_thrown_away(key, "photons")
+    raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
+
+
+def _tell_thrown_away(key: Key, purpose: str) -> None:
+    log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
+
+
+def _seeds(key: Key, purpose: str, taken: tuple[int, ...]) -> Iterator[int]:
+    """The seeds to try in turn, without end, none of them `taken`: equal seeds would make the halves equal."""
+    for attempt in count():
+        seed = seed_of(key, purpose if attempt == 0 else f"{purpose}, attempt {attempt}")
+        if seed not in taken:
+            yield seed

@@ -1,0 +1,174 @@
+"""`photonfarm measure-frames`: what the parts of one frame cost on this machine, and what its pixels show.
+
+Times are wall times until a part's result lies in numpy's memory, in a process whose thread pool is one thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.jobs.render import lit_points, located, photons_of
+from photonfarm.renderer.measure.partial_film import PartialFilm
+from photonfarm.renderer.measure.surfaces import surface_kinds
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.frame_costs import PARTS, FrameCosts
+from photonfarm.shared.core.keys import Key, view_key
+from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
+from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.read.find import scene_named
+
+WARM_UPS = 2
+"""Frames before those that count: the first compiles kernels, the second is the first to replay recorded launches."""
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What a row of the store shows."""
+
+    row: int
+    modification: Modification
+    key: Key  # of the modification
+    view: View
+
+
+def write_frame_costs(
+    store: str | Path, scene: str, rows: Sequence[int], kept: Sequence[int], timed: int, points: int | None, out: Path
+) -> FrameCosts:
+    """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
+
+    The backend must have been loaded, with one thread.
+    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError where the scene's files are
+    not here.
+    """
+    opened = Store(store)
+    reader = SceneReader(store, scene_id := scene_named(opened, scene))
+    reader.refresh()
+    _check_complete(reader, rows)
+    frames = [_frame(reader, row) for row in rows]
+    used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
+    wanted = opened.scene(scene_id).guides.settings() or reader.spec.guides
+    spec = located(reader.spec.model_copy(update={"guides": wanted}))
+    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
+    costs.write(out)
+    return costs
+
+
+def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
+    if missing := sorted(set(rows) - set(reader.rows.tolist())):
+        raise StoreError(
+            f"row {missing[0]} of scene {reader.spec.scene_id} is not complete; {len(reader.rows)} of "
+            f"{reader.planned} planned rows are, which `photonfarm store find` shows"
+        )
+
+
+def _frame(reader: SceneReader, row: int) -> Frame:
+    modification, view, _ = reader.inputs(row)
+    return Frame(row, modification, reader.modification_key(row), view)
+
+
+def frame_costs(
+    scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[Frame], kept: Sequence[int], timed: int
+) -> FrameCosts:
+    """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
+
+    Frames are taken again where there are fewer than are timed.
+    """
+    films = [PartialFilm(scene.spec, k) for k in kept]
+    surface = np.stack([_surfaces(scene, frame) for frame in frames])
+    parts, render_s = np.split(_seconds(scene, cloud, films, frames, timed), [len(PARTS)])
+    return FrameCosts(
+        scene.spec.scene_id,
+        np.array([frame.row for frame in frames], np.int64),
+        surface,
+        **dict(zip(PARTS, parts, strict=True)),
+        kept=np.array(kept, np.int64),
+        render_s=render_s,
+    )
+
+
+def in_turn(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """The frames without end, one of each configuration in turn: neighbours differ in it, unless all have the same."""
+    of_configuration: dict[Key, list[Frame]] = {}
+    for frame in frames:
+        of_configuration.setdefault(frame.key, []).append(frame)
+    for turn in cycle([cycle(alike) for alike in of_configuration.values()]):
+        yield next(turn)
+
+
+def _surfaces(scene: LoadedScene, frame: Frame) -> NDArray[np.uint8]:
+    scene.apply(frame.modification)
+    return surface_kinds(scene.scene, frame.view, scene.spec)
+
+
+# ---------------------------------------------------------------------------------------------------------------- times
+
+
+def _seconds(
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[Frame], timed: int
+) -> NDArray[np.float64]:
+    """Of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
+    stays = len({frame.key for frame in frames}) == 1
+    measured = []
+    for seed, frame in enumerate(islice(in_turn(frames), WARM_UPS + timed)):
+        if stays:  # there would be nothing to edit
+            scene.apply(rest(scene.spec))
+        measured.append(_time_frame(scene, cloud, films, frame, seed))
+    return np.array(measured[WARM_UPS:]).T
+
+
+def _time_frame(
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: Frame, seed: int
+) -> list[float]:
+    edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
+    buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
+    guides_s, _ = _wall_timed(partial(_guides, scene, cloud, frame))
+    points_s, _ = _wall_timed(partial(_points_seen, scene, cloud, frame))
+    photons = _time_photons(scene, frame)
+    render_s = [_wall_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
+    return [edit_s, buffers_s, guides_s, points_s, *photons, *render_s]
+
+
+def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
+    """Seconds to trace the configuration's photons, and to find which the view sees; zeros for a scene without."""
+    photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
+    if photons is None:
+        return 0.0, 0.0
+    seen_s, _ = _wall_timed(partial(scene.sees, frame.view, photons.position))
+    return photons_s, seen_s
+
+
+def _edit(scene: LoadedScene, modification: Modification) -> None:
+    scene.apply(modification)
+    dr.sync_thread()
+
+
+def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> Guides:
+    key = view_key(frame.key, frame.view.vector)
+    return scene.guides(frame.view, key, scene.spec.guides, lit_points(cloud, frame.modification))
+
+
+def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> NDArray[np.bool_]:
+    position, present = rebuild(cloud, frame.modification)
+    return scene.sees(frame.view, position) & present
+
+
+def _wall_timed(work: Callable[[], Result]) -> tuple[float, Result]:
+    begun = time.perf_counter()
+    result = work()
+    return time.perf_counter() - begun, result

@@ -1,0 +1,173 @@
+"""`photonfarm scene cost`: what samples of a scene cost on this machine, and how noisy they are.
+
+Times are CPU times of a process whose thread pool is one thread, until a part's result lies in numpy's memory: what a
+worker takes, without what it takes once for a scene, and without storing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.jobs.render import lit_points, photons_of, visibility_of
+from photonfarm.renderer.measure.frame_costs import WARM_UPS
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.strategy import cache
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.keys import view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Photons
+from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View, sample_view
+
+SEED = 0
+"""Master seed of configurations and views, as `submit` has it unless told otherwise."""
+
+FRAMES = 6
+"""Views that are measured, unless told otherwise."""
+
+RANGE = 4
+"""How many times as many samples the larger of the two timed passes has, which tells the fixed part from theirs."""
+
+MOST_PATHS = 1 << 21
+"""Eye paths of a half of the larger pass, unless one sample of each pixel needs more: those of clean images would
+take minutes, and beyond a launch of the integrator time is proportional to samples anyway."""
+
+TALK_SECONDS = 10.0
+"""Least seconds between two lines of progress."""
+
+Result = TypeVar("Result")
+Talk = Callable[[str], None]
+"""Takes a line on what is going on."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """What was measured of one view, named as in `SampleCosts`."""
+
+    configuration_s: float
+    view_s: float  # with guides
+    guides_s: float
+    pass_s: float
+    spp_s: float
+    noise: float | None  # None where nothing is seen, or not all of it is finite
+
+
+def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, talk: Talk) -> SampleCosts:
+    """The costs that were measured here before of as many frames, unless they are wanted again; else those of now.
+
+    The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
+    """
+    file = cache.file_of("costs", cache.digest_here("sample costs with guides", spec.scene_id, str(frames)))
+    if not again and (kept := _kept(file)) is not None:
+        return kept
+    talk(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
+    costs = measured_costs(spec, beside, frames, talk)
+    try:
+        cache.write_whole(file, costs.json())
+    except OSError as error:
+        talk(f"the measurement could not be kept: {error}")
+    return costs
+
+
+def _kept(file: Path) -> SampleCosts | None:
+    try:
+        return SampleCosts.read(file.read_bytes())
+    except (OSError, StoreError):  # none, or none that can be used
+        return None
+
+
+def measured_costs(
+    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, talk: Talk | None = None
+) -> SampleCosts:
+    """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
+    backend.load(threads=1)
+    return sample_costs(LoadedScene.load(spec, beside), frames, talk)
+
+
+def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> SampleCosts:
+    """Medians over the views of so many random configurations, one of each, after some that do not count."""
+    cloud = scene.base()[1]
+    measured, told = [], time.monotonic()
+    for number in range(WARM_UPS + frames):
+        measured.append(_measured(scene, cloud, number))
+        if talk is not None and time.monotonic() - told > TALK_SECONDS:
+            talk(f"view {number + 1} of {WARM_UPS + frames}")
+            told = time.monotonic()
+    measured = measured[WARM_UPS:]
+    noise = [frame.noise for frame in measured if frame.noise is not None]
+    return SampleCosts(
+        scene.spec.scene_id,
+        _median([frame.configuration_s for frame in measured]),
+        _median([frame.view_s for frame in measured]),
+        _median([frame.pass_s for frame in measured]),
+        _median([frame.spp_s for frame in measured]),
+        _median(noise) if noise else 0.0,
+        _median([frame.guides_s for frame in measured]),
+    )
+
+
+def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
+    spec = scene.spec
+    modification = sample_modification(spec, SEED, number)
+    view = sample_view(spec, modification.key(spec.scene_id), SEED, number)
+    configuration_s, (points, photons) = _timed(partial(_configure, scene, cloud, modification))
+    view_s, _ = _timed(partial(_look, scene, view, points, photons))
+    guides_s, _ = _timed(partial(_guide, scene, view, cloud, modification))
+    few = fewer_samples(spec)
+    few_s, halves = _timed(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
+    many_s, _ = _timed(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
+    pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
+    noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
+    return _Frame(configuration_s, view_s + guides_s, guides_s, pass_s, spp_s, noise)
+
+
+def fewer_samples(spec: SceneSpec) -> int:
+    """Samples per pixel of a half of the smaller pass: the spec's own, or fewer where 4 times these are many."""
+    of_film = RANGE * spec.film.width * spec.film.height
+    return int(np.clip(MOST_PATHS // of_film, 1, spec.transport.half_spp))
+
+
+def line_through(few: int, few_s: float, many: int, many_s: float) -> tuple[float, float]:
+    """Fixed seconds, and seconds a sample, from the times at two numbers of samples; neither is below 0."""
+    spp_s = max((many_s - few_s) / (many - few), 0.0)
+    return max(few_s - few * spp_s, 0.0), spp_s
+
+
+def _configure(
+    scene: LoadedScene, cloud: BasePointCloud, modification: Modification
+) -> tuple[tuple[F32, NDArray[np.bool_]], Photons | None]:
+    scene.apply(modification)
+    dr.sync_thread()  # what is not evaluated by then would be charged to the view
+    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.scene_id))[0]
+
+
+def _look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
+    scene.buffers(view)
+    visibility_of(scene, view, points, photons)
+
+
+def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
+    key = view_key(modification.key(scene.spec.scene_id), view.vector)
+    scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
+
+
+def _timed(work: Callable[[], Result]) -> tuple[float, Result]:
+    begun = time.process_time()
+    result = work()
+    return time.process_time() - begun, result
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values))

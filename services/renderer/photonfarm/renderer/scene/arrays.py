@@ -1,0 +1,63 @@
+"""Arrays of numpy handed to Dr.Jit and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.records import F32
+
+ALIGNMENT_BYTES = 64
+"""Width of the widest vector register."""
+
+
+def floats(values: NDArray[Any]) -> Any:
+    """All values, in order, as mi.Float in Dr.Jit's own memory.
+
+    Dr.Jit takes numpy's memory as it is, compiles a kernel anew for each combination of inputs that happen to lie on
+    odd addresses (numpy aligns to 16 bytes only), and `dr.freeze` does not notice when a mesh gets other such memory.
+    """
+    return _owned(mi.Float(_aligned(values, np.float32)) * dr.opaque(mi.Float, 1))
+
+
+def integers(values: NDArray[Any]) -> Any:
+    """The same for mi.UInt32."""
+    return _owned(mi.UInt32(_aligned(values, np.uint32)) * dr.opaque(mi.UInt32, 1))
+
+
+def _owned(product: Any) -> Any:
+    dr.eval(product)
+    return product
+
+
+def _aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
+    spare = ALIGNMENT_BYTES // 4
+    memory: NDArray[Any] = np.empty(values.size + spare, dtype)
+    start = -(memory.ctypes.data // 4) % spare
+    part = memory[start : start + values.size]
+    part[:] = values.ravel()
+    return part
+
+
+def points(values: NDArray[Any]) -> Any:
+    """Rows (N, 3) as mi.Point3f."""
+    return mi.Point3f(*(floats(values[:, i]) for i in range(3)))
+
+
+def matrix(values: NDArray[np.float64]) -> Any:
+    """A (4, 4) matrix as mi.Matrix4f whose entries the compiler does not know."""
+    return mi.Matrix4f(*(dr.opaque(mi.Float, float(entry)) for entry in values.ravel()))
+
+
+def zeros_like(value: Any) -> Any:
+    """A parameter of Mitsuba's, array, tensor or number, with all its entries 0."""
+    return dr.zeros(type(value), dr.shape(value)) if dr.is_array_v(value) else type(value)(0)
+
+
+def rows(values: Any, *shape: int) -> F32:
+    """Vectors of Dr.Jit as rows of numpy, (*shape, 3)."""
+    return np.ascontiguousarray(np.array(values, np.float32).T).reshape(*shape, 3)

@@ -1,0 +1,98 @@
+"""Mitsuba made ready: LLVM found, the variant chosen, the integrator plugin registered. All set-up is here.
+
+Dr.Jit compiles through a libLLVM that it opens by itself. On machines with AVX-512 LLVM 15 and 16 crash on Mitsuba's
+kernels ("Cannot select"), so that only versions known to work are chosen unasked; DRJIT_LIBLLVM_PATH overrules.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from photonfarm.shared.core.errors import BackendError
+
+LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
+DEFAULT_VARIANT = "llvm_ad_rgb"
+LLVM_VERSIONS = ("19", "22")
+"""Tried with Mitsuba's kernels, in order of preference."""
+
+_FOLDERS = ("lib/*-linux-gnu", "lib64", "lib", "lib/llvm-*/lib", "local/lib")
+_INSTALL_LLVM = f"install LLVM 19 (Debian and Ubuntu: libllvm19), or set {LLVM_VARIABLE} to a libLLVM"
+
+
+def load(threads: int | None = None) -> Any:
+    """The module `mitsuba`, its variant set and the plugin `bdpt` registered; cheap when called again.
+
+    `threads` is the size of Dr.Jit's thread pool (1 for a worker: two processes of one thread beat one of two).
+    Raises BackendError, in one sentence that says what to install or to set.
+    """
+    variant = os.environ.get(VARIANT_VARIABLE) or DEFAULT_VARIANT
+    if variant.startswith("llvm"):
+        os.environ[LLVM_VARIABLE] = find_llvm()
+    mitsuba, drjit = _import("mitsuba"), _import("drjit")
+    _set_variant(mitsuba, variant)
+    if threads is not None:
+        drjit.set_thread_count(threads)
+    _import("photonfarm.renderer.bdpt")
+    return mitsuba
+
+
+def find_llvm(roots: Iterable[Path] = (Path(sys.prefix), Path("/usr"))) -> str:
+    """The libLLVM to use: the one that DRJIT_LIBLLVM_PATH names, else a version that works in a library folder.
+
+    Raises BackendError where there is none, or where it cannot be opened.
+    """
+    named = os.environ.get(LLVM_VARIABLE)
+    if named:
+        return _opened(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
+    for version in LLVM_VERSIONS:
+        for found in _libraries(roots, version):
+            return _opened(str(found), f"{found} cannot be opened")
+    raise BackendError(f"no libLLVM of version {' or '.join(LLVM_VERSIONS)} is installed; {_INSTALL_LLVM}")
+
+
+def _libraries(roots: Iterable[Path], version: str) -> Iterable[Path]:
+    for root in roots:
+        for folder in _FOLDERS:
+            for pattern in (f"libLLVM-{version}.so", f"libLLVM.so.{version}.*", f"libLLVM-{version}.so.*"):
+                yield from sorted(root.glob(f"{folder}/{pattern}"))
+
+
+def _opened(library: str, failure: str) -> str:
+    try:
+        ctypes.CDLL(library)
+    except OSError as error:
+        raise BackendError(f"{failure} ({error}); {_INSTALL_LLVM}") from error
+    return library
+
+
+def _import(name: str) -> Any:
+    """Import a module; Dr.Jit without libatomic fails with a NameError that does not say so."""
+    try:
+        return importlib.import_module(name)
+    except NameError as error:
+        raise BackendError(
+            f"{name} cannot be imported ({error}); its libraries need libatomic: install libatomic1 (Debian and Ubuntu)"
+        ) from error
+    except ModuleNotFoundError as error:
+        raise BackendError(f"{name} is not installed ({error}); install photonfarm-renderer") from error
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        raise BackendError(f"{name} cannot be imported: {error}") from error
+
+
+def _set_variant(mitsuba: Any, variant: str) -> None:
+    if variant not in mitsuba.variants():
+        known = ", ".join(v for v in mitsuba.variants() if v.endswith("_rgb"))
+        raise BackendError(f"{VARIANT_VARIABLE} = {variant!r} is not a variant of this Mitsuba; known: {known}")
+    if mitsuba.variant() == variant:
+        return
+    try:
+        mitsuba.set_variant(variant)
+    except (ImportError, OSError, RuntimeError) as error:
+        raise BackendError(f"Mitsuba's variant {variant!r} cannot be used here: {error}") from error

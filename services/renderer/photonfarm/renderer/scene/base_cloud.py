@@ -1,0 +1,79 @@
+"""The geometry of a scene at rest, and the base point cloud on it [supplement 2.1, 2.3]."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.scene.arrays import floats, integers, points, rows
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
+from photonfarm.renderer.scene.tessellation import triangles_of
+from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
+from photonfarm.shared.scene.pointcloud import sample_surface
+
+
+def geometry_of(shapes: list[Any], group_of: Mapping[str, int]) -> Geometry:
+    """The triangles of shapes in the scene's order; `group_of` gives the movable group of a shape id."""
+    parts = [triangles_of(shape) for shape in shapes]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=False)]
+    return Geometry(
+        vertices=_stacked([part.vertices for part in parts], np.float32),
+        faces=_stacked(faces, np.uint32),
+        face_shape=np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts]),
+        shape_group=np.array([group_of.get(shape.id(), STATIC) for shape in shapes], np.int16),
+    )
+
+
+def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
+    return np.concatenate(arrays).astype(dtype) if arrays else np.zeros((0, 3), dtype)
+
+
+def cloud_of(scene: Any, geometry: Geometry, count: int, scene_id: str) -> BasePointCloud:
+    """`count` points uniform on the scene's surfaces, as they are at rest; which ones follows from the scene id."""
+    face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", scene_id), "surface"))
+    corners = geometry.vertices[geometry.faces[face]].astype(np.float64)  # (P, 3 corners, 3)
+    position = np.einsum("pk,pkx->px", barycentric, corners)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    si = _surface_at(scene, geometry, face, barycentric, position, across)
+    emission = si.emitter(scene).eval(si)
+    albedo = diffuse_reflectance(si, mi.Bool(True))
+    dr.eval(si.n, albedo, emission)
+    return BasePointCloud(
+        position=position.astype(np.float32),
+        normal=rows(si.n, count),
+        albedo=rows(albedo, count),
+        emission=rows(emission, count),
+        group=geometry.shape_group[geometry.face_shape[face]],
+        face=face,
+    )
+
+
+def _surface_at(
+    scene: Any,
+    geometry: Geometry,
+    face: NDArray[np.uint32],
+    barycentric: NDArray[np.float64],
+    position: NDArray[np.float64],
+    across: NDArray[np.float64],
+) -> Any:
+    """Mitsuba's surface interactions at the points, seen from their front; not found by rays, which may meet others."""
+    shape = geometry.face_shape[face]
+    first = np.searchsorted(geometry.face_shape, np.arange(len(geometry.shape_group)))  # each shape's first face
+    hit = dr.zeros(mi.PreliminaryIntersection3f, len(face))
+    hit.valid = dr.full(mi.Bool, True, len(face))
+    hit.t = floats(np.ones(len(face)))
+    hit.prim_index = integers(face - first[shape])
+    hit.prim_uv = mi.Point2f(*(floats(barycentric[:, i]) for i in (1, 2)))
+    hit.shape = dr.gather(mi.ShapePtr, scene.shapes_dr(), integers(shape))
+    ray = mi.Ray3f(o=points(position + across), d=mi.Vector3f(points(-across)))
+    si = hit.compute_surface_interaction(ray)
+    si.wi = mi.Vector3f(0, 0, 1)
+    return si

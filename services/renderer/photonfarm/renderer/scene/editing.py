@@ -1,0 +1,138 @@
+"""Movable groups edited in place: nothing is added, taken away or compiled again once the scene is loaded.
+
+A removed group is *parked*: its shapes are shrunk to 10⁻⁴ of their size into the lower corner of the static geometry's
+bounding box, and its lights shine with radiance 0, which `bdpt` and its photon tracer never select. So counts, types
+and order of everything stay, and with them the compiled kernels. In the room `room` the corner lies outside the walls;
+in a scene that is open there, what is parked has 10⁻⁸ of its area and does not shine.
+
+Positions are always made from those at rest, so that no rounding adds up: at rest they are what was loaded, bit by bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.scene.arrays import floats, matrix, zeros_like
+from photonfarm.shared.core.records import F32
+
+PARKED_SCALE = 1e-4
+
+Parking = NDArray[np.float32]
+"""The point (3,) that parked shapes are shrunk to."""
+
+
+class MeshPlacement:
+    """Where a mesh stands: its vertices moved, its normals as modelled."""
+
+    def __init__(self, shape: Any) -> None:
+        self._parameters = mi.traverse(shape)
+        self._rest: F32 = np.array(self._parameters["vertex_positions"], np.float32).reshape(-1, 3)
+        self._normals = np.array(self._parameters["vertex_normals"], np.float32) if shape.has_vertex_normals() else None
+
+    def move(self, translation: F32) -> None:
+        """Put the shape `translation` (3,) away from rest."""
+        self._put(self._rest + translation)
+
+    def park(self, parking: Parking) -> None:
+        """Shrink the shape into the parking place."""
+        self._put(parking + np.float32(PARKED_SCALE) * (self._rest - self._rest.min(axis=0)))
+
+    def _put(self, vertices: F32) -> None:
+        self._parameters["vertex_positions"] = floats(vertices)
+        if self._normals is not None:  # in the same update: alone, new positions make Mitsuba compute others from faces
+            self._parameters["vertex_normals"] = floats(self._normals)
+        self._parameters.update()
+
+
+class TransformPlacement:
+    """Where a rectangle, sphere, disk or cylinder stands: its transform, opaque to the compiler."""
+
+    def __init__(self, shape: Any) -> None:
+        self._parameters = mi.traverse(shape)
+        self._rest: NDArray[np.float64] = np.array(self._parameters["to_world"].matrix, np.float64).reshape(4, 4)
+        self._corner = np.array([shape.bbox().min[i] for i in range(3)], np.float64)
+        self.move(np.zeros(3, np.float32))
+
+    def move(self, translation: F32) -> None:
+        """Put the shape `translation` (3,) away from rest."""
+        self._put(_shifted(translation.astype(np.float64)) @ self._rest)
+
+    def park(self, parking: Parking) -> None:
+        """Shrink the shape into the parking place."""
+        shrunk = np.diag([PARKED_SCALE] * 3 + [1.0])
+        self._put(_shifted(parking.astype(np.float64)) @ shrunk @ _shifted(-self._corner) @ self._rest)
+
+    def _put(self, to_world: NDArray[np.float64]) -> None:
+        kind = type(self._parameters["to_world"])
+        self._parameters["to_world"] = kind(matrix(to_world))
+        dr.make_opaque(self._parameters["to_world"])
+        self._parameters.update()
+
+
+class Shine:
+    """The radiance of one area light, switched on and off."""
+
+    def __init__(self, emitter: Any) -> None:
+        self._parameters = mi.traverse(emitter)
+        keys = [key for key in self._parameters.keys() if key.startswith("radiance.")]  # noqa: SIM118 - no mapping
+        self._lit = {key: _copied(self._parameters[key]) for key in keys if not key.endswith("to_uv")}
+        self._dark = {key: zeros_like(value) for key, value in self._lit.items()}
+
+    def switch(self, on: bool) -> None:
+        """Give the light its radiance, or radiance 0."""
+        for key, value in (self._lit if on else self._dark).items():
+            self._parameters[key] = value
+            dr.make_opaque(self._parameters[key])
+        self._parameters.update()
+
+
+def _copied(value: Any) -> Any:
+    return type(value)(value)  # a parameter is a reference, which changes with the scene
+
+
+def _shifted(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    shift = np.eye(4)
+    shift[:3, 3] = offset
+    return shift
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovableGroup:
+    """The shapes of one movable group."""
+
+    placements: tuple[MeshPlacement | TransformPlacement, ...]
+    shines: tuple[Shine, ...]
+
+    @classmethod
+    def of(cls, shapes: list[Any]) -> MovableGroup:
+        """The group of these shapes, which stand as modelled."""
+        shines = tuple(Shine(shape.emitter()) for shape in shapes if shape.is_emitter())
+        return cls(tuple(_placement(shape) for shape in shapes), shines)
+
+    def move(self, translation: F32, *, was_present: bool) -> None:
+        """Put the group `translation` (3,) away from rest."""
+        for placement in self.placements:
+            placement.move(translation)
+        if not was_present:
+            self._switch(True)
+
+    def park(self, parking: Parking) -> None:
+        """Take the group out of the scene."""
+        for placement in self.placements:
+            placement.park(parking)
+        self._switch(False)
+
+    def _switch(self, on: bool) -> None:
+        for shine in self.shines:
+            shine.switch(on)
+
+
+def _placement(shape: Any) -> MeshPlacement | TransformPlacement:
+    meshed = "vertex_positions" in mi.traverse(shape)
+    return MeshPlacement(shape) if meshed else TransformPlacement(shape)

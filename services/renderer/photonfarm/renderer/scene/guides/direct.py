@@ -1,0 +1,175 @@
+"""What lights send straight to points, and to surfaces that reflect it.
+
+Shape letters: L lit points, N rays.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.scene.arrays import floats, points, rows
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
+from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted
+from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.materials import has_other_lobes
+from photonfarm.shared.core.keys import Key, Stream
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.spec import GuideSpec
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.bdpt.recording import Recorder
+
+
+def point_light(
+    scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec, recorder: Recorder | None = None
+) -> F32:
+    """Irradiance (L, 3) of points on the side of their normals by what lights send directly; 0 without light samples.
+
+    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
+    `recorder` of `irradiance` Python runs but once.
+    """
+    if not wanted.light_samples or not scene.emitters():
+        return np.zeros_like(position)
+    lights, pattern = read_lights(scene), pattern_of(0)
+    u = (Stream(key, "point light").uniform(len(position), 1, 3) + pattern) % 1
+    at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
+    arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
+    traced = functools.partial(recorder, (len(at), lights.kinds)) if recorder else irradiance
+    found = traced(scene, None, *arguments)
+    mean: F32 = rows(found, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
+    return mean
+
+
+def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u: list[Any]) -> Any:
+    """What one sample of the lights brings to each point, on the side of its normal (Color3f)."""
+    count = dr.width(position)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
+    si.sh_frame = mi.Frame3f(si.n)
+    light = sample_direct(lights, si, Points(u), dr.full(mi.Bool, True, count))
+    cosine = dr.dot(si.n, light.d)
+    shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+    lit = light.valid & (cosine > 0)
+    lit &= ~scene.ray_test(shadow, lit)
+    found = dr.select(lit, light.radiance_over_density * cosine, 0)
+    dr.eval(found)
+    return found
+
+
+# -------------------------------------------------------------------------------------------------------- on surfaces
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """How rays came to a surface."""
+
+    met: Any  # Bool: there is one
+    direction: Any  # Vector3f: of the ray that meets it
+    followed: Any  # UInt32: surfaces left behind
+
+
+@dataclass(slots=True)
+class _Sum:
+    """Loop variables of the sums over light samples."""
+
+    index: Any  # UInt32
+    diffuse: Any  # Color3f
+    whole: Any  # Color3f
+
+
+@dataclass(slots=True)
+class Arrives:
+    """Reflected direct light."""
+
+    diffuse: Any  # Color3f: by a white diffuse surface
+    whole: Any  # Color3f: by the surface as it is
+
+    def __add__(self, more: Arrives) -> Arrives:
+        return Arrives(self.diffuse + more.diffuse, self.whole + more.whole)
+
+
+@dataclass(frozen=True, slots=True)
+class _Surface:
+    """Where direct light is asked for."""
+
+    scene: Any
+    lights: Lights
+    si: Any  # SurfaceInteraction3f
+    normal: Any  # Normal3f: turned to where the ray comes from
+    direction: Any  # Vector3f: of that ray
+    diffuse: Any  # Bool: its diffuse lobe reflects
+    other: Any  # Bool: it has other lobes
+    settings: Settings
+
+
+def lit(
+    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: Settings
+) -> Arrives:
+    """What lights send straight to a surface and it reflects: as a white diffuse one, and by all of its lobes."""
+    nothing = Arrives(mi.Color3f(0), mi.Color3f(0))
+    if lights is None or not settings.light_samples:
+        return nothing
+    flags = si.bsdf().flags()
+    reached = seen.met & (seen.followed + 2 <= settings.max_depth)
+    two_sided = mi.has_flag(flags, mi.BSDFFlags.BackSide)
+    diffuse = reached & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0))
+    diffuse &= mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
+    other = reached & has_other_lobes(flags) & settings.glossy
+    at = _Surface(scene, lights, si, turned(si.sh_frame.n, seen.direction), seen.direction, diffuse, other, settings)
+    return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
+
+
+def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+    """The mean over shadow rays to points of lights; of other lobes the share that the balance heuristic leaves."""
+    count = at.settings.light_samples
+    context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
+
+    def body(s: _Sum) -> tuple[_Sum]:
+        light = sample_direct(at.lights, si, Points(shifted(pattern, shift, s.index)), at.diffuse | at.other)
+        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+        lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
+        cosine = dr.dot(at.normal, light.d)
+        reflects = at.diffuse & lit & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, at.direction) < 0)
+        white = dr.select(reflects, light.radiance_over_density * cosine * dr.inv_pi, 0)
+        whole = mi.Color3f(0)
+        if at.settings.glossy:
+            value, density = bsdf.eval_pdf(context, si, si.to_local(light.d), at.other & lit)
+            share = dr.select(light.delta, 1, count * light.density / (count * light.density + density))
+            whole = dr.select(at.other & lit, value * light.radiance_over_density * share, 0)
+        return (_Sum(s.index + 1, s.diffuse + white, s.whole + whole),)
+
+    width = dr.width(at.diffuse)
+    start = _Sum(dr.zeros(mi.UInt32, width), dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width))
+    (sums,) = traced_once(
+        state=(start,), cond=lambda s: s.index < count, body=body, labels=("sum",), label="shadow rays"
+    )
+    diffuse = sums.diffuse / count
+    of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
+    return Arrives(diffuse, sums.whole / count + of_diffuse)
+
+
+def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+    """What one ray along a sample of the BSDF meets of lights, with the share that shadow rays leave of it."""
+    u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
+    bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
+    ray = at.si.spawn_ray(at.si.to_world(bs.wo))
+    found = at.scene.ray_intersect(ray, active=at.other)
+    emitter = found.emitter(at.scene, at.other)
+    by_light, _ = hit_densities(at.scene, at.lights, emitter, found, ray.o, at.si.p, at.other)
+    is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
+    emitted = emitter.eval(found, at.other)
+    return Arrives(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+
+
+def turned(normal: Any, direction: Any) -> Any:
+    """The normal on the side that a ray along `direction` comes from."""
+    return dr.select(dr.dot(normal, direction) > 0, -normal, normal)

@@ -1,0 +1,103 @@
+"""Rays followed through mirrors and glass, and what they find on the way and at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from photonfarm.renderer.bdpt.emission import Lights
+from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
+from photonfarm.renderer.scene.guides.direct import Seen, lit, turned
+from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.guides.specular import specular_of
+from photonfarm.renderer.scene.materials import is_pure_delta
+
+
+def trace(
+    scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
+    settings: Settings,
+) -> dict[str, Any]:  # fmt: skip
+    """What `images` makes means of, by name, of each ray; zeros where there is nothing.
+
+    `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
+    plane, whose distance from the eye is `settings.near` / `along`.
+    """
+    roughness, diffuse_kept, *pattern = tables
+    ray = mi.Ray3f(o=o, d=d, maxt=reach, time=0, wavelengths=[])
+    first = scene.ray_intersect(ray)
+    hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
+    number = dr.reinterpret_array(mi.UInt32, bsdf)
+    path, last = _followed(scene, ray, first, before, settings)
+    met, is_beyond = last.is_valid(), hit & (path.followed > 0)
+    albedo = diffuse_reflectance(last, met)
+    arrives = lit(scene, lights, last, Seen(met, path.ray.d, path.followed), pattern, shift, settings)
+    found = {
+        "hits": dr.select(hit, mi.Float(1), 0),
+        "depth": dr.select(hit, settings.near + first.t * along, 0),
+        "normal": dr.select(hit, turned(first.sh_frame.n, d), 0),
+        "specular": specular_of(bsdf, first, hit, dr.gather(mi.Float, diffuse_kept, number, hit)),
+        "roughness": dr.gather(mi.Float, roughness, number, hit),
+        "emission": path.emission,
+        "direct": path.throughput * albedo * arrives.diffuse,
+        "gloss": path.throughput * (arrives.whole - albedo * arrives.diffuse),
+        "throughput": dr.select(is_beyond, path.throughput, 0),
+        "beyond": dr.select(is_beyond & met, mi.Float(1), 0),
+        "beyond_albedo": dr.select(is_beyond & met, albedo, 0),
+        "beyond_normal": dr.select(is_beyond & met, turned(last.sh_frame.n, path.ray.d), 0),
+        "beyond_depth": dr.select(is_beyond & met, path.length + last.t, 0),
+    }
+    dr.eval(found)
+    return found
+
+
+@dataclass(slots=True)
+class _Path:
+    """Loop variables of a path through mirrors and glass."""
+
+    active: Any  # Bool: the ray has not been traced yet
+    ray: Any  # Ray3f
+    throughput: Any  # Color3f
+    emission: Any  # Color3f: of all that was met
+    length: Any  # Float: from the eye to the ray's origin
+    followed: Any  # UInt32: surfaces left behind
+
+
+def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings) -> tuple[_Path, Any]:
+    """The path of each ray, which meets `first`, to a surface that is no pure mirror, glass or null; that surface."""
+    active = dr.full(mi.Bool, True, dr.width(ray))
+    start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
+    start = _follow(scene, start, first, settings)
+    if not settings.followed:
+        return start, first
+    (path,) = traced_once(
+        state=(start,),
+        cond=lambda s: s.active,
+        body=lambda s: (_follow(scene, s, scene.ray_intersect(s.ray, active=s.active), settings),),
+        labels=("path",),
+        label="mirrors and glass",
+    )
+    led_on = path.followed > 0
+    return path, dr.select(led_on, scene.ray_intersect(path.ray, active=led_on), first)
+
+
+def _follow(scene: Any, s: _Path, si: Any, settings: Settings) -> _Path:
+    """One surface `si` on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
+
+    Sampled at 1/2, glass gives the lobe that takes more than half, with its probability, which is what it takes.
+    """
+    emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
+    bsdf = si.bsdf()
+    leads_on = s.active & si.is_valid() & is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), leads_on)
+    return _Path(
+        active=leads_on,
+        ray=dr.select(leads_on, si.spawn_ray(si.to_world(bs.wo)), s.ray),
+        throughput=dr.select(leads_on, s.throughput * weight * bs.pdf, s.throughput),
+        emission=s.emission + s.throughput * emitted,
+        length=dr.select(leads_on, s.length + si.t, s.length),
+        followed=dr.select(leads_on, s.followed + 1, s.followed),
+    )

@@ -1,0 +1,179 @@
+"""A scene loaded once and edited in place: what every sample of a scene is rendered from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.scene import backend
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
+from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
+from photonfarm.shared.scene.view import View
+
+
+class LoadedScene:
+    """A Mitsuba scene and its spec. Not thread-safe: it is in one configuration at a time.
+
+    `scene` is the Mitsuba scene, for tests and comparisons; it belongs to this object.
+    """
+
+    def __init__(self, spec: SceneSpec, scene: Any) -> None:
+        from photonfarm.renderer.bdpt import photons
+        from photonfarm.renderer.bdpt.recording import Recorder
+        from photonfarm.renderer.scene import gbuffer, guides
+        from photonfarm.renderer.scene.editing import MovableGroup
+        from photonfarm.renderer.scene.loading import lower_corner
+        from photonfarm.renderer.scene.materials import Materials
+        from photonfarm.renderer.scene.sensor import AimedSensor
+
+        self.spec = spec
+        self.scene = scene
+        self._sensor = AimedSensor(spec)
+        self._integrator = integrator_of(spec.transport)
+        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
+        self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
+        self._materials = Materials.of(scene)
+        self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
+        shapes = scene.shapes()
+        by_id = {shape.id(): shape for shape in shapes}
+        self._groups = [MovableGroup.of(_found(by_id, shape_ids(group), group.name)) for group in spec.groups]
+        self._parking = lower_corner([s for s in shapes if s.id() not in self._group_of] or shapes)
+        self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+        self._state = rest(spec)
+
+    @classmethod
+    def load(cls, spec: SceneSpec, beside: Path | None = None) -> Self:
+        """The scene of a spec, at rest; `beside` is the spec's folder, where its scene file may lie.
+
+        Raises SpecError for a scene that cannot be loaded or rendered, BackendError where Mitsuba does not work. Every
+        movable group has been parked and brought back once, so that what this compiles is compiled.
+        """
+        backend.load()
+        from photonfarm.renderer.scene.acceleration import expect_changes
+        from photonfarm.renderer.scene.loading import load_scene
+
+        loaded = cls(spec, load_scene(spec, beside))
+        if spec.groups:
+            expect_changes(loaded.scene)
+        at_rest = rest(spec)
+        loaded.apply(Modification(at_rest.translation, np.zeros_like(at_rest.present)))
+        loaded.apply(at_rest)
+        return loaded
+
+    def apply(self, modification: Modification) -> None:
+        """Bring the scene into a configuration, whatever it was in; only groups that change are touched."""
+        for i, group in enumerate(self._groups):
+            present, was_present = bool(modification.present[i]), bool(self._state.present[i])
+            translation = modification.translation[i]
+            if present and not (was_present and np.array_equal(translation, self._state.translation[i])):
+                group.move(translation, was_present=was_present)
+            elif was_present and not present:
+                group.park(self._parking)
+        self._state = modification
+        self._refresh()
+
+    def _refresh(self) -> None:
+        """Let Mitsuba rebuild what depends on all shapes.
+
+        It tells environment lights of the scene's bounding sphere before it knows the new one, and directional lights
+        never; so they are told once more.
+        """
+        if self._groups:
+            self.scene.parameters_changed([])
+            for emitter in self._distant:
+                emitter.set_scene(self.scene)
+
+    def render_halves(self, view: View, seeds: Sequence[int], half_spp: int | None = None) -> F32:
+        """Half-estimates of linear radiance for each seed, (K, H, W, 3): the spec's integrator and `half_spp`.
+
+        Or as many samples per pixel as are given.
+        """
+        spp = half_spp or self.spec.transport.half_spp
+        return np.array(self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, spp), np.float32)
+
+    def render_half(self, view: View, seed: int) -> F32:
+        """One of them, (H, W, 3)."""
+        return self.render_halves(view, (seed,))[0]
+
+    def render(self, view: View, seed: int, integrator: Any = None, spp: int | None = None) -> F32:
+        """Linear radiance (H, W, 3), with another Mitsuba integrator or number of samples per pixel if given."""
+        import drjit as dr
+        import mitsuba as mi
+
+        image = (integrator or self._integrator).render(
+            self.scene,
+            sensor=self._sensor.aim(view),
+            seed=dr.opaque(mi.UInt32, seed),
+            spp=spp or self.spec.transport.half_spp,
+        )
+        return np.array(image, np.float32)
+
+    def buffers(self, view: View) -> ViewBuffers:
+        """Depth, albedo and normal of what each pixel's centre sees in the present configuration."""
+        from photonfarm.renderer.scene.gbuffer import view_buffers
+
+        return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
+
+    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
+        """What is known of a view beside its buffers; `key` is the view's, by which its direct light is sampled.
+
+        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        """
+        from photonfarm.renderer.scene.guides import point_light, view_guides
+
+        arrives = point_light(self.scene, *lit, key, wanted, self._point_recorder)
+        return view_guides(self.scene, view, self.spec, wanted, key, self._materials, arrives, self._guide_recorder)
+
+    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
+        """Whether the view sees points (N, 3) of the present configuration, (N,)."""
+        from photonfarm.renderer.scene.visibility import seen_points
+
+        return seen_points(self.scene, view, self.spec, position)
+
+    def photons(self, seed: int) -> Photons | None:
+        """Surface hits of light sub-paths in the present configuration; None if the spec wants none."""
+        from photonfarm.renderer.bdpt.photons import trace_photons
+
+        wanted = self.spec.photons
+        if not wanted.paths:
+            return None
+        hits = trace_photons(
+            self.scene, seed=seed, paths=wanted.paths, depth=wanted.depth, recorder=self._photon_recorder
+        )
+        return Photons(hits.position, hits.direction, hits.normal, hits.power, hits.bounce.astype(np.int8))
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """Geometry and base point cloud of the scene at rest; the present configuration stays."""
+        from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of
+
+        before = self._state
+        self.apply(rest(self.spec))
+        geometry = geometry_of(self.scene.shapes(), self._group_of)
+        cloud = cloud_of(self.scene, geometry, self.spec.points, self.spec.scene_id)
+        self.apply(before)
+        return geometry, cloud
+
+
+def integrator_of(transport: Transport) -> Any:
+    """The integrator `bdpt` with the spec's parameters. Raises SpecError for those that it refuses."""
+    import mitsuba as mi
+
+    parameters = transport.model_dump(exclude={"half_spp"})
+    try:
+        return mi.load_dict({"type": "bdpt", "record": True, **parameters})
+    except (RuntimeError, ValueError) as error:
+        raise SpecError(f"transport: {' '.join(str(error).split())}") from error
+
+
+def _found(by_id: dict[str, Any], wanted: tuple[str, ...], name: str) -> list[Any]:
+    missing = sorted(set(wanted) - set(by_id))
+    if missing:
+        raise SpecError(f"{name}.shapes: {missing[0]!r} is not a shape of the loaded scene")
+    return [by_id[shape] for shape in wanted]

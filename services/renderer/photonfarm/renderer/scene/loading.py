@@ -1,0 +1,111 @@
+"""From a scene spec to a Mitsuba scene: the file or built-in room, with the lights that the spec adds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from photonfarm.renderer.bdpt.emission import is_flat
+from photonfarm.renderer.bdpt.scenes import check_scene
+from photonfarm.renderer.scene import rooms
+from photonfarm.renderer.scene.dimming import dim, factor_of
+from photonfarm.renderer.scene.rooms.shapes import rectangle_light
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.files import SceneFile
+from photonfarm.shared.scene.spec import SceneSpec, find_scene
+
+
+def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
+    """The Mitsuba scene of a spec; its cameras, films and integrators are left aside, as the spec has its own.
+
+    Shapes stay apart (`optimize=False`), as single objects could not be moved otherwise. Raises SpecError for a file
+    that is not there, that changed since the spec was read, or that Mitsuba or the integrator cannot take.
+    """
+    scene = _builtin(spec) if spec.scene.builtin else _from_file(spec, beside)
+    try:
+        check_scene(scene, light_paths=bool(spec.transport.light_ratio or spec.photons.paths))
+    except ValueError as error:
+        raise SpecError(f"{spec.name}: {error}") from error
+    _check_lights(spec, scene)
+    return scene
+
+
+def _check_lights(spec: SceneSpec, scene: Any) -> None:
+    """Raise SpecError for mesh lights with smooth normals: they can be hit only, and would give next to pure noise."""
+    for shape in scene.shapes():
+        if shape.is_emitter() and shape.is_mesh() and not np.array(is_flat(shape)).all():
+            raise SpecError(
+                f"{spec.name}: mesh light {shape.id()!r} has smooth vertex normals, with which it cannot be sampled "
+                'without bias; give it <boolean name="face_normals" value="true"/>'
+            )
+
+
+def _builtin(spec: SceneSpec) -> Any:
+    shapes = rooms.describe(str(spec.scene.builtin))
+    scene = mi.load_dict({"type": "scene", **shapes, **_added_lights(spec)}, optimize=False)
+    dim(scene, spec)
+    return scene
+
+
+def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
+    file = SceneFile.read(find_scene(str(spec.scene.file), spec.name, beside))
+    if file.digest != spec.content:
+        raise SpecError(
+            f"{spec.name}: {file.path} or a file it names is not what the spec was made from; load the spec anew"
+        )
+    try:
+        with _threads_to_read_with():
+            scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
+    except (RuntimeError, ValueError) as error:
+        raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
+    dim(scene, spec)
+    free = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+    shining = [emitter for emitter in free if factor_of(emitter, spec) > 0]
+    added = _added_lights(spec)
+    if len(shining) == len(free) and not added:
+        return scene
+    return _joined([*scene.shapes(), *shining], added)
+
+
+@contextmanager
+def _threads_to_read_with() -> Iterator[None]:
+    """Two threads at least: the decoder of OpenEXR files waits for ever in a pool of one."""
+    count = dr.thread_count()
+    dr.set_thread_count(max(count, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
+
+
+def _joined(parts: list[Any], added: dict[str, Any]) -> Any:
+    """A scene of loaded parts, which keep their ids, and of others to load."""
+    ids = [part.id() for part in parts]
+    keys = [f"_part_{i}" for i in range(len(parts))]  # ids need not be there, and may have dots, which no key may
+    scene = mi.load_dict({"type": "scene", **dict(zip(keys, parts, strict=True)), **added}, optimize=False)
+    for part, name in zip(parts, ids, strict=True):
+        part.set_id(name)
+    return scene
+
+
+def _added_lights(spec: SceneSpec) -> dict[str, Any]:
+    return {
+        light.name: rectangle_light(light.at, light.rectangle.size, spec.view.up, light.rectangle.radiance)
+        for light in spec.lights
+        if light.rectangle is not None
+    }
+
+
+def _sentence(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def lower_corner(shapes: list[Any]) -> Any:
+    """The lower corner (3,) of the shapes' common bounding box."""
+    return np.min([[shape.bbox().min[i] for i in range(3)] for shape in shapes], axis=0).astype(np.float32)

@@ -1,0 +1,1 @@
+"""The sampling plan as people read it, and as a spec holds it."""

@@ -1,0 +1,138 @@
+"""A plan for people to read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from photonfarm.renderer.strategy.candidate import Candidate
+from photonfarm.renderer.strategy.choices import Offer, best
+from photonfarm.renderer.strategy.comparison import CLEAR, WORTHWHILE, saving
+from photonfarm.renderer.strategy.measurement import present
+from photonfarm.renderer.strategy.output.table import legend, table
+from photonfarm.renderer.strategy.plan import Plan
+from photonfarm.renderer.strategy.reasons import BLACK, plus_minus, reasons_for
+
+
+def lines(plan: Plan) -> list[str]:
+    """The verdict, what is modelled, what is left out, why, what that saves, and the measurement it rests on."""
+    m = plan.measurement
+    origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
+    return [
+        f"{plan.spec.name}: connections {plan.candidate.connections}, light_ratio {plan.candidate.light_ratio:g}, "
+        f"half_spp {plan.half_spp}; photons: paths {plan.photons.paths}, depth {plan.photons.depth}",
+        _verdict(plan),
+        "",
+        "Modelled",
+        *(f"  {sentence}" for sentence in (*m.modelled, plan.photons_reason, *_halves(plan))),
+        "Left out",
+        *(f"  {sentence}" for sentence in (*m.left_out, *_unchosen(plan)) or ("nothing",)),
+        "Why",
+        *(f"  {reason}" for reason in _why(plan)),
+        "Measured saving",
+        *(f"  {sentence}" for sentence in _savings(plan)),
+        "",
+        *_measured(plan),
+        f"{origin}: {m.views} views of {m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU, "
+        f"{m.compiling_s:.0f} of them to load, to compile, to time images and to weight them",
+    ]
+
+
+def _verdict(plan: Plan) -> str:
+    now = present(plan.spec)
+    if not plan.offers:
+        return "nothing was measured: every view is black"
+    if plan.candidate == now:
+        found = best(_fitting(plan))
+        better = "the spec's settings are the best measured" if found.candidate == now else _NO_GAIN
+        return f"{better}: keep them"
+    gain = plan.saving(now)
+    factor = plus_minus(gain.factor, gain.spread)
+    return f"change them: {factor} times as fast to the same error as the spec's settings, {now}"
+
+
+_NO_GAIN = "no significant gain over the spec's settings"
+
+
+def _fitting(plan: Plan) -> dict[Candidate, Offer]:
+    return {c: offer for c, offer in plan.offers.items() if offer.fits}
+
+
+def _halves(plan: Plan) -> list[str]:
+    if plan.halves_overhead is None:
+        return []
+    return [
+        f"both half-estimates: they cost at most {plan.halves_overhead:.0%} more than one image of twice the samples, "
+        "and without them no error could be measured free of noise"
+    ]
+
+
+def _unchosen(plan: Plan) -> list[str]:
+    """Of light paths and connections, those that the plan does without though they were measured."""
+    if plan.measurement.left_out or not plan.offers:
+        return []
+    if not plan.candidate.light_ratio:
+        return [f"light paths: {_not_better(plan, lambda c: c.light_ratio > 0)}"]
+    if not plan.candidate.connections:
+        return [f"connections: {_not_better(plan, lambda c: c.connections > 0)}"]
+    return []
+
+
+def _not_better(plan: Plan, has: Callable[[Candidate], bool]) -> str:
+    chosen = plan.offers[plan.candidate]
+    others = [offer for offer in plan.offers.values() if has(offer.candidate)]
+    if all(saving(chosen, offer).deviations >= CLEAR for offer in others):
+        return "all settings with them take longer to the same error here"
+    return "no settings with them that fit the cost are shown to be worth a change"
+
+
+# --------------------------------------------------------------------------------------------------------------- why
+
+
+def _why(plan: Plan) -> list[str]:
+    if not plan.offers:
+        return [BLACK]
+    rows = list(plan.offers.values())
+    reasons = [*reasons_for(plan.offers[plan.candidate], rows, plan.measurement.shared), *_not_taken(plan)]
+    now, half_spp = present(plan.spec), plan.spec.transport.half_spp
+    if plan.half_spp != half_spp:
+        reasons.append(f"half_spp {plan.half_spp} costs about what {half_spp} does with the spec's settings, {now}")
+    return reasons
+
+
+def _not_taken(plan: Plan) -> list[str]:
+    """Why the best measured is not what the plan says, where it is not."""
+    reasons = []
+    chosen, fitting, any_cost = plan.offers[plan.candidate], best(_fitting(plan)), best(dict(plan.offers))
+    if fitting.candidate != plan.candidate:
+        gain = saving(fitting, over=chosen)
+        if gain.factor > 1:
+            reasons.append(
+                f"{fitting.candidate} was measured {plus_minus(gain.factor, gain.spread)} times as fast; less than "
+                f"{CLEAR:g} standard errors or {WORTHWHILE:.0%} are not worth a change, after which all samples are "
+                "rendered again"
+            )
+    gain = saving(any_cost, over=chosen)
+    if not any_cost.fits and gain.significant:
+        reasons.append(
+            f"one sample of {any_cost.candidate} costs more than a half-estimate does now; a larger half_spp allows "
+            f"it, which reaches the same error {plus_minus(gain.factor, gain.spread)} times as fast"
+        )
+    return reasons
+
+
+def _savings(plan: Plan) -> Sequence[str]:
+    now = present(plan.spec)
+    if plan.savings:
+        return [
+            f"{plus_minus(gain.factor, gain.spread)} times as fast to the same error as {gain.over}"
+            + (", the spec's settings now" if gain.over == now else "")
+            for gain in plan.savings
+        ]
+    return ["none: the spec has these settings already" if plan.candidate == now else "none: nothing to compare with"]
+
+
+def _measured(plan: Plan) -> list[str]:
+    """The table, its legend and an empty line each; nothing where nothing was measured."""
+    if not plan.offers:
+        return []
+    return [*table(list(plan.offers.values()), plan.candidate), "", *legend(plan.spec), ""]

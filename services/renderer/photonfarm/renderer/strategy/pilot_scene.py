@@ -1,0 +1,70 @@
+"""What the pilot of a spec is rendered on: a loaded scene, some configurations of it, and a view of each."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
+from photonfarm.renderer.scene.sensor import AimedSensor
+from photonfarm.renderer.strategy.candidate import Candidate, Render
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View, sample_view
+
+SEED = 0
+"""Master seed of the configurations, views and images of pilots."""
+
+
+class Stage:
+    """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
+
+    def __init__(self, spec: SceneSpec, beside: Path | None) -> None:
+        """Load the scene of a spec, on a film as small as the pilot wants it."""
+        self.spec = spec
+        self.loaded = LoadedScene.load(spec, beside)
+        self._integrators: dict[Candidate, Any] = {}
+        self._applied: Modification | None = None
+        self._editing_s = 0.0
+
+    def clock(self) -> float:
+        """CPU seconds of this process, without those that editing the scene took: it costs all candidates the same."""
+        return time.process_time() - self._editing_s
+
+    def renders(self, count: int) -> list[Render]:
+        """A function for each of some configurations, which renders one view of it."""
+        return [partial(self._render, *drawn) for drawn in _draw(self.spec, count)]
+
+    def configurations(self, count: int) -> Iterator[Any]:
+        """The Mitsuba scene in each of the same configurations, in turn."""
+        for modification, _ in _draw(self.spec, count):
+            self._apply(modification)
+            yield self.loaded.scene
+
+    def camera(self) -> Any:
+        """Mitsuba's sensor, aimed anywhere."""
+        return AimedSensor(self.spec).sensor
+
+    def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
+        self._apply(modification)
+        if candidate not in self._integrators:
+            settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
+            self._integrators[candidate] = integrator_of(self.spec.transport.model_copy(update=settings))
+        return self.loaded.render(view, seed, self._integrators[candidate], spp)
+
+    def _apply(self, modification: Modification) -> None:
+        if modification is not self._applied:
+            start = time.process_time()
+            self.loaded.apply(modification)
+            self._applied = modification
+            self._editing_s += time.process_time() - start
+
+
+def _draw(spec: SceneSpec, count: int) -> Iterator[tuple[Modification, View]]:
+    for i in range(count):
+        modification = sample_modification(spec, SEED, i)
+        yield modification, sample_view(spec, modification.key(spec.scene_id), SEED, i)

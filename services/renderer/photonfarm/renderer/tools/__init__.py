@@ -1,0 +1,1 @@
+"""Tools for people: the contact sheet, and the doctor."""

@@ -1,0 +1,123 @@
+"""What works on this machine, and what to do about what does not; each check is a real use, not a look at versions."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
+from photonfarm.shared.store.io.storage import open_storage
+
+if TYPE_CHECKING:
+    from photonfarm.shared.store.io.objects import ObjectStorage
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The result of one check."""
+
+    name: str
+    works: bool
+    detail: str
+    exit_code: int = 0  # of the command, if this does not work and is needed
+
+
+def examine(store: str | Path, redis_url: str) -> Iterator[Finding]:
+    """Every check in turn; optional parts that are absent are reported and give exit code 0."""
+    yield _packages()
+    yield _tried("renderer", _renders)
+    yield _tried("store", lambda: _writes(store))
+    yield _tried("embedded Redis", _starts_redis)
+    yield _optional(_tried("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
+    yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
+
+
+def _packages() -> Finding:
+    names = ("photonfarm-shared", "mitsuba", "drjit", "zarr", "rq", "redis")
+    return Finding("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
+
+
+def _tried(name: str, check: Callable[[], str]) -> Finding:
+    try:
+        return Finding(name, True, check())
+    except PhotonfarmError as error:
+        return Finding(name, False, str(error), error.exit_code)
+
+
+def _optional(finding: Finding, note: str) -> Finding:
+    return finding if finding.works else Finding(finding.name, False, f"{finding.detail} ({note})")
+
+
+def _renders() -> str:
+    from photonfarm.renderer.scene import backend
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
+    from photonfarm.shared.scene.spec import load_spec
+    from photonfarm.shared.scene.view import sample_view
+
+    mi = backend.load(threads=1)
+    spec = load_spec("cornell")
+    start = time.perf_counter()
+    image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
+    seconds = time.perf_counter() - start
+    size = f"{spec.film.width} × {spec.film.height}"
+    return f"{mi.variant()}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"
+
+
+def _writes(store: str | Path) -> str:
+    if isinstance(store, str):
+        return _writes_to_bucket(store)
+    try:
+        folder = next(p for p in (store.absolute(), *store.absolute().parents) if p.exists())
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".doctor-"):
+            free_gb = shutil.disk_usage(folder).free / 1e9
+    except OSError as error:
+        raise StoreError(f"{store}: cannot be written: {error.strerror}") from error
+    reserve_gb = WorkerSettings.model_fields["reserve_bytes"].default / 1e9
+    if free_gb < reserve_gb:
+        raise StoreError(
+            f"{store}: can be written, but {free_gb:.1f} GB are free, and `photonfarm work` takes no job below "
+            f"{reserve_gb:g} GB; make room, or give it a smaller --reserve"
+        )
+    return f"{store} can be written, {free_gb:.0f} GB free"
+
+
+def _writes_to_bucket(url: str) -> str:
+    with store_errors("write", url):
+        cast("ObjectStorage", open_storage(url)).check()
+    return f"{url} can be written, and does not overwrite where it must not"
+
+
+def _starts_redis() -> str:
+    from photonfarm.shared.farm.redis_server import EmbeddedRedis
+    from photonfarm.shared.queue import connect
+
+    with tempfile.TemporaryDirectory() as folder, EmbeddedRedis(Path(folder)) as server:
+        return f"version {connect(server.url).info('server')['redis_version']}"
+
+
+def _reaches(url: str) -> str:
+    from photonfarm.shared.queue import connect
+
+    try:
+        return f"version {connect(url).info('server')['redis_version']}"
+    except QueueError:
+        raise
+    except OSError as error:
+        raise QueueError(str(error)) from error
+
+
+def _scenes() -> Finding:
+    from photonfarm.shared.scene.spec import SCENES_VARIABLE
+
+    folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
+    found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
+    detail = ", ".join(found) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
+    return Finding("scenes", bool(found), detail)

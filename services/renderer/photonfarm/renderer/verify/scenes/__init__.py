@@ -1,0 +1,1 @@
+"""The hard scenes, each with its truth."""

@@ -1,0 +1,138 @@
+"""The integrator's weights against the oracle's, on real paths through small scenes with all kinds of lights."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from photonfarm.renderer.bdpt.emission import read_lights
+from photonfarm.renderer.bdpt.integrator import connection_count
+from photonfarm.renderer.verify.scenes import hard_scenes
+from photonfarm.renderer.verify.scenes.case import Scene, Settings
+from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from photonfarm.renderer.verify.scenes.truths import load
+from photonfarm.renderer.verify.weights import oracle
+from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCounts, stored, walk, weights_of
+from photonfarm.renderer.verify.weights.oracle import Mask, Paths
+
+TOLERANCE = 1e-3
+"""Of the sum of a path's weights, and of each weight relative to the oracle's."""
+REFRACTED = 2e-2
+"""The same through a ball of glass: rays start a little off its surface, so it is not quite a ball."""
+EDGES = 6
+_SIZE = 16
+_GRAZING = 4.0  # proportion of densities beyond which the ray's offset decides where it leaves the glass
+_NEGLIGIBLE = 1e-5  # weights below this are compared in absolute terms
+
+
+def shiny_room(size: int) -> Scene:
+    """The lit room with a large light, a ball of glass, a mirror, and rough plastic all around."""
+    rough = {"type": "roughplastic", "alpha": 0.3}
+    scene = {
+        name: {**entry, "bsdf": rough} if name in ("floor", "back") else entry for name, entry in lit_room(size).items()
+    }
+    return {
+        **scene,
+        "glass": {"type": "sphere", "center": [-0.4, 0, 0.4], "radius": 0.4, "bsdf": {"type": "dielectric"}},
+        "mirror": rectangle([0.5, 0.7], [0.95, 0, 0.9], [-1, 0, 0.1], bsdf={"type": "conductor"}),
+        "light": rectangle([0.6, 0.6], [0, 0, 1.95], [0, 0, -1], emitter=shining(2.0)),
+    }
+
+
+def bulb_room(size: int) -> Scene:
+    """The room with a point light alone."""
+    scene = {name: entry for name, entry in lit_room(size).items() if name != "light"}
+    return {
+        **scene,
+        "bulb": {"type": "point", "position": [0.3, -0.4, 1.2], "intensity": {"type": "rgb", "value": 1.0}},
+    }
+
+
+def ball_light(size: int) -> Scene:
+    """A floor and a plastic ball lit by a shining ball."""
+    return {
+        "type": "scene",
+        "sensor": camera(size, [0, -4, 2], [0, 0, 0.3], 40),
+        "floor": rectangle([1.5, 1.5], [0, 0, 0], [0, 0, 1], bsdf=grey(0.5)),
+        "ball": {"type": "sphere", "center": [-0.4, 0, 0.5], "radius": 0.5, "bsdf": {"type": "plastic"}},
+        "light": {"type": "sphere", "center": [0.8, -0.2, 0.9], "radius": 0.3, "emitter": shining(3.0)},
+    }
+
+
+SCENES: dict[str, Callable[[int], Scene]] = {
+    "cornell": hard_scenes.cornell,
+    "shiny-room": shiny_room,
+    "bulb-room": bulb_room,
+    "ball-light": ball_light,
+    "rotated-envmap": hard_scenes.rotated_envmap,
+    "many-lights": hard_scenes.many_lights,
+}
+"""What the tests look at."""
+LONG_SCENES = {**SCENES, **{name.replace("_", "-"): build for name, build in hard_scenes.HARD_SCENES.items()}}
+"""What the long version looks at."""
+
+
+@dataclass(slots=True)
+class Comparison:
+    """What came of one scene."""
+
+    paths: int = 0
+    with_delta: int = 0  # of them with a mirror or a smooth interface on the way
+    sum_error: float = 0.0  # largest |Σ weights − 1|
+    weight_error: float = 0.0  # largest |weight − oracle's| relative to the oracle's, of paths without refraction
+    refracted_error: float = 0.0  # of paths with it, but for grazing ones
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What is beyond the tolerance; NaN is."""
+        named = (
+            ("the sum of a path's weights", self.sum_error, TOLERANCE),
+            ("a weight", self.weight_error, TOLERANCE),
+            ("a weight of a path with a refraction", self.refracted_error, REFRACTED),
+        )
+        return tuple(
+            f"{what} is off by {error:.2g}, allowed is {most:g}" for what, error, most in named if not error <= most
+        )
+
+
+def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0) -> Comparison:
+    """All techniques of all paths of 2 … `EDGES` edges that ``lanes`` primary rays make."""
+    scene = load(build(_SIZE))
+    lights, lens = read_lights(scene), Pinhole.of(scene)
+    count = connection_count(settings.connections, EDGES)
+    result = Comparison()
+    for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
+        complete = np.array(joined.complete)
+        if not complete.any():
+            continue
+        counts = TechniqueCounts(count, settings.light_ratio)
+        ours = weights_of(scene, lights, joined, lens, counts)[complete]
+        paths = stored(lights, joined, lens)
+        walked = _can_be_walked(paths)
+        truth = oracle.weights(paths, oracle.technique_counts(paths.edges, count, settings.light_ratio))
+        ours, truth = ours[walked], truth[walked]
+        result.paths += len(truth)
+        result.with_delta += int(paths.delta[walked].any(axis=1).sum())
+        refracted = (paths.turn[walked] != 1).any(axis=1)
+        off = (np.abs(ours - truth) / np.maximum(truth, _NEGLIGIBLE)).max(axis=1)
+        result.sum_error = _largest(result.sum_error, np.abs(ours.sum(axis=1) - 1))
+        result.weight_error = _largest(result.weight_error, off[~refracted])
+        grazing = (paths.turn[walked] > _GRAZING).any(axis=1)
+        result.refracted_error = _largest(result.refracted_error, off[refracted & ~grazing])
+    return result
+
+
+def _can_be_walked(paths: Paths) -> Mask:
+    """[N]: whether eye paths find all vertices.
+
+    Rays start a little off surfaces: seen from the vertex itself the next one may lie behind a grazing surface.
+    """
+    return np.asarray((paths.delta | (paths.to_light > 0))[:, 2:-1].all(axis=1))
+
+
+def _largest(before: float, errors: npt.ArrayLike) -> float:
+    """NaN if any is."""
+    return float(np.max(np.append(errors, before)))

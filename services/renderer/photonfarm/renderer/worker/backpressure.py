@@ -1,0 +1,120 @@
+"""When a worker should take no job: the disk is nearly full, or the trainer is far behind.
+
+Neither fails a job, and both pass by themselves. They hold back what has not begun; the job in hand is finished.
+"""
+
+from __future__ import annotations
+
+import errno
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from redis import Redis
+
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import store_errors
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.shared.store.write.scene_store import Progress
+
+AHEAD_MINIMUM = 256
+"""Samples that may be committed before any has been used: a trainer waits for its first few, also held-out ones."""
+
+AHEAD_LOOK_S = 5.0
+"""Between counts of what is committed, which lists every marker."""
+
+FULL_S = 30.0
+"""How long a disk that refused a commit is left alone, where the reserve does not tell when there is space again."""
+
+
+class DiskReserve:
+    """Keeps some of a store's disk free; a store that is not on a disk of ours has no end."""
+
+    def __init__(self, store: Store, reserve_bytes: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take a store and how much of its disk is to stay free."""
+        self._root = store.storage.root if isinstance(store.storage, LocalStorage) else None
+        self._reserve_bytes = reserve_bytes
+        self._clock = clock
+        self._refused_until = 0.0
+
+    def refused(self) -> None:
+        """The disk has just refused a write, whatever it says of its space: quotas are not seen there."""
+        self._refused_until = self._clock() + FULL_S
+
+    def reason(self) -> str | None:
+        """Why no job should be taken now; None if there is none. Raises StoreError if the store's folder is gone."""
+        if self._clock() < self._refused_until:
+            return "the disk is full; trying again now and then"
+        with store_errors("ask how much of the disk is free", str(self._root)):
+            free = _free_bytes(self._root)
+        if free is None or free >= self._reserve_bytes:
+            return None
+        return (
+            f"{free / 1e9:.1f} GB are free on the disk of {self._root}, and {self._reserve_bytes / 1e9:g} GB are to "
+            "stay free (--reserve)"
+        )
+
+
+def _free_bytes(root: Path | None) -> int | None:
+    return None if root is None else shutil.disk_usage(root).free
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error means that there is no space, on the disk or in a quota."""
+    cause = error.__cause__ if error.__cause__ is not None else error
+    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+class TrainerPace:
+    """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
+
+    Each scene by itself: a trainer uses the samples of one. Samples that lack guides do not count in a scene that is to
+    have them: a trainer that needs these cannot use them yet, and would wait for workers that wait for it.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        connection: Redis,
+        ratio: float,
+        *,
+        scene_id: str | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Take where both numbers are found; a ratio below 1 would stop for good, as no more is used than committed."""
+        self._store = store
+        self._connection = connection
+        self._ratio = ratio
+        self._scene_id = scene_id
+        self._clock = clock
+        self._due = 0.0
+        self._ahead: dict[str, str] = {}
+
+    def ahead(self) -> dict[str, str]:
+        """Why no job of a scene should be taken now, by the ids of such scenes. Raises redis.RedisError."""
+        if self._clock() >= self._due:
+            self._ahead = self._look()
+            self._due = self._clock() + AHEAD_LOOK_S
+        return self._ahead
+
+    def _progress(self) -> dict[str, Progress]:
+        """By scene id; a scene that cannot be read holds nobody back."""
+        if self._scene_id is None:
+            return self._store.each(SceneStore.progress)[0]
+        return {self._scene_id: self._store.scene(self._scene_id).progress()}
+
+    def _look(self) -> dict[str, str]:
+        committed = {
+            scene_id: progress.usable_samples
+            for scene_id, progress in self._progress().items()
+            if progress.usable_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
+        }
+        used = queue.consumed_samples(self._connection, list(committed))
+        return {
+            scene_id: f"{samples} samples are committed, and the trainer has used {used[scene_id]} "
+            f"(--ahead {self._ratio:g})"
+            for scene_id, samples in committed.items()
+            if samples > self._ratio * used[scene_id]
+        }

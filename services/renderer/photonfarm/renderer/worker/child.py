@@ -1,0 +1,342 @@
+"""The worker's child: an RQ worker that keeps its scenes warm, for our jobs alone.
+
+What RQ leaves out is here: a deadline that also ends native code, recycling, and filling the queue when idle. What it
+has too much of is left out: commands over pub/sub, scheduled jobs, maintenance that loads strangers' jobs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import redis
+from redis import Redis
+from rq import SimpleWorker
+from rq.serializers import JSONSerializer
+from rq.worker.base import StopRequested, WorkerStatus
+
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
+from photonfarm.renderer.worker.heartbeat import Heart
+from photonfarm.renderer.worker.log import Talk, Tally
+from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import (
+    BackendError,
+    CorruptError,
+    IncompleteError,
+    PhotonfarmError,
+    QueueError,
+    SceneNotHereError,
+    StoreError,
+)
+from photonfarm.shared.queue import RenderArguments, RenderJob
+from photonfarm.shared.store import SceneStore, Store
+
+STARTS_ALLOWED = 5
+"""Starts of one job without an end, after which it counts as failed: it kills its workers."""
+
+RQ_WORKER_TTL_S = 120
+"""After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
+
+POLL_S = 0.2
+"""Between looks at an empty queue."""
+
+NOT_HERE_S = 300.0
+"""For so long a scene is left to others whose files are not here; then they are looked for again."""
+
+log = logging.getLogger(__name__)
+
+
+def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
+    """The child's main function: settings from stdin, work, and the exit code; its last words go to stdout."""
+    words = os.dup(1)
+    os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
+    settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
+    threading.Thread(target=_end_with_supervisor, daemon=True).start()
+    try:
+        store = Store(settings.store)
+        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
+        return RenderWorker(settings, store, queue.connect(settings.redis_url), words).run()
+    except PhotonfarmError as error:
+        _leave_word(words, str(error))
+        return error.exit_code
+    except redis.RedisError as error:
+        _leave_word(words, f"lost Redis: {error}")
+        return QueueError.exit_code
+
+
+def _leave_word(words: int, message: str) -> None:
+    """Tell the supervisor, if it is still there."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(words, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
+
+
+def _end_with_supervisor() -> None:
+    """Stop once the supervisor is gone: after the job in hand, or in the middle of it after GRACE_S."""
+    while os.read(0, 1):  # not through sys.stdin, whose lock would be held at the interpreter's end
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class RenderWorker(SimpleWorker):
+    """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
+
+    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, words: int | None = None) -> None:
+        """Register nothing yet; `words` is a file descriptor that the supervisor reads, if there is one."""
+        self._queue = queue.open_queue(connection)
+        super().__init__(
+            [self._queue],
+            name=f"{settings.name}-{os.getpid()}-{time.time_ns():x}",
+            connection=connection,
+            job_class=RenderJob,
+            serializer=JSONSerializer,
+            log_job_description=False,
+            worker_ttl=RQ_WORKER_TTL_S,
+        )
+        self._settings = settings
+        self._store = store
+        self._fatal: PhotonfarmError | None = None
+        self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
+        self._failed = False  # the job in hand
+        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others…
+        self._look_again: dict[str, float] = {}  # …and until when
+        self._heart = Heart(settings, store, words)
+        self._disk = DiskReserve(store, settings.reserve_bytes)
+        self._pace = (
+            None
+            if settings.ahead is None
+            else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
+        )
+        self._talk = Talk(settings)
+        self._words = words
+        self._tally = Tally()
+
+    def run(self) -> int:
+        """Work until stopped, complete or due for a successor; the exit code, 0 only if all is complete."""
+        self._heart.start()
+        self.bootstrap(logging_level="WARNING")
+        self._install_signal_handlers()
+        done = 0
+        try:
+            while not self._stop_requested:
+                self.heartbeat()
+                job = self._take()
+                if job is None:
+                    if self._fill_or_finish():
+                        return 0
+                    continue
+                self.execute_job(job, self._queue)
+                done += 1
+                if self._fatal:
+                    raise self._fatal
+                worn = done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+                if worn or self._tainted:
+                    return RECYCLED
+        except StopRequested:
+            pass
+        finally:
+            with contextlib.suppress(redis.RedisError):
+                self._heart.end()
+                self.teardown()
+        return RECYCLED  # for a supervisor that has not been told to stop itself
+
+    def subscribe(self) -> None:
+        """Nothing: whoever may write to Redis could stop workers and jobs by RQ's commands, and nobody needs them."""
+
+    def run_maintenance_tasks(self) -> None:
+        """Nothing: `reconcile` does what is needed, without loading strangers' jobs."""
+
+    def get_heartbeat_ttl(self, job: RenderJob) -> int:  # noqa: ARG002
+        """How long RQ's own records of a running job last, in seconds."""
+        return int(self._settings.deadline_s) + 60
+
+    # ---------------------------------------------------------------------------------------------------- taking a job
+
+    def _take(self) -> RenderJob | None:
+        """The next job; None if for a while there was none, or none should be taken."""
+        queue.serve(self.connection, self._store)
+        held_back = self._disk.reason()
+        self._talk.pausing(held_back)
+        self._heart.paused = held_back
+        self._heart.left = self._left()
+        until = time.monotonic() + self._settings.idle_s
+        while True:
+            job, strangers = (None, 0) if held_back else self._next()
+            if strangers:
+                log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
+            if job is not None or time.monotonic() >= until:
+                return job
+            time.sleep(self._settings.idle_s if self._heart.left else POLL_S)  # Redis looks at each job that is left
+
+    def _next(self) -> tuple[RenderJob | None, int]:
+        return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._heart.left)
+
+    def _left(self) -> dict[str, str]:
+        """Why this worker takes no jobs of some scenes now, by their ids."""
+        ahead = self._pace.ahead() if self._pace else {}
+        self._talk.waiting(ahead)
+        for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
+            del self._not_here[scene_id], self._look_again[scene_id]
+        return {**ahead, **{scene_id: str(error) for scene_id, error in self._not_here.items()}}
+
+    def _fill_or_finish(self) -> bool:
+        """Look at the store, as there is no coordinator; True if there is nothing left to wait for.
+
+        Raises StoreError if the store is gone: an empty folder in its place has nothing missing.
+        """
+        self._store.check()
+        if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
+            return False
+        self._store.sweep()
+        if not self._settings.until_complete:
+            return False
+        missing, unreadable = self._missing()
+        failed = queue.queue_status(self.connection).failed
+        not_failed = missing.keys() - failed.keys()
+        if not_failed and all(missing[name] in self._not_here for name in not_failed):
+            raise self._not_here[missing[min(not_failed)]]
+        if unreadable and not not_failed:  # and nothing else is left: the others were gone on with
+            raise unreadable[min(unreadable)]
+        if missing and not not_failed:
+            first = min(missing)
+            raise IncompleteError(
+                f"{len(missing)} jobs have failed; {first}: {failed[first].reason}. `photonfarm status` has the "
+                "causes, and commands that repeat them"
+            )
+        return not missing
+
+    def _missing(self) -> tuple[dict[str, str], dict[str, StoreError]]:
+        """The scene ids of the missing jobs, by their names; and why nothing is known of some scenes, by their ids."""
+        only = self._settings.scene_id
+        unreadable: dict[str, StoreError] = {}
+        if only is None:
+            found, unreadable = self._store.each(SceneStore.missing_jobs)
+        else:
+            found = {only: self._store.scene(only).missing_jobs()}
+        return {queue.job_name(scene, job): scene for scene, jobs in found.items() for job in jobs}, unreadable
+
+    # ------------------------------------------------------------------------------------------------------------- jobs
+
+    def execute_job(self, job: RenderJob, queue: Any) -> None:
+        """Run one job under a heartbeat and a deadline."""
+        self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
+        self._failed = False
+        began = time.monotonic()
+        with self._heart.working(job.id), self._talk.timing(job.id):
+            self._count_start(job)
+            super().execute_job(job, queue)
+            self._settle(job.id)
+        self._count(job.id, time.monotonic() - began)
+
+    def _count(self, name: str, seconds: float) -> None:
+        """Have the supervisor know what became of the jobs so far: it outlives us, whatever ends us."""
+        done = not self._failed
+        self._tally += Tally(done, not done, self._samples(name) if done else 0, seconds)
+        if self._words is not None:
+            _leave_word(self._words, self._tally.line)
+
+    def _samples(self, name: str) -> int:
+        """How many samples a job has; 0 where its scene cannot be read any more."""
+        with contextlib.suppress(PhotonfarmError, IndexError):
+            arguments = RenderArguments.of(name)
+            return len(self._store.scene(arguments.scene_id).job_rows(arguments.job).samples)
+        return 0
+
+    def _count_start(self, job: RenderJob) -> None:
+        """Count a start, and have a job refused that has been started too often."""
+        starts = queue.count_start(self.connection, job.id)
+        if starts > STARTS_ALLOWED:
+            job.refuse(self._given_up(job.id, starts - 1))
+
+    def _given_up(self, name: str, starts: int) -> str:
+        """Why a job is not started again."""
+        overdue = min(queue.overdue(self.connection, name), starts)
+        late = f"it took longer than --deadline {self._settings.deadline_s:g} s and was ended"
+        if overdue == starts:
+            return f"it was started {starts} times, and each time {late}"
+        died = f"it was started {starts} times, and each time its worker died or lost Redis"
+        return f"{died}, or {late} ({overdue} times)" if overdue else died
+
+    def _settle(self, name: str) -> None:
+        """Count nothing against a job that has ended, but its failures."""
+        if self._failed:
+            queue.forget_starts_of(self.connection, name)
+        else:
+            queue.forget_failures_of(self.connection, name)
+
+    def handle_exception(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> None:  # noqa: ARG002
+        """Decide what a failed job means: for the job, for this worker, or nothing."""
+        if self._is_committed(job.id):
+            log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", job.id, error)
+            return
+        self._failed = True
+        what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"
+        known = isinstance(error, PhotonfarmError | redis.RedisError)
+        log.warning("job %s %s: %s", job.id, what, error, exc_info=None if known else error)
+        if is_full(error):
+            self._disk.refused()
+        elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
+            scene_id = job.id.rpartition("-")[0]
+            self._not_here[scene_id] = error
+            self._look_again[scene_id] = time.monotonic() + NOT_HERE_S
+            log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
+        elif (fatal := self._fatal_of(error)) is not None:
+            self._fatal = fatal
+            with contextlib.suppress(redis.RedisError):
+                queue.put_back(self._queue, job.id)
+        elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
+            self._tainted = not isinstance(error, PhotonfarmError)
+            with contextlib.suppress(redis.RedisError):
+                self._record(job.id, f"{type(error).__name__}: {error}")
+
+    def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
+        """What the next job would fail of as well; in a store that is gone, whatever the job has failed of."""
+        if isinstance(error, redis.RedisError):
+            return None
+        try:
+            self._store.check()
+        except StoreError as gone:
+            return gone
+        return error if isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError) else None
+
+    def _is_committed(self, name: str) -> bool:
+        with contextlib.suppress(PhotonfarmError, OSError):
+            arguments = RenderArguments.of(name)
+            return self._store.scene(arguments.scene_id).is_done(arguments.job)
+        return False
+
+    def _record(self, name: str, reason: str) -> None:
+        failure = queue.record_failure(self.connection, name, reason)
+        if failure.set_aside:
+            log.warning(
+                "job %s has failed %d times and is set aside; photonfarm submit --retry queues it again, and this "
+                "repeats it: %s",
+                name,
+                failure.times,
+                queue.repeating_command(self._settings.store, name),
+            )
+
+
+def _resident_bytes() -> int:
+    """Memory of this process now; its peak where the system does not tell."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+if __name__ == "__main__":
+    sys.exit(child())

@@ -1,0 +1,85 @@
+"""A worker's heartbeat and a job's deadline, both kept by threads that no rendering holds up."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import os
+import threading
+from collections.abc import Iterator, Mapping
+
+import redis
+
+from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.store import Store
+
+STDERR = 2
+
+
+class Heart:
+    """Tells Redis that the worker and its job are alive, and what holds it up, from a thread with its own connection.
+
+    `paused` says why it takes no jobs, and `left` by scene id why it leaves scenes alone for now.
+    """
+
+    def __init__(self, settings: WorkerSettings, store: Store, words: int | None) -> None:
+        """Connect; `words` is a file descriptor for the supervisor. Raises QueueError if there is no Redis."""
+        self._settings = settings
+        self._store = store
+        self._words = words
+        self._connection = queue.connect(settings.redis_url)
+        self._supervisor = os.getppid()
+        self._job: str | None = None
+        self._ended = threading.Event()
+        self.paused: str | None = None
+        self.left: Mapping[str, str] = {}  # replaced, never changed
+        self._left_told: Mapping[str, str] = {}
+
+    def start(self) -> None:
+        """Take over from a child that died, and beat for as long as the process lives."""
+        queue.free_job(self._connection, self._settings.name)
+        self._beat()
+        threading.Thread(target=self._keep_beating, daemon=True).start()
+
+    def end(self) -> None:
+        """Say that the worker's child is gone; its supervisor keeps the name."""
+        self._ended.set()
+        queue.free_job(self._connection, self._settings.name)
+        queue.forget_held_up(self._connection, self._settings.name, {*self.left, *self._left_told})
+
+    @contextlib.contextmanager
+    def working(self, name: str) -> Iterator[None]:
+        """Beat for a job too while the block runs; past the deadline the process ends, and says where it hung."""
+        self._job = name
+        if self._words is not None:
+            with contextlib.suppress(BrokenPipeError):
+                os.write(self._words, f"{JOB_IN_HAND}{name}\n".encode())
+        self._beat()
+        # its watchdog is a thread without Python's lock, so that native code that never returns is ended as well
+        faulthandler.dump_traceback_later(
+            self._settings.deadline_s, exit=True, file=STDERR if self._words is None else self._words
+        )
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            self._job = None
+            with contextlib.suppress(redis.RedisError):
+                self._connection.delete(queue.ALIVE + name)
+
+    def _keep_beating(self) -> None:
+        while not self._ended.wait(self._settings.heartbeat_ttl_s / 5):
+            with contextlib.suppress(redis.RedisError, QueueError):  # an outage is noticed where the job ends
+                self._beat()
+                queue.serve(self._connection, self._store)
+
+    def _beat(self) -> None:
+        name, ttl_s = self._settings.name, self._settings.heartbeat_ttl_s
+        queue.beat(self._connection, name, process_space(), self._job, ttl_s=ttl_s, process=self._supervisor)
+        left, self._left_told = self._left_told, self.left
+        if no_longer := left.keys() - self._left_told.keys():
+            queue.forget_held_up(self._connection, name, no_longer)
+        queue.tell_held_up(self._connection, name, self.paused, self._left_told, ttl_s=ttl_s)

@@ -1,0 +1,103 @@
+"""What a worker says while all is well: a line after its first job and then one a minute, and why it pauses."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from photonfarm.renderer.worker.settings import TALLY, WorkerSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What became of jobs."""
+
+    jobs: int = 0  # done
+    failed: int = 0
+    samples: int = 0  # of those that are done
+    seconds: float = 0.0  # of all
+
+    def __add__(self, other: Tally) -> Tally:
+        """Both together."""
+        return Tally(
+            self.jobs + other.jobs,
+            self.failed + other.failed,
+            self.samples + other.samples,
+            self.seconds + other.seconds,
+        )
+
+    @property
+    def line(self) -> str:
+        """As a child tells it."""
+        return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
+
+    @classmethod
+    def of(cls, line: str) -> Tally:
+        """What a child has told."""
+        jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
+        return cls(int(jobs), int(failed), int(samples), float(seconds))
+
+    def __str__(self) -> str:
+        """As people are told."""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"{counted(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
+
+
+def counted(jobs: int) -> str:
+    """So many jobs, in words."""
+    return f"{jobs} job{'s' * (jobs != 1)}"
+
+
+class Talk:
+    """Counts jobs, and says how it goes; nothing if the settings say quiet, but for what holds the worker up."""
+
+    def __init__(self, settings: WorkerSettings) -> None:
+        """Count from now on."""
+        log.setLevel(logging.WARNING if settings.quiet else logging.INFO)
+        self._name = settings.name
+        self._every_s = settings.report_s
+        self._jobs = 0
+        self._seconds = 0.0
+        self._said = -settings.report_s
+        self._pausing = False
+        self._waiting: set[str] = set()
+
+    @contextlib.contextmanager
+    def timing(self, name: str) -> Iterator[None]:
+        """A job, as long as the block runs."""
+        began = time.monotonic()
+        yield
+        now = time.monotonic()
+        self._jobs += 1
+        self._seconds += now - began
+        if now - self._said >= self._every_s:
+            self._said = now
+            log.info(
+                "worker %s: %s in %.0f s, %.2f s each; the last was %s",
+                self._name,
+                counted(self._jobs),
+                self._seconds,
+                self._seconds / self._jobs,
+                name,
+            )
+
+    def pausing(self, reason: str | None) -> None:
+        """Say once that no jobs are taken, and once that they are again."""
+        if reason and not self._pausing:
+            log.warning("worker %s: takes no jobs: %s", self._name, reason)
+        elif self._pausing and not reason:
+            log.warning("worker %s: takes jobs again", self._name)
+        self._pausing = bool(reason)
+
+    def waiting(self, ahead: Mapping[str, str]) -> None:
+        """Say once of each scene that its jobs are left for a reason, and once that they are taken again."""
+        for scene_id in ahead.keys() - self._waiting:
+            log.warning("worker %s: takes no jobs of scene %s: %s", self._name, scene_id, ahead[scene_id])
+        for scene_id in self._waiting - ahead.keys():
+            log.warning("worker %s: takes jobs of scene %s again", self._name, scene_id)
+        self._waiting = set(ahead)

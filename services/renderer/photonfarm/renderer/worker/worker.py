@@ -1,0 +1,83 @@
+"""The worker: a supervisor and the child that it keeps alive.
+
+The child (`worker_child`) is an RQ worker that renders in its own process, so that scenes and kernels stay warm. It is
+always a fresh interpreter, as Dr.Jit's threads do not survive a fork; it gets its settings through stdin, as the Redis
+URL may hold a password, and ends when that pipe does, so that it cannot outlive its supervisor.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker.settings import LOG_FORMAT, WorkerSettings
+from photonfarm.renderer.worker.supervisor import Supervisor
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import IncompleteError, StoreError
+from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.read.find import scene_named
+
+CHILD = (sys.executable, "-m", "photonfarm.renderer.worker.child")
+
+log = logging.getLogger(__name__)
+
+
+def run_worker(
+    store: str | Path,
+    redis_url: str,
+    *,
+    name: str | None = None,
+    child: Sequence[str] = CHILD,
+    say: Callable[[str], None] | None = None,
+    **settings: Any,
+) -> None:
+    """Render what is queued until told to stop, or with `until_complete` until nothing is missing.
+
+    A store that does not exist is waited for, but with `until_complete`. Where another worker has its name, this one
+    goes by that with a number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a
+    second one at once. Further `settings` are those of WorkerSettings; `scene_id` may also be how an id begins, or a
+    scene's name. Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves
+    another store, StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    """
+    logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
+    told = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
+    Supervisor(told, tuple(child), say or log.warning).run()
+
+
+def render_job(
+    store: str | Path, scene: str, job: int, *, load: jobs.SceneLoader = jobs.load_scene
+) -> tuple[bool, float]:
+    """Render and commit one job here and now, without a queue: whether it was not committed before, and the seconds.
+
+    `scene` is its id, how that begins, or its name. Whatever goes wrong in it is raised as it is; StoreError if the
+    store has no such job.
+    """
+    opened = Store(store)
+    scene_id = scene_named(opened, scene)
+    planned = opened.scene(scene_id).jobs()
+    if not 0 <= job < planned:
+        raise StoreError(f"{store}: scene {scene_id} has {planned} jobs, numbered from 0; there is no job {job}")
+    began = time.monotonic()
+    rendered = jobs.ShardRenderer(opened, worker=_default_name(), load=load).render(scene_id, job)
+    return rendered, time.monotonic() - began
+
+
+def _default_name() -> str:
+    return f"{socket.gethostname()}-{os.getpid()}"
+
+
+def check(redis_url: str) -> None:
+    """Return if a worker of this host, or container, is alive; raises IncompleteError if none is.
+
+    Raises QueueError without a Redis.
+    """
+    if process_space() not in queue.hosts(queue.connect(redis_url)):
+        raise IncompleteError(f"no worker of {socket.gethostname()} is alive")

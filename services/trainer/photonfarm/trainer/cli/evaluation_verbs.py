@@ -1,0 +1,218 @@
+"""The verbs that ask what was learned: evaluate, infer, report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import product
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from photonfarm.shared.cli.options import json_option, store_option
+from photonfarm.trainer.cli.train_verb import run_option
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+
+
+class Several(click.Option):
+    """An option that may be repeated, of which a configuration file may give one."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        """The values; click takes the letters of a single one apart."""
+        return super().type_cast_value(ctx, [value] if isinstance(value, str | int) else value)
+
+
+device_option = click.option(
+    "--device", default="auto", show_default=True, help="Of the networks: cpu, cuda, or auto, cuda where there is one."
+)
+
+
+runs_option = click.option(
+    "--run", "runs", cls=Several, multiple=True, type=click.Path(path_type=Path, file_okay=False), default=["run"],
+    envvar="PHOTONFARM_RUN", show_default=True, help="Folder of a training run; several give several rows.",
+)  # fmt: skip
+references_option = click.option(
+    "--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
+    help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
+)  # fmt: skip
+denoisers_option = click.option(
+    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=Several, multiple=True,
+    help="Measure one that is not trained too, or several. none: dropped pixels stay black.",
+)  # fmt: skip
+kept_option = click.option(
+    "--kept", type=click.IntRange(1), cls=Several, multiple=True, metavar="K",
+    help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
+)  # fmt: skip
+samples_option = click.option(
+    "--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True,
+    help="At most so many, each of a view of its own.",
+)  # fmt: skip
+inception_option = click.option(
+    "--inception", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
+)  # fmt: skip
+
+
+def measuring(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say what is measured, against what and on which device; `_how` takes all but the runs."""
+    options = (
+        store_option, runs_option, references_option, denoisers_option, kept_option, samples_option, inception_option,
+        device_option,
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def _how(
+    denoisers: tuple[UntrainedDenoiser, ...],
+    kept: tuple[int, ...],
+    references: Path | None,
+    inception: Path | None,
+    **others: Any,
+) -> dict[str, Any]:
+    """What `compare` takes, every denoiser with every share of the pixels; UsageError for options that need others."""
+    if kept and not denoisers:
+        raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
+    if inception and references is None:
+        raise click.UsageError("--inception is for the columns that compare with references; name these: --references")
+    chosen = list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
+    return {"denoisers": chosen, "references": references, "inception": inception, **others}
+
+
+@click.command()
+@measuring
+@click.option(
+    "--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time."
+)
+@json_option
+def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: Any) -> None:
+    """Measure trained networks on views that none of them was trained on, each by its first sample.
+
+    The linear error is mean squared, of radiance × exposure, against the clean images: the targets' noise is taken out.
+    With references there are the columns of the paper too: of clip(exposure · I, 0, 1)^(1/2.2). In each run's folder
+    this leaves evaluation.json, with every figure, and comparison.png, a few of the images side by side.
+    """
+    how = _how(**asked)
+    from photonfarm.trainer.compare.evaluate import compare, write
+    from photonfarm.trainer.compare.evaluation_table import told
+    from photonfarm.trainer.predict.trained import TrainedRun
+
+    loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
+    with _progress() as tell:
+        found = compare(store, loaded, tell=tell, **how)
+    pictures = write(found, loaded)
+    click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
+    click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
+
+
+@click.command()
+@measuring
+@click.option("--untimed", is_flag=True, help="Leave out the time of a frame, which asks for a quiet machine.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
+@json_option
+def report(
+    store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, as_json: bool, **asked: Any
+) -> None:  # fmt: skip
+    """Write report.html, report.md and report.json: what was learned, at which cost, with pictures.
+
+    Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
+    from the scene to the image; with references, the worst cases of the first run are found and shown.
+    """
+    how = _how(**asked)
+    from photonfarm.trainer.report import write_report
+
+    with _progress() as tell:
+        figures = write_report(store, list(dict.fromkeys(runs)), out, tell=tell, timed=not untimed, **how)
+    click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """What tells how far it has come: a bar for each predictor on a terminal, a line elsewhere; both to stderr."""
+    from rich import markup
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _line
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def tell(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(markup.escape(name), total=total)
+            bars.update(tasks[name], completed=done)
+
+        yield tell
+
+
+def _line(name: str, done: int, total: int) -> None:
+    if done == total:
+        click.echo(f"{name}: {total} samples", err=True)
+
+
+@click.command()
+@store_option
+@run_option
+@click.option("--row", type=click.IntRange(0), help="The sample in a row of the store.")
+@click.option("--view", metavar="VECTOR|KEY", help="The sample of this view, as `store find` takes it.")
+@click.option("--modification", metavar="VECTOR|KEY", help="And of this configuration; of a path its configuration, "
+              "which otherwise is the scene at rest.")  # fmt: skip
+@click.option("--camera-path", "path", type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="FILE",
+              help="Views along a path in JSON, as `photonfarm buffers` takes it.")  # fmt: skip
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Views once around the scene.")
+@click.option("--buffers", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Views whose buffers `photonfarm buffers` wrote, on a machine with the renderer.")  # fmt: skip
+@click.option("--fps", type=click.FloatRange(1, 50), default=12.0, show_default=True, help="Frames a second of a path.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
+@device_option
+def infer(
+    store: str | Path,
+    run: Path,
+    row: int | None,
+    view: str | None,
+    modification: str | None,
+    path: Path | None,
+    orbit: int | None,
+    buffers: Path | None,
+    fps: float,
+    out: Path,
+    device: str,
+) -> None:
+    """Show a trained network's image of one sample, or of a camera path: PNG, GIF and, with its extra, MP4.
+
+    The views of a path are in no store: the renderer makes their buffers, where it is installed, or a file has them.
+    """
+    from photonfarm.shared.scene.frames import Frames
+    from photonfarm.trainer.predict import infer as shows
+    from photonfarm.trainer.predict.trained import TrainedRun
+
+    kinds = {"--row": row, "--view": view, "--camera-path": path, "--orbit": orbit, "--buffers": buffers}
+    given = [name for name, value in kinds.items() if value is not None]
+    if len(given) > 1 or not (given or modification):
+        several = f"; {' and '.join(given)} exclude each other" if given else ""
+        raise click.UsageError(f"name what to show by one of {', '.join(kinds)}, or by --modification{several}")
+    if modification and given in (["--row"], ["--buffers"]):
+        raise click.UsageError(f"{given[0]} has a configuration; --modification cannot give it another one")
+    trained = TrainedRun.load(run)
+    if path is not None or orbit is not None:
+        shows.check_path(trained)
+        asked = ["--orbit", str(orbit)] if orbit else ["--camera-path", str(path)]
+        asked += ["--modification", modification] if modification else []
+        found = shows.show_frames(
+            store, trained, shows.rendered_frames(store, trained, asked), out, fps=fps, device=device
+        )
+    elif buffers is not None:
+        found = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
+    else:
+        chosen = shows.find_row(store, trained, modification, view) if row is None else row
+        found = shows.show_sample(store, trained, chosen, out, device)
+    for file in found.files:
+        click.echo(file)
+    click.echo(found.sentence, err=True)

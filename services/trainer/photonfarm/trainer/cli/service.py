@@ -1,0 +1,335 @@
+"""The trainer as a service: it waits for a store and a scene, trains as the samples come, and says that it lives."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+from pydantic import ValidationError
+from redis import Redis, RedisError
+
+from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
+from photonfarm.shared.core.estimate import stated
+from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.scene.spec import load_spec, sentences
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.io.storage import is_vacant
+from photonfarm.trainer.runs import wait_times as waits
+from photonfarm.trainer.runs.run_folder import held
+from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings, preset
+
+if TYPE_CHECKING:
+    from photonfarm.trainer.runs.distributed import Group
+
+T = TypeVar("T")
+
+POLL_S = 1.0
+ALIVE_FILE = "alive"
+TELL_S = 5.0  # between figures for the workers
+ALIVE_S = 60.0  # a run whose sign of life is older is taken for dead
+
+
+def run(
+    spec: str | None,
+    store: str | Path,
+    folder: Path,
+    preset_name: str,
+    changes: dict[str, Any],
+    redis_url: str | None = None,
+) -> None:
+    """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint.
+
+    Waiting for a scene, its base and its samples counts as time spent. With a Redis, workers are told what is used.
+    Started by torchrun, rank 0 does all this, and the others train with it until it ends; all need the same folder.
+    """
+    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.trainer.runs.device import described
+    from photonfarm.trainer.runs.distributed import ALONE, leading, ranks
+    from photonfarm.trainer.training.assist import assist
+    from photonfarm.trainer.training.loop import stop_on_signals
+
+    settings = _settings(preset_name, changes)
+    with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
+        group = ours or ALONE
+        device = group.device(settings.device)
+        if ours is not None and ours.rank:
+            assist(partial(StoreSource, store), settings, folder, ours)
+            return
+        with leading(group):
+            click.echo(f"training on {described(device, settings.network.precision)}", err=True)
+            _lead(load_spec(spec).scene_id if spec else None, store, folder, settings, redis_url, stop, group)
+
+
+def _lead(
+    scene_id: str | None,
+    store: str | Path,
+    folder: Path,
+    settings: TrainSettings,
+    redis_url: str | None,
+    stop: Stop,
+    group: Group,
+) -> None:
+    """Train as the only process or as rank 0: it waits for a scene, tells, and leaves event files for TensorBoard."""
+    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.trainer.runs.tensorboard import event_files
+    from photonfarm.trainer.training.loop import train
+
+    begun_on = _begun_on(folder)
+    if scene_id and begun_on and scene_id != begun_on:
+        raise SpecError(
+            f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
+        )
+    scene_id = scene_id or begun_on
+    with _sign_of_life(folder), event_files(folder) as board:
+        began = time.monotonic()
+        if is_vacant(store):
+            click.echo(f"waiting for a store and a scene in {store}", err=True)
+        scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
+        if scene_id is None:
+            click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
+            return
+        source, waited = StoreSource(store, scene_id), time.monotonic() - began
+        if not is_vacant(store) and not source.ready():
+            there = scene_id in Store(store).scene_ids()
+            lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
+            click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
+        with _consumption_told(redis_url, store, scene_id) as count:
+            listen = [_tell, *([board.record] if board else [])]
+            outcome = train(
+                source, settings, folder, stop=stop, count=count, waited=waited, group=group,
+                listen=lambda record: [hear(record) for hear in listen], show=board.pictures if board else None,
+            )  # fmt: skip
+    click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
+
+
+def check(folder: Path) -> None:
+    """Raise IncompleteError unless a trainer has given a sign of life in this run's folder lately."""
+    try:
+        age_s = time.time() - (folder / ALIVE_FILE).stat().st_mtime
+    except OSError as error:
+        raise IncompleteError(f"{folder}: no trainer is at work here") from error
+    if age_s > ALIVE_S:
+        raise IncompleteError(
+            f"{folder}: the trainer's last sign of life is {age_s:.0f} s old; {ALIVE_S:.0f} s are allowed"
+        )
+
+
+def summarise(spec: str | None, store: str | Path, preset_name: str, changes: dict[str, Any]) -> str:
+    """The parameters and the work of a network, as a table; nothing is trained, and of a store only a spec is read.
+
+    Raises SpecError without a spec, unless the store has one scene.
+    """
+    from photonfarm.trainer.networks import ARCHITECTURES
+    from photonfarm.trainer.networks.summary import summary, table
+
+    network = _settings(preset_name, changes).network
+    if spec:
+        scene = load_spec(spec)
+    else:
+        scene_id = _only_scene(store)
+        if scene_id is None:
+            raise SpecError(f"{store}: holds no scene; name the spec of the one to summarise a network for")
+        scene = Store(store).scene(scene_id).spec
+    points = min(network.points or scene.points, scene.points)
+    head = (
+        f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
+        f"width {network.width}" + (f", {points} points" if ARCHITECTURES[network.architecture].needs.points else "")
+    )
+    return f"{head}\n{table(summary(scene, network))}"
+
+
+def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, changes: dict[str, Any]) -> str:
+    """The table of a grid search over optimisers, rates and decays on a complete store; goes on where it was stopped.
+
+    What `changes` set of these is searched no further. Raises SpecError without a spec, unless the store has one scene,
+    for a store without the scene, and in one of several processes.
+    """
+    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.trainer.grid import AXES, STEPS, run_grid, table
+    from photonfarm.trainer.runs.distributed import processes
+    from photonfarm.trainer.training.loop import stop_on_signals
+
+    if (size := processes()) > 1:
+        raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
+    settings = _settings(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
+    scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
+    if scene_id is None or not StoreSource(store, scene_id).ready():
+        wanted = f" {spec}" if spec else ""
+        raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
+    with stop_on_signals() as stop, _sign_of_life(folder):
+        tell = partial(click.echo, err=True)
+        axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
+        if settings.schedule == "cosine":
+            axes["decay"] = (settings.decay,)
+            tell("decay is not searched: schedule = 'cosine' has none")
+        elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
+            axes["decay"] = (settings.decay,)
+            tell(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
+        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
+        if stop.is_set():
+            tell(f"stopped after {len(cells)} cells; the same command goes on")
+        return table(cells)
+
+
+def _settings(name: str, changes: dict[str, Any]) -> TrainSettings:
+    """A preset with changes; keys of the network may stand among them, under their own names."""
+    network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
+    others = {key: value for key, value in changes.items() if key not in network}
+    if "network" in others:
+        raise SpecError("the settings of the training: network: its keys are set each by its own name, as in width=32")
+    try:
+        return preset(name, network=network, **others)
+    except ValidationError as error:
+        raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error
+
+
+def _begun_on(folder: Path) -> str | None:
+    """The scene that a run was begun on; None for a run that has not begun."""
+    from photonfarm.trainer.runs import checkpoint
+    from photonfarm.trainer.runs.run_folder import INITIAL
+
+    begun = folder / INITIAL
+    return str(checkpoint.load(begun)["scene_id"]) if begun.exists() else None
+
+
+def _only_scene(store: str | Path) -> str | None:
+    """The scene of a store that has one; None while there is no store or no scene; SpecError if there are several."""
+    try:
+        ids = Store(store).scene_ids()
+    except StoreError:
+        if not is_vacant(store):
+            raise
+        return None
+    if len(ids) > 1:
+        names = ", ".join(scene.spec.name for scene in Store(store).scenes())
+        raise SpecError(f"{store}: holds {len(ids)} scenes ({names}); name the spec of the one to train on")
+    return ids[0] if ids else None
+
+
+def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
+    """What `look` finds at last; None once told to stop, or after so many seconds."""
+    end = time.monotonic() + seconds
+    while (found := look()) is None:
+        if stop.wait(min(POLL_S, max(end - time.monotonic(), 0.0))) or time.monotonic() >= end:
+            return None
+    return found
+
+
+@contextmanager
+def _sign_of_life(folder: Path) -> Iterator[None]:
+    """Touch a file now and then, from a thread of its own, for `check`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ALIVE_FILE).touch()
+    except OSError as error:
+        raise StoreError(f"{folder}: the folder of the training run cannot be written: {error.strerror}") from error
+    ended = threading.Event()
+
+    def touch() -> None:
+        while not ended.wait(ALIVE_S / 4):
+            (folder / ALIVE_FILE).touch()
+
+    thread = threading.Thread(target=touch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        if folder.is_dir():
+            with suppress(StoreError), held(folder):  # whoever trains there keeps it
+                (folder / ALIVE_FILE).unlink(missing_ok=True)
+
+
+@contextmanager
+def _consumption_told(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+    """What takes draws and samples of training; Redis is told now and then, and at the end, how many have been used.
+
+    By a thread. Each sample counts once, and held-out ones as soon as they are seen. A Redis that is not there is none
+    of our trouble, nor a store that is not there yet; that it serves another store is said once.
+    """
+    told = _Told(redis_url, store, scene_id)
+    ended = threading.Event()
+
+    def keep_telling() -> None:
+        while not ended.wait(TELL_S):
+            told.tell()
+
+    thread = threading.Thread(target=keep_telling, daemon=True)
+    thread.start()
+    try:
+        yield told.take
+    finally:
+        ended.set()
+        thread.join()
+        told.tell()
+
+
+class _Told:
+    """What Redis is told of a scene's samples."""
+
+    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str) -> None:
+        self._url, self._root, self._scene_id = redis_url, store, scene_id
+        self._store: Store | None = None  # opened with the first figures: before training begins there may be none
+        self._used: int | None = None  # a run that continues knows only once it has begun
+        self._connection: Redis | None = None
+        self._refused = False
+
+    def take(self, draws: int, samples: int) -> None:
+        """Take what there was by now."""
+        self._used = min(draws, samples)
+
+    def tell(self) -> None:
+        """Tell what was taken last, if there is anything and a Redis."""
+        if self._url is None or self._used is None:
+            return
+        from photonfarm.shared import queue
+
+        try:
+            self._connection = self._connection or queue.connect(self._url)
+            self._store = self._store or Store(self._root)
+            queue.check_served(self._connection, self._store)
+            queue.tell_consumed(self._connection, self._scene_id, self._used)
+        except queue.OtherStoreError as error:
+            if not self._refused:
+                click.echo(f"no worker is told what is used: {error}", err=True)
+            self._refused = True
+        except (QueueError, RedisError, StoreError):
+            pass
+
+
+def _tell(record: dict[str, Any]) -> None:
+    if record["kind"] == "changes":
+        changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
+        click.echo(f"goes on from step {record['step']} with {changed}", err=True)
+    if record["kind"] == "recovered":
+        click.echo(f"step {record['step']}: {_recovered(record)}", err=True)
+    if record["kind"] == "validation":
+        there = f"on {record['held_out']} of {record['samples']} samples; "
+        click.echo(
+            f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
+            f"({stated(record['shown_error'], None)} up to white) {there}"
+            + waits.stated(record["waits"], record["samples_per_used"]),
+            err=True,
+        )
+
+
+def _recovered(record: dict[str, Any]) -> str:
+    """Why a run went back, and to what."""
+    errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
+    if errors is None:
+        found = "the loss is not finite"
+    elif errors["now"] is None:
+        found = "the held-out error is not finite"
+    else:
+        found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
+    if record["cause"] == "end":
+        return f"{found}; ends with {back_to}"
+    return f"{found}; goes on from {back_to}, at {record['rate_factor']:g} of the rate"

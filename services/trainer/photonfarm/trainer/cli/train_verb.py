@@ -1,0 +1,122 @@
+"""The verb train of the trainer service."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from photonfarm.shared.cli.options import redis_option, store_option
+from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
+
+run_option = click.option(
+    "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
+    show_default=True, help="Folder of the training run: checkpoints, metrics.",
+)  # fmt: skip
+
+
+class Pairs(click.Option):
+    """KEY=VALUE, as often as wanted, of which a configuration file makes a table."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        """The pairs as written; those of a table as they would be."""
+        pairs = [f"{key}={json.dumps(given)}" for key, given in value.items()] if isinstance(value, Mapping) else value
+        return super().type_cast_value(ctx, pairs)
+
+
+def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """The values of `Pairs` by their keys, each as in JSON, or text."""
+    found: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise click.BadParameter(f"{pair!r} is not KEY=VALUE", param_hint="--set")
+        name = key.strip().removeprefix("network.")
+        try:
+            found[name] = json.loads(value)
+        except ValueError:
+            found[name] = value.strip()
+    return found
+
+
+@click.command()
+@click.argument("spec", required=False)
+@store_option
+@run_option
+@redis_option
+@click.option(
+    "--preset",
+    type=click.Choice(list(PRESETS)),
+    default="small",
+    show_default=True,
+    help="Sizes of network and batch.",
+)
+@click.option(
+    "--architecture",
+    type=click.Choice(get_args(Architecture)),
+    help="Kind of network; denoise_K is given one of K pixels in noisy colour.  [default: light_transport]",
+)
+@click.option(
+    "--precision", type=click.Choice(get_args(Precision)), help="Of the U-Net's computations.  [default: float32]"
+)
+@click.option("--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
+@click.option("--seconds", "max_seconds", type=click.FloatRange(0, min_open=True),
+              help="Stop after so much time in all, with waiting and what the run has had before.")  # fmt: skip
+@click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
+@click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
+@click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    help="Share of the configurations never trained on.  [default: the preset's, 1/8 or 1/16]",
+)
+@click.option("--threads", type=click.IntRange(1), help="Processor threads of torch.  [default: 1]")
+@click.option("--device", metavar="NAME", help="cpu, cuda, cuda:N, or auto: cuda where there is one.  [default: auto]")
+@click.option(
+    "--loss",
+    metavar=f"[{'|'.join(get_args(Loss))}]",
+    help="Squared error; relative: to the prediction's brightness; paired: and to the other half's.  [default: linear]",
+)
+@click.option("--optimiser", metavar=f"[{'|'.join(get_args(Optimiser))}]", help="[default: adam]")
+@click.option("--learning-rate", type=click.FloatRange(0, min_open=True), help="At the beginning.  [default: 0.0005]")
+@click.option("--decay", type=click.FloatRange(0, 1, min_open=True), help="Of the rate, per epoch.  [default: 0.99]")
+@click.option("--beta2", type=float, help="Of Adam; 0.9999 or more where fireflies are rare.  [default: 0.999]")
+@click.option("--demodulation", type=float, help="ε; the network's output × (albedo + ε) is the image.  [default: off]")
+@click.option(
+    "--set",
+    "pairs",
+    cls=Pairs,
+    multiple=True,
+    metavar="KEY=VALUE",
+    help=f"Any setting, also those above, whose own options come first; may be repeated: {', '.join(KEYS)}.",
+)
+@click.option("--grid", is_flag=True, help="Search optimisers, rates and decays by short runs on a complete store.")
+@click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
+@click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
+def train(
+    spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...], grid: bool,
+    summary: bool, check: bool, **options: Any,
+) -> None:  # fmt: skip
+    """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
+
+    Redis, where there is one, is told how many samples have been used, for `photonfarm work --ahead`. Several processes
+    share each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
+    see the same run folder. Exits with 8 if training diverges.
+    """
+    from photonfarm.trainer.cli import service
+
+    instead = [name for name, asked in (("--grid", grid), ("--summary", summary), ("--check", check)) if asked]
+    if len(instead) > 1:
+        raise click.UsageError(f"{' and '.join(instead)} are different things to do; give one of them")
+    changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
+    if check:
+        service.check(run)
+    elif grid:
+        click.echo(service.search(spec, store, run, preset, changes))
+    elif summary:
+        click.echo(service.summarise(spec, store, preset, changes))
+    else:
+        service.run(spec, store, run, preset, changes, redis_url)

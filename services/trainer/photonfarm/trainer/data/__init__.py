@@ -1,0 +1,1 @@
+"""Samples on their way from the store to the network."""

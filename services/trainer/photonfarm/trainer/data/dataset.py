@@ -1,0 +1,278 @@
+"""What the trainer reads: samples from a store that grows, split by configuration, as arrays ready for a batch.
+
+Shape letters: B batch, P points, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.core.records import (
+    F32,
+    BasePointCloud,
+    Geometry,
+    Guides,
+    Photons,
+    ViewBuffers,
+    Visibility,
+    arrays_of,
+)
+from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.request import sample_key
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.trainer.networks.inputs import (
+    POINTS_ONLY,
+    GuideInputs,
+    Inputs,
+    Needs,
+    NoisyColour,
+    PhotonInputs,
+    PointInputs,
+    given,
+    map_tensors,
+)
+
+
+class Sample(Protocol):
+    """One sample as it is read: its images in whatever type they are stored in."""
+
+    @property
+    def modification(self) -> Modification:
+        """The configuration."""
+
+    @property
+    def view(self) -> View:
+        """The view."""
+
+    @property
+    def radiance(self) -> NDArray[np.floating]:
+        """Half-estimates A and B, (2, H, W, 3); times `scale` linear."""
+
+    @property
+    def scale(self) -> float:
+        """What makes linear radiance of what is stored, a power of two."""
+
+    @property
+    def buffers(self) -> ViewBuffers:
+        """The image-space buffers."""
+
+    @property
+    def visibility(self) -> Visibility:
+        """Which points and photons are seen."""
+
+    @property
+    def pass_(self) -> int:
+        """The number of the noisy pass of this view."""
+
+    @property
+    def guides(self) -> Guides | None:
+        """What is known of the view beside its buffers; None unless guides are followed."""
+
+
+class SampleSource(Protocol):
+    """The samples of one scene: the store's reader, or anything that behaves like it. Used by one thread at a time."""
+
+    def ready(self) -> bool:
+        """Whether spec and base are there; they come with the scene's first job."""
+
+    def follow_guides(self) -> None:
+        """Have guides read too, and samples be complete only with them; SpecError if the scene has none."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """The geometry and the base cloud."""
+
+    def refresh(self) -> NDArray[np.int64]:
+        """The rows that became complete since the last call."""
+
+    def taken_back(self) -> NDArray[np.int64]:
+        """The rows that were complete before the last `refresh` and not after it; they become complete once more."""
+
+    def read_batch(self, rows: Sequence[int]) -> Sequence[Sample]:
+        """Complete rows' samples, valid until the next call; raises StoreError if one is not, or cannot be read."""
+
+    def read_photons(self, row: int) -> Photons:
+        """The photons of a complete row's configuration; raises StoreError if the scene has none."""
+
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration."""
+
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content key of each row's configuration and view."""
+
+    def planned(self) -> int:
+        """The number of samples in all plans so far, complete or not."""
+
+    def plan_requests(self) -> list[dict[str, Any]]:
+        """What was asked for with each plan so far, in order, as JSON has it: all that the rows follow from."""
+
+
+def rows_held_out(source: SampleSource, rows: Sequence[int], share: float) -> list[bool]:
+    """Whether each row is kept from training, not by when it arrived but by what it is.
+
+    All views and passes of a configuration are on one side. A static scene has one configuration; there the view
+    decides, and all passes of a view are on one side.
+    """
+    return are_held_out(units_of(source, rows), share)
+
+
+def units_of(source: SampleSource, rows: Sequence[int]) -> list[Key]:
+    """What each row is held out by: the key of its configuration or, of a static scene, of its view."""
+    return source.modification_keys(rows) if source.spec.groups else source.view_keys(rows)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Samples as tensors; valid until the next one is taken. Those that were not complete are left out, maybe all."""
+
+    rows: tuple[int, ...]
+    units: tuple[Key, ...]  # what each is held out by: equal for samples that are not independent
+    inputs: Inputs
+    target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, linear radiance × exposure
+
+    @classmethod
+    def empty(
+        cls, size: int, points: int, spec: SceneSpec, needs: Needs = POINTS_ONLY, *, pinned: bool = False
+    ) -> Batch:
+        """Memory for what is needed of `size` samples, to be filled again and again."""
+
+        def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            try:
+                return torch.empty(size, *shape, dtype=dtype, pin_memory=pinned)
+            except RuntimeError as error:  # torch's way to say that there is no memory
+                raise SpecError(f"batch = {size}: no memory for so many samples") from error
+
+        target = memory(2, spec.film.height, spec.film.width, 3)
+        return cls((), (), Inputs.empty(memory, points, spec, needs), target)
+
+    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> Batch:
+        """The first samples of this memory, named by their rows and what they are held out by."""
+        n = len(rows)
+        return Batch(rows, units, map_tensors(lambda tensor: tensor[:n], self.inputs), self.target[:n])
+
+    def to(self, device: torch.device) -> Batch:
+        """The same batch on a device; itself on the CPU."""
+        inputs = map_tensors(lambda tensor: tensor.to(device), self.inputs)
+        return Batch(self.rows, self.units, inputs, self.target.to(device))
+
+    def for_training(self) -> Batch:
+        """The batch whose targets nothing in its inputs has seen: itself, if these hold no noisy colour.
+
+        Otherwise it is twice as long: the samples with A in the inputs and B as the target, (B, 1, H, W, 3), then the
+        same samples the other way round (Lehtinen et al., Noise2Noise, 2018). The same pixels are kept of both.
+        """
+        noisy = self.inputs.noisy
+        if noisy is None:
+            return self
+        half_b = NoisyColour(self.target[:, 1] * noisy.kept[..., None], noisy.kept)
+        inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=half_b))
+        target = torch.cat([self.target[:, 1:], self.target[:, :1]])
+        return Batch(2 * self.rows, 2 * self.units, inputs, target)
+
+
+def kept_count(spec: SceneSpec, of: int) -> int:
+    """How many pixels of the film one of `of` is; SpecError where the film has fewer than `of`."""
+    pixels = spec.film.height * spec.film.width
+    if of > pixels:
+        raise SpecError(
+            f"one of {of} pixels is to be kept, and the film has {pixels} ({spec.film.width}×{spec.film.height}); "
+            "keep one of fewer"
+        )
+    return pixels // of
+
+
+def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+    """One of `of` pixels, (H, W), H·W / `of` in all: a random choice that follows from the sample's content key.
+
+    So each pass of a view keeps pixels of its own, and a run that continues sees what it saw. Of more pixels, those of
+    fewer are a part. Raises SpecError as `kept_count` does.
+    """
+    film = spec.film.height, spec.film.width
+    key = sample_key(spec.scene_id, sample.modification, sample.view.vector, sample.pass_)
+    chance = Stream(key, "kept pixels").uniform(*film)
+    last = kept_count(spec, of) - 1
+    kept: NDArray[np.bool_] = chance <= np.partition(chance, last, axis=None)[last]
+    return kept
+
+
+def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: Needs, cloud: BasePointCloud) -> Batch:
+    """Complete rows of a source, read into the first places of a batch's memory; StoreError if one cannot be read."""
+    spec = source.spec
+    units = []
+    for place, (row, sample) in enumerate(zip(rows, source.read_batch(rows), strict=True)):
+        fill(memory, place, sample, spec, cloud)
+        if memory.inputs.photons is not None:
+            fill_photons(memory.inputs.photons, place, source.read_photons(row))
+        if needs.kept:
+            _fill_noisy(memory, place, kept_pixels(sample, spec, needs.kept))
+        units.append(sample.modification.key(spec.scene_id) if spec.groups else make_key(sample.view.vector))
+    return memory.filled(tuple(rows), tuple(units))
+
+
+def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BasePointCloud) -> None:
+    """Write one sample into a batch's memory, but for its photons and its noisy colour.
+
+    That is its camera, its buffers, its exposed targets; where they are needed, its points; and which points and
+    photons are seen. What it is stored in becomes float32 on the way, in one pass over the images.
+    """
+    i, b = batch.inputs, sample.buffers
+    i.world_to_camera[place] = torch.from_numpy(Camera.of(sample.view, spec).world_to_camera)
+    for memory, array in ((i.depth, b.depth), (i.albedo, b.albedo), (i.normal, b.normal)):
+        memory[place] = torch.from_numpy(array)
+    if i.guides is not None:
+        _fill_guides(i.guides, place, sample.guides, spec.exposure)
+    batch.target[place] = torch.from_numpy(sample.radiance)
+    batch.target[place].mul_(spec.exposure * sample.scale)
+    if i.points is not None:
+        _fill_points(i.points, place, *rebuild(cloud, sample.modification), sample.visibility.points)
+    if i.photons is not None:
+        i.photons.seen[place] = torch.from_numpy(sample.visibility.photons)
+
+
+OF_LIGHT = ("emission", "direct", "gloss", "point_light")
+"""The guides that are in units of radiance, or of irradiance, and so exposed."""
+
+
+def _fill_guides(memory: GuideInputs, place: int, guides: Guides | None, exposure: float) -> None:
+    for name, array in arrays_of(given(guides)).items():
+        values = getattr(memory, name)
+        values[place] = torch.from_numpy(array)
+        if name in OF_LIGHT:
+            values[place].mul_(exposure)
+
+
+def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
+    """Write a configuration's photons into a batch's memory, but for which of them a view sees."""
+    for name, array in arrays_of(photons).items():
+        getattr(memory, name)[place] = torch.from_numpy(array)
+    memory.present[place] = memory.bounce[place] >= 0
+
+
+def _fill_points(
+    memory: PointInputs, place: int, position: F32, visible: NDArray[np.bool_], seen: NDArray[np.bool_]
+) -> None:
+    points = memory.position.shape[1]
+    memory.position[place] = torch.from_numpy(position[:points])
+    memory.visible[place] = torch.from_numpy(visible[:points])
+    memory.seen[place] = torch.from_numpy(seen[:points])
+
+
+def _fill_noisy(batch: Batch, place: int, kept: NDArray[np.bool_]) -> None:
+    noisy = given(batch.inputs.noisy)
+    noisy.kept[place] = torch.from_numpy(kept)
+    torch.mul(batch.target[place, 0], noisy.kept[place, ..., None], out=noisy.colour[place])

@@ -1,0 +1,160 @@
+"""A thread that follows the store and reads batches ahead, into memory that is used again and again."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.trainer.data.dataset import Batch, SampleSource, read_into, rows_held_out
+from photonfarm.trainer.networks import ARCHITECTURES
+from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.settings import TrainSettings
+
+
+class Feed:
+    """Batches in the order they were asked for, and the rows as they arrive; a context manager.
+
+    Rows that are not complete when they are read, as a repair of the store may have taken them back, are left out of
+    their batch, until they have become complete again. Only its thread touches the source. Samples are not kept
+    beside the batches: reading one from the system's cache, checked, is less than half of what it takes to make a place
+    of a batch of it (docs/results/train_step.md), so that a cache of our own would hardly pay for its memory.
+    """
+
+    def __init__(
+        self,
+        source: SampleSource,
+        settings: TrainSettings,
+        clock: Callable[[], float] = time.monotonic,
+        needs: Needs | None = None,
+    ) -> None:
+        """Feed what the settings' network needs, or what other predictors do."""
+        self.geometry: Geometry
+        self.cloud: BasePointCloud
+        self._source, self._settings, self._clock = source, settings, clock
+        self._needs = needs or ARCHITECTURES[settings.network.architecture].needs
+        if self._needs.guides:
+            source.follow_guides()
+        self.geometry, self.cloud = source.base()
+        self.spec = source.spec
+        self._lock = threading.Lock()
+        self._arrived: list[tuple[int, bool]] = []
+        self._complete = False
+        self._plans: list[dict[str, Any]] = []
+        self._here: set[int] = set()  # rows that are complete
+        self._known: set[int] = set()  # rows that are, or were
+        self._error: BaseException | None = None
+        points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
+        pinned = usable_device(settings.device).type == "cuda"
+        self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[Batch, Batch] | None] = queue.SimpleQueue()
+        self._free: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
+        for _ in range(settings.prefetch + 1):
+            self._free.put(Batch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
+        self._lent: Batch | None = None
+        self._polled = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._polled.wait()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._free.put(None)
+        self._asked.put(None)
+        self._thread.join()
+
+    def ask(self, rows: Sequence[int]) -> None:
+        """Have a batch of these rows read; at most `batch` of them."""
+        self._asked.put(tuple(rows))
+
+    def take(self) -> Batch:
+        """The next batch asked for, read. The one taken before is no longer valid. Raises what the reading raised."""
+        if self._lent is not None:
+            self._free.put(self._lent)
+        got = self._ready.get()
+        if got is None:
+            self._raise()
+            raise RuntimeError("the feed is closed")
+        batch, self._lent = got
+        return batch
+
+    def arrivals(self) -> tuple[list[tuple[int, bool]], bool]:
+        """The rows that became complete since the last call, each with whether it is held out; and whether all have.
+
+        The second is True once everything that is planned has been complete. A row that was taken back is told again
+        when it has become complete again. Raises what the reading raised.
+        """
+        self._raise()
+        with self._lock:
+            rows, self._arrived = self._arrived, []
+            return rows, self._complete
+
+    def plan_requests(self) -> list[dict[str, Any]]:
+        """What was asked for with each plan, by the last look at the store."""
+        with self._lock:
+            return self._plans
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        try:
+            self._serve()
+        except BaseException as error:  # handed to the thread that takes
+            self._error = error
+        finally:
+            self._polled.set()
+            self._ready.put(None)
+
+    def _serve(self) -> None:
+        due = self._clock()
+        while True:
+            if self._clock() >= due:
+                self._poll()
+                due = self._clock() + self._settings.poll_seconds
+            try:
+                rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
+            except queue.Empty:
+                continue
+            memory = self._free.get() if rows is not None else None
+            if rows is None or memory is None:
+                return
+            self._ready.put((self._read(rows, memory), memory))
+
+    def _poll(self) -> None:
+        rows = [int(row) for row in self._source.refresh()]
+        gone = [int(row) for row in self._source.taken_back()]
+        self._here.difference_update(gone)
+        self._here.update(rows)
+        self._known.update(rows)
+        found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
+        with self._lock:
+            self._arrived.extend(found)
+            self._plans = self._source.plan_requests()
+            self._complete = 0 < self._source.planned() <= len(self._known)
+        self._polled.set()
+
+    def _read(self, rows: Sequence[int], memory: Batch) -> Batch:
+        """Those of the rows that are complete."""
+        if not self._known.issuperset(rows):
+            self._poll()  # somebody else has seen them arrive
+        try:
+            return self._read_complete(rows, memory)
+        except StoreError:
+            self._poll()  # a repair may have set some aside since the last time, and a worker have rendered them again
+            return self._read_complete(rows, memory)
+
+    def _read_complete(self, rows: Sequence[int], memory: Batch) -> Batch:
+        there = [row for row in rows if row in self._here]
+        return read_into(memory, self._source, there, self._needs, self.cloud)

@@ -1,0 +1,163 @@
+"""The stream of training batches from a store that grows, at a pace that its growth allows."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import torch
+
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.sampler import RoundSampler
+from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.settings import TrainSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """What arrived and when: with the seed, all that the order of training depends on.
+
+    A run's checkpoint has it whole, as `following.arrived` and `following.growth`. To look at there is metrics.jsonl,
+    each record of which tells how many draws there were and how many samples had arrived.
+    """
+
+    rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
+    log: list[tuple[int, int]] = field(default_factory=list)  # (batches drawn by then, rows that had arrived)
+
+    @classmethod
+    def of(cls, state: dict[str, Any]) -> Self:
+        """That of a run, by the `following` of its checkpoint."""
+        return cls(state["arrived"].tolist(), [(drawn, arrived) for drawn, arrived in state["growth"].tolist()])
+
+    def visible(self, drawn: int) -> int | None:
+        """How many rows had arrived when batch `drawn` was drawn; None past the log's end."""
+        if not self.log or drawn > self.log[-1][0]:
+            return None
+        place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
+        return self.log[place - 1][1] if place else 0
+
+
+class Following:
+    """Draws batches ahead of training; they are read meanwhile. A `script` repeats the growth of an earlier run."""
+
+    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: Group = ALONE) -> None:
+        """Draw for all processes of a group, and read this one's part."""
+        self._feed, self._settings, self._group = feed, settings, group
+        self._script = script or Growth()
+        self._sampler = RoundSampler(settings.seed, settings.catch_up)
+        self._waiting: dict[int, bool] = {}  # arrived, not yet visible: row → held out
+        self._known: set[int] = set()
+        self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
+        self._complete = False
+        self.growth = Growth()
+        self.held_out: list[int] = []
+        self.drawn = 0  # batches
+
+    @property
+    def training_rows(self) -> list[int]:
+        """The visible rows that are trained on, in order of arrival."""
+        return self._sampler.rows
+
+    @property
+    def complete(self) -> bool:
+        """True once everything that is planned has arrived and is visible."""
+        return self._complete
+
+    def look(self) -> None:
+        """Make visible what has arrived, or of it what the script says."""
+        rows, complete = self._feed.arrivals()
+        self._waiting.update((row, held) for row, held in rows if row not in self._known)
+        scripted = self._script.visible(self.drawn)
+        if scripted is None:
+            self._show(list(self._waiting))
+        else:
+            due = self._script.rows[len(self.growth.rows) : scripted]
+            self._show(due if all(row in self._waiting for row in due) else [])
+        self._complete = complete and not self._waiting
+
+    def _show(self, rows: list[int]) -> None:
+        if not rows:
+            return
+        held = {row: self._waiting.pop(row) for row in rows}
+        self._known.update(rows)
+        self.growth.rows.extend(rows)
+        self.growth.log.append((self.drawn, len(self.growth.rows)))
+        self.held_out.extend(row for row in rows if held[row])
+        self._sampler.add([row for row in rows if not held[row]])
+
+    def may_draw(self) -> bool:
+        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and enough to begin with.
+
+        Neither holds back once everything planned has arrived. A script is followed as it is.
+        """
+        scripted = self._script.visible(self.drawn)
+        if scripted is not None:
+            return scripted == len(self.growth.rows)
+        arrived, s = len(self.training_rows), self._settings
+        if self._complete:
+            return arrived > 0
+        draws = (self.drawn + 1) * s.batch
+        return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
+
+    def draw_ahead(self, until: int) -> bool:
+        """Draw and ask for batches, up to `prefetch` ahead and batch number `until`; False if there is none to take."""
+        while len(self._asked) < self._settings.prefetch and self.drawn < until:
+            self.look()
+            if not self.may_draw():
+                break
+            self._ask(self._sampler.draw(self._settings.batch))
+            self.drawn += 1
+        return bool(self._asked)
+
+    def _ask(self, rows: tuple[int, ...]) -> None:
+        self._asked.append(rows)
+        self._group.tell("rows", rows)
+        self._feed.ask(self._group.part(rows))
+
+    def take(self) -> Batch | None:
+        """The next batch drawn, this process' part of it read; draws of rows that are not complete now do not count.
+
+        None if there is no row left in it: another one is drawn in its place, as the last one.
+        """
+        batch = self._feed.take()
+        self._group.tell("take")  # only now, so that the others wait for no rank that has failed to read
+        rows, there = self._asked.popleft(), self._group.joined(batch.rows)
+        self._sampler.put_back((Counter(rows) - Counter(there)).elements())
+        if there:
+            return batch
+        self._ask(self._sampler.draw(self._settings.batch))
+        return None
+
+    def drop(self) -> None:
+        """Let go of the batches that were read ahead, so that something else can be read; other ranks keep theirs."""
+        for _ in self._asked:
+            self._feed.take()
+
+    def ask_again(self) -> None:
+        """Have the batches that were let go read again."""
+        for rows in self._asked:
+            self._feed.ask(self._group.part(rows))
+
+    def state(self) -> dict[str, Any]:
+        """What is to be restored for the same batches to follow; int64 tensors where there is a number for each row."""
+        return {
+            "sampler": self._sampler.state(),
+            "asked": [list(rows) for rows in self._asked],
+            "drawn": self.drawn,
+            "arrived": torch.tensor(self.growth.rows, dtype=torch.int64),
+            "growth": torch.tensor(self.growth.log, dtype=torch.int64).reshape(-1, 2),
+            "held_out": torch.tensor(self.held_out, dtype=torch.int64),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._sampler.restore(state["sampler"])
+        self.drawn = state["drawn"]
+        self.growth = Growth.of(state)
+        self.held_out = state["held_out"].tolist()
+        self._known = set(self.growth.rows)
+        for rows in state["asked"]:
+            self._ask(tuple(rows))

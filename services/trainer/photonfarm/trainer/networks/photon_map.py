@@ -1,0 +1,69 @@
+"""The photon map, gathered in the image: what falls on the surfaces that each pixel sees, estimated from the photons.
+
+The irradiance of a surface is the flux of the photons that land near over the area on which they do [Jensen, Global
+Illumination using Photon Maps, 1996]; near are here those that land near in the image. Noise falls with the number of
+photons and of pixels, and what differs between these is blurred.
+
+Shape letters: B batch, K photon slots, H W image.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from photonfarm.trainer.networks.projection import Footprint, Optics
+
+WINDOWS = (0.07, 0.17)
+"""Sides of the squares over which photons and area are summed, of the image's width, three times in a row, as a sum
+over one square has an edge. The wider has less noise, the narrower more detail."""
+
+GRAZING = 0.05
+"""Cosine between ray and normal below which a pixel is left out: the area of a surface seen edge-on has no bound."""
+
+
+def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
+    """Area of the surface that each pixel sees, (B, H, W) in scene units², 0 where nothing is seen, or all but edge-on.
+
+    z² / (f² |n · d|) for depth z, focal length f in pixels, unit shading normal n, and d the ray that crosses depth 1.
+    """
+    rays, forward = optics.rays(world_to_camera), world_to_camera[:, None, None, 2, :3]
+    along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs()
+    area = (depth / optics.focal_px) ** 2 * along / facing.clamp(min=GRAZING)
+    return torch.where(facing < GRAZING, 0, area)
+
+
+def arrives_on_seen_side(position: Tensor, direction: Tensor, normal: Tensor, world_to_camera: Tensor) -> Tensor:
+    """Whether photons (B, K, 3) come from the side of their surface that the eye is on, (B, K)."""
+    eye = -(world_to_camera[:, :, :3].mT @ world_to_camera[:, :, 3:]).mT
+    return (direction * normal).sum(dim=-1) * ((position - eye) * normal).sum(dim=-1) > 0
+
+
+def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
+    """Irradiance / π by each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
+
+    power (B, K, 3) is flux over the number of paths emitted, area (B, H, W), and pixels where that is 0 are left out.
+    Zero where no surface is seen near.
+    """
+    B, H, W = area.shape
+    landed = power.flatten(0, 1).index_select(0, kept.point)
+    flux = power.new_zeros(B * H * W, 3).index_add(0, kept.pixel, landed).view(B, H, W, 3)
+    both = torch.cat([flux * (area > 0)[..., None], area[..., None]], dim=-1).permute(0, 3, 1, 2)
+    found = []
+    for share in WINDOWS:
+        around = _blurred(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
+        seen = around[..., 3:]
+        found.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
+    return found
+
+
+def _blurred(x: Tensor, beside: int) -> Tensor:
+    """Means over squares with so many pixels on each side of a pixel, three times, (B, C, H, W); zero outside."""
+    side = 2 * beside + 1
+    for _ in range(3):
+        x = functional.avg_pool2d(x, (1, side), 1, (0, beside))
+        x = functional.avg_pool2d(x, (side, 1), 1, (beside, 0))
+    return x

@@ -1,0 +1,142 @@
+"""Points to pixels: the projection step between light transport and image synthesis [supplement 1.2].
+
+Shape letters: B batch, P points, H W image, C channels, K points that land in an image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.trainer.runs.settings import Occlusion
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What all cameras of a scene have in common, and how points that are hidden are told from those that are seen."""
+
+    focal_px: float
+    width: int
+    height: int
+    near: float  # scene units, near plane of window depth
+    far: float
+    occlusion: Occlusion = "exact"
+    tolerance: float = 1e-3  # ε of the rules on a depth buffer [supplement 1.2]
+
+    @classmethod
+    def of(cls, spec: SceneSpec, occlusion: Occlusion = "exact", tolerance: float = 1e-3) -> Optics:
+        """The optics of a spec; the focal length is that of every `Camera` of it."""
+        camera = Camera.of(View(np.zeros(3, np.float32), np.ones(3, np.float32)), spec)
+        return cls(camera.focal_px, camera.width, camera.height, spec.view.near, spec.view.far, occlusion, tolerance)
+
+    def rays(self, world_to_camera: Tensor) -> Tensor:
+        """Unit world directions through the pixel centres, (B, H, W, 3): normalise(T⁻¹ K⁻¹ (u+.5, v+.5, 1))."""
+        x = (torch.arange(self.width).to(world_to_camera) + 0.5 - 0.5 * self.width) / self.focal_px
+        y = (torch.arange(self.height).to(world_to_camera) + 0.5 - 0.5 * self.height) / self.focal_px
+        right, down, forward = (world_to_camera[:, None, None, i, :3] for i in range(3))
+        direction = x[:, None] * right + y[:, None, None] * down + forward
+        return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """Which point lands in which pixel; one entry per point that is kept."""
+
+    point: Tensor  # (K,) int64 index into B·P
+    pixel: Tensor  # (K,) int64 index into B·H·W
+
+
+@torch.no_grad()
+def footprint(
+    position: Tensor,
+    visible: Tensor,
+    seen: Tensor,
+    world_to_camera: Tensor,
+    depth: Tensor,
+    normal: Tensor,
+    optics: Optics,
+) -> Footprint:
+    """The points that are kept, and their pixels.
+
+    position (B, P, 3) world, visible and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
+    axis, normal (B, H, W, 3) world. Image coordinates are floored. Dropped are points flagged invisible, behind the
+    camera, off the image, or occluded. To "exact" what is not `seen` is occluded, whatever the depth; to the other
+    rules what lies behind the rendered depth by more than the tolerance, seen or not, and nothing where the depth is 0,
+    as nothing was hit there.
+    """
+    in_camera = position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]
+    kept = visible & seen if optics.occlusion == "exact" else visible
+    sample, point, u, v = _landing(in_camera, kept, optics)
+    if optics.occlusion != "exact":
+        at, surface = in_camera[sample, point], depth[sample, v, u]
+        if optics.occlusion == "surface":
+            facing = (world_to_camera[sample, :, :3] @ normal[sample, v, u, :, None]).squeeze(-1)
+            behind = _behind_surface(at, _through_centres(u.to(at), v.to(at), optics), surface, facing)
+        else:
+            behind = _behind_depth(at[:, 2], surface, optics)
+        in_sight = (surface == 0) | (behind <= optics.tolerance)
+        sample, point, u, v = (index[in_sight] for index in (sample, point, u, v))
+    return Footprint(point=sample * position.shape[1] + point, pixel=(sample * optics.height + v) * optics.width + u)
+
+
+def _landing(in_camera: Tensor, kept: Tensor, optics: Optics) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Those of the points kept (B, P) that lie ahead and in the image: sample, point, column and row, (K,) each."""
+    x, y, z = in_camera.unbind(-1)
+    ahead = kept & (z > 0)
+    z = torch.where(ahead, z, 1)  # divides safely; dropped below
+    column = torch.floor(optics.focal_px * x / z + 0.5 * optics.width)
+    row = torch.floor(optics.focal_px * y / z + 0.5 * optics.height)
+    inside = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
+    sample, point = inside.nonzero(as_tuple=True)
+    return sample, point, column[sample, point].long(), row[sample, point].long()
+
+
+def _behind_depth(z: Tensor, surface: Tensor, optics: Optics) -> Tensor:
+    """How far points at depth z lie behind the rendered surface, (K,); without meaning where the surface is 0.
+
+    Window depth is OpenGL's, w(z) = (1/near − 1/z) / (1/near − 1/far), 0 at the near plane and 1 at the far plane. The
+    supplement's ε = 1e-3 is only sensible there: on linear depth it removes points of slanted surfaces [method 2].
+    """
+    match optics.occlusion:
+        case "window":
+            return (1 / surface - 1 / z) / (1 / optics.near - 1 / optics.far)
+        case "linear":
+            return z - surface
+        case _:
+            return z / surface - 1
+
+
+def _through_centres(u: Tensor, v: Tensor, optics: Optics) -> Tensor:
+    """Where the rays through pixel centres cross depth 1, in camera coordinates, (K, 3)."""
+    x = (u + 0.5 - 0.5 * optics.width) / optics.focal_px
+    y = (v + 0.5 - 0.5 * optics.height) / optics.focal_px
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def _behind_surface(point: Tensor, ray: Tensor, surface: Tensor, normal: Tensor) -> Tensor:
+    """How far points lie behind the rendered surface continued as a plane, over its depth, (K,); all (K, 3) in camera.
+
+    The depth of a pixel is that of its centre. What lies elsewhere in the pixel on the same plane is at another depth,
+    by more the more it slants, and yet at distance 0 from the plane: so ε can be small, and does not depend on near and
+    far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/projection.md has figures.
+    """
+    from_eye = (normal * ray).sum(dim=-1)  # < 0: the normal is on the eye's side
+    offset = ((point - ray * surface[:, None]) * normal).sum(dim=-1) * torch.sign(from_eye)
+    return torch.minimum(offset, point[:, 2] - surface) / surface
+
+
+def project_mean(features: Tensor, kept: Footprint, height: int, width: int) -> Tensor:
+    """The mean feature of the points in each pixel, zero where there is none: (B, P, C) → (B, H, W, C).
+
+    Differentiable in the features; a point that is not in the footprint contributes nothing, in value or gradient.
+    """
+    B, _, C = features.shape
+    pixels = B * height * width
+    total = features.new_zeros(pixels, C).index_add(0, kept.pixel, features.flatten(0, 1).index_select(0, kept.point))
+    count = torch.bincount(kept.pixel, minlength=pixels).clamp(min=1).to(features.dtype)
+    return (total / count[:, None]).view(B, height, width, C)

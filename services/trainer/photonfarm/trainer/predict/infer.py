@@ -1,0 +1,215 @@
+"""`photonfarm infer`: what a trained network shows of a sample, or of a camera path.
+
+The views of a path are in no store, and their buffers come from the renderer: from a file that `photonfarm buffers`
+wrote, or from that verb, run as a process of its own where it is installed.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from photonfarm.shared.core.commands import command, is_installed
+from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.records import F32, BasePointCloud, Guides, ViewBuffers, Visibility
+from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.read.find import Query, find_samples
+from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, rows_held_out
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.networks.inputs import given
+from photonfarm.trainer.predict import animation
+from photonfarm.trainer.predict.evaluation import error_of
+from photonfarm.trainer.predict.trained import TrainedRun
+
+VERB = "buffers"  # of the renderer
+NOT_JUDGED = "was trained on (it is not held out), so no error is told: the network may know its noise by heart"
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What was written, and how good it is or how fast it went."""
+
+    files: tuple[Path, ...]
+    sentence: str
+
+
+# ---------------------------------------------------------------------------------------------------- a stored sample
+
+
+def find_row(store: str | Path, run: TrainedRun, modification: str | None, view: str | None) -> int:
+    """The first complete sample of a configuration and a view, as `store find` takes them; StoreError without one."""
+    found = find_samples(Store(store), [run.scene_id], Query.of(modification=modification, view=view))
+    row = next((sample.row for sample in found.samples if sample.complete), None)
+    if row is None:
+        nearest = "" if found.nearest is None else f"; the nearest planned one is {found.nearest:.3g} scene units away"
+        raise StoreError(
+            f"{store}: no complete sample of this configuration and view{nearest}. Any view can be shown with "
+            "--camera-path, for which the renderer makes the buffers"
+        )
+    return row
+
+
+def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> Written:
+    """Write prediction.png and target.png, the mean of both noisy halves, of one sample; StoreError without it."""
+    torch.set_num_threads(run.settings.threads)
+    source = _source(store, run)
+    with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
+        feed.ask([row])
+        batch = feed.take()
+        predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), device)
+    if not batch.rows:
+        raise StoreError(_missing(source, row))
+    shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
+    files = tuple(out / f"{name}.png" for name in shown)
+    _make(out)
+    for file, pixels in zip(files, shown.values(), strict=True):
+        animation.write_png(animation.enlarged(pixels), file)
+    (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
+    return Written(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
+
+
+def _missing(source: StoreSource, row: int) -> str:
+    rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests()), default=0)
+    if row >= rows:
+        return f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0"
+    return f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers"
+
+
+def _judged(image: F32, batch: Batch) -> str:
+    half_a, half_b = batch.target[0].numpy()
+    return f"held out; squared error {error_of(batch)(image, half_a, half_b):.5f}, the noise taken out"
+
+
+# ------------------------------------------------------------------------------------------------------ a camera path
+
+
+def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
+    """What `photonfarm buffers` makes of the arguments, such as --orbit 24, for the scene of the run.
+
+    Raises SpecError where the verb is not installed, PhotonfarmError with its exit code where it failed.
+    """
+    if not is_installed(VERB):
+        raise SpecError(
+            "the buffers of a camera path come from the renderer, which is not installed here; where it is, run "
+            f"`photonfarm {VERB} --scene {run.scene_id} {' '.join(arguments)}`, and give its file as --buffers FILE"
+        )
+    with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
+        file = Path(folder) / "buffers.npz"
+        named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
+        code = subprocess.run(command(VERB, *named, *arguments), stdout=subprocess.DEVNULL, check=False).returncode
+        if code:
+            raise _ended(code)
+        return Frames.read(file)
+
+
+def _ended(code: int) -> PhotonfarmError:
+    """An error with the exit code of the verb, which has said why."""
+    error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
+    error.exit_code = code
+    return error
+
+
+def show_frames(
+    store: str | Path, run: TrainedRun, frames: Frames, out: Path, *, fps: float = 12.0, device: str = "auto"
+) -> Written:
+    """Write the network's images of all frames: frame-0000.png …, path.gif, and path.mp4 where that can be made.
+
+    Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
+    """
+    torch.set_num_threads(run.settings.threads)
+    source = _source(store, run)
+    _check(run, frames, source.spec)
+    predict = run.predictor(source.spec, source.base(), device)
+    _make(out)
+    files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
+    seconds = 0.0
+    found = _batches(run, frames, source.spec, source.base()[1])
+    for file in files:
+        began = time.perf_counter()
+        image = predict(next(found))[0]
+        seconds += time.perf_counter() - began
+        animation.write_png(animation.enlarged(image), file)
+    sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"
+    animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
+    if not animation.can_write_mp4():
+        sentence += "; no MP4: pip install photonfarm-trainer[video]"
+        return Written((*files, out / "path.gif"), sentence)
+    animation.write_mp4(map(animation.read_png, files), out / "path.mp4", fps)
+    return Written((*files, out / "path.gif", out / "path.mp4"), sentence)
+
+
+def check_path(run: TrainedRun) -> None:
+    """Raise SpecError for a network that cannot show a camera path."""
+    if run.needs.kept:
+        raise SpecError(
+            f"{run.folder}: {run.settings.network.architecture} needs the noisy image of a view, which a camera path "
+            "has not; show one sample of the store, by --row"
+        )
+
+
+def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
+    check_path(run)
+    film = (len(frames), spec.film.height, spec.film.width)
+    if (frames.scene_id, frames.depth.shape) != (run.scene_id, film):
+        raise SpecError(
+            f"the buffers are of scene {frames.scene_id}, {frames.depth.shape}; the run is of scene {run.scene_id}, "
+            f"{film} of so many frames"
+        )
+    if run.needs.photons and frames.photons is None:
+        raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
+    if run.needs.guides and frames.guides is None:
+        raise SpecError(
+            f"{run.folder}: {run.settings.network.architecture} needs guides, and the buffers have none: make them of "
+            "a store whose scene has guides, by `photonfarm buffers`"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unrendered:
+    """A frame as a sample whose image nobody rendered."""
+
+    modification: Modification
+    view: View
+    buffers: ViewBuffers
+    visibility: Visibility
+    radiance: F32  # (2, H, W, 3) black
+    guides: Guides | None
+    scale: float = 1.0
+    pass_: int = 0
+
+
+def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[Batch]:
+    """The frames one by one, in memory that is used again."""
+    points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
+    memory = Batch.empty(1, points, spec, run.needs)
+    if memory.inputs.photons is not None:
+        fill_photons(memory.inputs.photons, 0, given(frames.photons))
+    black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
+    for i, view in enumerate(frames.views):
+        shown = _Unrendered(
+            frames.modification, view, frames.buffers(i), frames.visibility(i), black, frames.guides_of(i)
+        )
+        fill(memory, 0, shown, spec, cloud)
+        yield memory.filled((i,), (b"",))
+
+
+def _source(store: str | Path, run: TrainedRun) -> StoreSource:
+    """The samples of the run's scene; StoreError where there is no store."""
+    return StoreSource(Store(store).root, run.scene_id)
+
+
+def _make(folder: Path) -> None:
+    with store_errors("make the folder of the pictures", folder):
+        folder.mkdir(parents=True, exist_ok=True)

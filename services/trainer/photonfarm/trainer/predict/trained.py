@@ -1,0 +1,66 @@
+"""A training run as those see it who come after the training: its settings, its scene, its network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.predict.evaluation import DevicePredictor, network_predictor
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.run_settings import read_settings
+from photonfarm.trainer.runs.settings import TrainSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainedRun:
+    """A run folder with a checkpoint."""
+
+    folder: Path
+    settings: TrainSettings
+    scene_id: str
+    weights: dict[str, Any]  # by which it predicts: averaged over its steps, where it was trained so
+
+    @classmethod
+    def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
+        """The run with the weights of the checkpoint of this name, the last one that was written unless told otherwise.
+
+        Raises SpecError if the folder is not a run, or its settings are not those of the checkpoint; StoreError without
+        a readable checkpoint.
+        """
+        settings, state = read_settings(folder), checkpoint.load(folder / name)
+        said = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
+        checkpoint.check_continues(folder / name, state, said)
+        weights = average["weights"] if (average := state.get("average")) else state["network"]
+        return cls(folder, settings, str(state["scene_id"]), weights)
+
+    def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
+        """The trained network, on the CPU, for the scene that it was trained on."""
+        settings = self.settings.network
+        network = build(settings, SceneFrame.of(spec, *base, settings), self.settings.seed)
+        network.load_state_dict(self.weights)
+        return network
+
+    @property
+    def name(self) -> str:
+        """Architecture, and the folder where that says more; of an absolute path its last part."""
+        architecture, folder = self.settings.network.architecture, self.folder
+        said = folder.name if folder.is_absolute() else str(folder)
+        return architecture if said == architecture else f"{architecture} ({said})"
+
+    @property
+    def needs(self) -> Needs:
+        """What its network reads."""
+        return ARCHITECTURES[self.settings.network.architecture].needs
+
+    def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
+        """The network's images, made on a device. SpecError where that is not usable."""
+        return network_predictor(self.network(spec, base).to(usable_device(device)).eval())

@@ -1,0 +1,46 @@
+"""What an error is measured by who knows nothing: the mean colour, and the network before its first step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.trainer.data.dataset import SampleSource
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.predict.evaluation import (
+    HeldOut,
+    batches,
+    constant_predictor,
+    mean_colour,
+    measure,
+    network_predictor,
+)
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import INITIAL
+
+MOST_TRAINING = 1024  # samples to take the mean colour of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gauges:
+    """Errors to compare with, in linear radiance × exposure, the targets' noise removed."""
+
+    mean_colour: HeldOut  # of the training samples, everywhere
+    untrained: HeldOut  # the first run's network before its first step
+
+    @classmethod
+    def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Gauges:
+        """On some held-out samples of a run; raises IncompleteError without samples to take the colour of."""
+        settings = run.settings.model_copy(update={"device": "cpu"})
+        with Feed(source, settings, needs=run.needs) as feed:
+            arrived, _ = feed.arrivals()
+            training = [row for row, held in arrived if not held]
+            if not training:
+                raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
+            colour = mean_colour(batches(feed, training[:: -(-len(training) // MOST_TRAINING)], settings.batch))
+            network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
+            return cls(
+                measure(constant_predictor(colour), batches(feed, rows, settings.batch)),
+                measure(network_predictor(network), batches(feed, rows, settings.batch)),
+            )

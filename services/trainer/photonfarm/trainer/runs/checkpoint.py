@@ -1,0 +1,199 @@
+"""Checkpoints: safetensors with what is no tensor as JSON inside; written whole or not at all, enough to go on exactly.
+
+A file's tensors are named by where they stand in the state, `network.image_synthesis.out.weight`. The rest of the state
+is the JSON under `photonfarm` in the file's metadata, where {"tensor": NAME} stands for each of them; it has a digest
+of their bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as to_bytes
+from torch import Tensor
+
+from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
+from photonfarm.shared.store.io.local import sync
+from photonfarm.trainer.runs.settings import NetworkSettings
+
+FORMAT = 3
+ANEW = "without this file the run begins anew"
+METADATA = "photonfarm"
+TENSOR = "tensor"
+
+Changes = dict[str, tuple[Any, Any]]
+"""Settings by key, as they were and as they are."""
+
+LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
+"""What a run keeps for as long as it lasts. The rest may be changed where it goes on."""
+
+OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed")
+"""Those with an option of their own on the command line; the others are told by --set."""
+
+UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)
+"""What is raised on bytes that were not written here."""
+
+
+def save(path: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint: to a temporary name, synced, renamed, and the rename synced. StoreError where that fails.
+
+    A state is made of dictionaries by string, lists, tensors, and what JSON has beside them.
+    """
+    tensors: dict[str, Tensor] = {}
+    described = _apart(state, "", tensors)
+    document = json.dumps({"format": FORMAT, "sha256": _digest(tensors), **described})
+    content = to_bytes(tensors, {METADATA: document})  # safetensors writing to the file itself would not sync it
+    partial = path.with_suffix(".partial")
+    with store_errors("write the checkpoint", path):
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+        sync(path.parent)
+
+
+def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
+    """A checkpoint's content, on the CPU; nothing in it is executed.
+
+    Raises StoreError if it cannot be read; `without` says what the run does if the file is taken away.
+    """
+    document, tensors = _read(path, without)
+    if (found := document.get("format")) != FORMAT:
+        raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
+    if document.get("sha256") != _digest(tensors):
+        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {without}")
+    state: dict[str, Any] = _together(document, tensors)
+    return state
+
+
+def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What is no tensor, and the tensors by their names."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            document = dict(json.loads((file.metadata() or {}).get(METADATA, "{}")))
+            return document, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise StoreError(
+            f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
+            "its end"
+        ) from error
+    except UNREADABLE as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {without}") from error
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """Of names and bytes."""
+    found = hashlib.sha256()
+    for name in sorted(tensors):
+        found.update(name.encode())
+        found.update(tensors[name].numpy().tobytes())
+    return found.hexdigest()
+
+
+def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+    """The value with a reference for each tensor; these are put into `tensors`, by their names."""
+    if isinstance(value, Tensor):
+        tensors[name] = value.detach().cpu().contiguous()
+        return {TENSOR: name}
+    if isinstance(value, Mapping):
+        return {key: _apart(member, f"{name}.{key}".lstrip("."), tensors) for key, member in value.items()}
+    if isinstance(value, list):
+        return [_apart(member, f"{name}.{place}", tensors) for place, member in enumerate(value)]
+    return value
+
+
+def _together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """The value with a tensor for each reference."""
+    if isinstance(value, dict):
+        if value.keys() == {TENSOR}:
+            return tensors[value[TENSOR]]
+        return {key: _together(member, tensors) for key, member in value.items()}
+    return [_together(member, tensors) for member in value] if isinstance(value, list) else value
+
+
+def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
+    """What a checkpoint has seen of a store: scene, plans, and how many samples had arrived; `following` has which."""
+    return {"scene_id": scene_id, "plans": list(plans), "samples": samples}
+
+
+def versions() -> dict[str, str]:
+    """What the arithmetic of a run depends on."""
+    return {
+        "photonfarm-trainer": version("photonfarm-trainer"),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str, Any]) -> Changes:
+    """Raise SpecError if the checkpoint is of another scene or of a run that `LASTING` settings make another one.
+
+    Returns which other settings are not what they were. Both have `scene_id` and `settings`.
+    """
+    then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
+    check_of_this_version(path, then["network"])
+    changed = _differing(then, now)
+    lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
+    if lasting:
+        found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
+        options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key != "scene_id")
+        same = f"the same values{f' ({options})' if options else ''}"
+        raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
+    return changed
+
+
+def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
+    """Raise SpecError unless what a run wrote of its network says all that makes one today.
+
+    What it left out would be today's default, and another network.
+    """
+    if unsaid := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+        raise SpecError(f"{path}: lacks {unsaid} of the network: another version's run; train anew, in another folder")
+
+
+def _option(key: str, value: Any) -> str:
+    """What sets a key to a value on the command line."""
+    name = key.split(".")[-1]
+    if name in OPTIONS:
+        return f"no --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
+    return f"--set {name}={'null' if value is None else value}"
+
+
+def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
+    """What is not the same in both, (then, now), by key; a key within another one as OUTER.INNER."""
+    found: Changes = {}
+    for key in {**before, **now}:
+        then, value = before.get(key), now.get(key)
+        if isinstance(then, Mapping) and isinstance(value, Mapping):
+            found |= _differing(then, value, f"{inside}{key}.")
+        elif then != value:
+            found[f"{inside}{key}"] = (then, value)
+    return found
+
+
+def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:
+    """Raise SpecError unless the store's plans begin with those that the checkpoint saw: rows are numbered by them.
+
+    StoreError if it holds weights alone, as of a run that has not begun.
+    """
+    if "store" not in state:
+        raise StoreError(f"{path}: holds weights alone, and not where a run stood; without this file it begins anew")
+    before = state["store"]["plans"]
+    if list(plans[: len(before)]) != before:
+        raise SpecError(
+            f"{path}: was trained on the samples of {len(before)} plans that this store does not begin with; "
+            "use another run directory, or the store it was trained on"
+        )

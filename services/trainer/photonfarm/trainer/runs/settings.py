@@ -1,0 +1,185 @@
+"""What can be set about training, with each default and its reason; light to import (no torch).
+
+Where a default is the supplement's, its section is named; the others are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from photonfarm.trainer.runs import biased
+
+Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
+Architecture = Literal[
+    "cnn", "feature_projection", "light_transport", "light_transport_photons",  # of the paper
+    "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, told what is known of a view
+    "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
+]  # fmt: skip
+Precision = Literal["float32", "bfloat16"]
+Maxima = Literal["absolute", "relative"]
+PhotonUse = Literal["gathered", "transport"]
+Loss = Literal["linear", "relative", "paired"]
+Optimiser = Literal["adam", "rmsprop"]
+Schedule = Literal["epochs", "cosine"]
+UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
+
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+
+MOST_HELD_OUT = 512
+"""Samples that a finished run is measured on, at most."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class NetworkSettings(_Frozen):
+    """The network; changing any of these makes another network, and old checkpoints are refused."""
+
+    architecture: Architecture = "light_transport"
+    width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
+    points: Count | None = None  # first points of the base cloud to use; None: all of them
+    descriptor: Annotated[int, Field(ge=0, le=512)] = 32  # learnable numbers per point
+    octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
+    maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
+    # with which it takes fewer steps to learn what lights do
+    photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
+    # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons
+    occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
+    # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
+    occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
+    precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
+    lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
+    demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
+
+    @model_validator(mode="after")
+    def _fits_its_architecture(self) -> Self:
+        if self.architecture == "feature_projection" and not self.descriptor:
+            raise ValueError("has descriptor = 0; feature_projection projects descriptors, and at least 1 is needed")
+        if self.photons != "gathered" and self.architecture != "light_transport_photons":
+            raise ValueError(f"has photons = {self.photons!r}, which is for light_transport_photons alone")
+        return self
+
+
+class TrainSettings(_Frozen):
+    """A training run."""
+
+    network: NetworkSettings = NetworkSettings()
+    seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
+
+    loss: Loss = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased
+    batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
+    learning_rate: Positive = 5e-4  # [S 3.1]
+    decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]
+    epoch_samples: Count = 50_000  # an epoch counts samples drawn, so the schedule ignores how much has arrived
+    optimiser: Optimiser = "adam"  # [S 3.1]
+    beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
+    beta2: Annotated[float, Field(ge=0, lt=1)] = 0.999  # with rare fireflies 0.9999 … 0.99999: 1 / (1 − β₂) steps
+    # must see some 25 of them, or the weights that they reach stay too dark (docs/results/firefly.md)
+    alpha: Annotated[float, Field(ge=0, lt=1)] = 0.99  # of RMSprop, as β₂ of Adam: with 0.99 it darkens even more
+    schedule: Schedule = "epochs"  # of the rate: × decay an epoch [S 3.1]; "cosine" (ours): up, then down to 0 at
+    # max_steps, so that a run's last steps shake its weights the least; without decay and epochs
+    warm_up: Annotated[float, Field(ge=0, lt=1)] = 0.03  # share of max_steps in which "cosine" rises: Adam's means are
+    # of few steps then, and its first steps would else be its worst
+    average: Annotated[float, Field(ge=0, lt=1)] = 0.0  # of the weights, kept after each step, with which a run
+    # predicts: 0.999 remembers 1000 steps, over which their noise is evened out; 0: none
+    recover: bool = True  # where it gets much worse than it was, or is not finite, a run goes back to good weights,
+    # with half the rate, so that a night of training ends little worse than it once was
+
+    max_steps: Count = 150_000  # [S 4]
+    max_seconds: Positive | None = None  # wall time of all sessions of the run together
+
+    hold_out: Annotated[float, Field(gt=0, lt=1)] = 1 / 16  # share of the configurations never trained on
+    replay_ratio: Positive = 64.0  # draws per sample that has arrived, while more are to come
+    replay_buffer: Annotated[int, Field(ge=0)] = 256  # draws allowed beyond that
+    minimum_samples: Count = 8  # training samples to wait for before the first step
+    catch_up: Annotated[int, Field(ge=0)] = 2  # further draws a round for a sample that has been drawn less than others
+
+    validate_every: Count = 250  # steps
+    validation_samples: Count = 64  # at most so many held-out samples each time
+    checkpoint_every: Count = 500  # steps
+    poll_seconds: Positive = 1.0  # between looks at the store
+    prefetch: Count = 2  # batches read ahead
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of torch on the CPU; renderers share the machine
+    device: str = "auto"  # cuda where torch has one, and otherwise the cpu
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_what_biases(cls, settings: Any) -> Any:
+        return biased.refuse(settings)
+
+    @model_validator(mode="after")
+    def _has_the_other_half(self) -> Self:
+        if self.loss == "paired" and self.network.architecture.startswith("denoise"):
+            raise ValueError(
+                f"has loss = 'paired', which weights each half by the other; {self.network.architecture} is given one "
+                "of them, and 'linear' or 'relative' are its losses"
+            )
+        return self
+
+
+KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model_fields) if key != "network")
+"""Every key that can be set, those of the network among them."""
+
+
+def paper_static(**changes: object) -> TrainSettings:
+    """The supplement's settings for a static scene: batches of 128; the image is what the scene's film is."""
+    return paper_dynamic(**{"batch": 128, **changes})
+
+
+def paper_dynamic(**changes: object) -> TrainSettings:
+    """The supplement's settings for movable objects and lights: width 64, 16 384 points (ours), batches of 32 [S 3.1].
+
+    Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they are what the scene's film is.
+    """
+    return TrainSettings.model_validate({"network": NetworkSettings(points=16384), **changes})
+
+
+def paper(**changes: object) -> TrainSettings:
+    """The supplement to the letter, as far as it says: as `paper_dynamic`, without what is ours in the network.
+
+    Positions without octaves, the projection's rule on the depth buffer [S 1.2], maxima as they are [S Fig. 1], the
+    linear loss [S 3.2], and no going back. docs/training.md lists what is left of ours, and why.
+    """
+    network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
+    return TrainSettings.model_validate({"network": network, "recover": False, **changes})
+
+
+def small(**changes: object) -> TrainSettings:
+    """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2. All ours.
+
+    The network is told what is known of a view, and its rate rises and falls over the whole run, however short; weights
+    are averaged over the last hundred steps. One configuration of eight is held out. Maxima over the points, of the
+    networks that take them, are relative, as so short a run learns little of lights from absolute ones.
+    """
+    described: dict[str, object] = {
+        "network": NetworkSettings(architecture="guided_transport", width=16, points=4096, maxima="relative"),
+        "loss": "relative",
+        "batch": 2,
+        "learning_rate": 1e-3,
+        "schedule": "cosine",
+        "average": 0.99,
+        "epoch_samples": 256,
+        "hold_out": 1 / 8,
+        "max_steps": 4000,
+    }
+    return TrainSettings.model_validate({**described, **changes})
+
+
+PRESETS: dict[str, Callable[..., TrainSettings]] = {
+    "small": small,
+    "paper": paper,
+    "paper-static": paper_static,
+    "paper-dynamic": paper_dynamic,
+}
+
+
+def preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), **changes: object) -> TrainSettings:
+    """The settings of a preset with changes, those of its network in `network`. Raises ValidationError."""
+    settings = PRESETS[name](**changes)
+    return TrainSettings.model_validate({**dict(settings), "network": {**dict(settings.network), **network}})

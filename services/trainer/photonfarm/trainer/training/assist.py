@@ -1,0 +1,49 @@
+"""What the other processes of a group do while rank 0 trains: their part of each batch, and what it tells them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from photonfarm.trainer.data.dataset import SampleSource
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.distributed import Ranks
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.recovery import GoodState
+
+
+def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
+    """Train with rank 0 until that ends; `source` makes the samples of a scene by its id.
+
+    The folder `run`, which rank 0 writes, is read where the run goes on. Raises what `train` does.
+    """
+    torch.set_num_threads(settings.threads)
+    what, told = ranks.hear()
+    if what == "end":
+        return
+    own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
+    with Feed(source(told["scene_id"]), own) as feed:
+        good, step = GoodState(Learner(feed, settings, ranks)), told["step"]
+        if told["continues"]:
+            good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
+        _follow(ranks, feed, good, step)
+
+
+def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
+    """Do what rank 0 tells, until it tells the end."""
+    while (heard := ranks.hear())[0] != "end":
+        what, told = heard
+        if what == "rows":
+            feed.ask(ranks.part(told))
+        elif what == "keep":
+            good.keep(told)
+        elif what == "back":
+            good.go_back(told)
+        elif ranks.joined((batch := feed.take()).rows):  # "take"
+            good.step_or_go_back(step, batch)
+            step += 1

@@ -1,0 +1,96 @@
+"""What learns: a network and its optimiser, a step at a time, by one process or by several that share each batch."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks import build
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.average import WeightAverage
+from photonfarm.trainer.training.losses import LOSSES
+from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
+
+
+class DivergedError(IncompleteError):
+    """Loss or held-out error are no longer finite, or much worse than they were; the same run would come to that again.
+
+    `found` says which, and at which step.
+    """
+
+    exit_code = 8
+
+    def __init__(self, found: str) -> None:
+        super().__init__(
+            f"{found}; training cannot go on. What the run has saved is kept; a smaller learning_rate or a larger "
+            "batch may help"
+        )
+
+
+class Learner:
+    """The network of a scene, equal in all processes of a group, before and after each step."""
+
+    def __init__(self, feed: Feed, settings: TrainSettings, group: Group = ALONE) -> None:
+        """The untrained network of the feed's scene, on the device of this process."""
+        frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
+        self._settings, self._group = settings, group
+        self._device = group.device(settings.device)
+        self.network = build(settings.network, frame, settings.seed).to(self._device)
+        self.optimiser = build_optimiser(self.network.parameters(), settings)
+        self.average = WeightAverage(self.network, settings.average) if settings.average else None
+        self.rate_factor = 1.0  # on top of the schedule; no part of the state below
+
+    @property
+    def predicting(self) -> Network:
+        """The network to predict by: of averaged weights, where there are some."""
+        return self.network if self.average is None else self.average.network
+
+    def rate(self, number: int) -> float:
+        """The learning rate of step `number`."""
+        return self.rate_factor * rate_at(number, self._settings)
+
+    def step(self, number: int, batch: Batch) -> float:
+        """Step `number` of the optimiser on this process' part of a batch [supplement 3.1]; returns the batch's loss.
+
+        It is the same in all processes. If it is not finite, all is as it was before.
+        """
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.rate(number)
+        self.optimiser.zero_grad()
+        loss = torch.zeros((), device=self._device)
+        if batch.rows:  # of a part, all may have been taken back
+            batch = batch.to(self._device).for_training()
+            loss = LOSSES[self._settings.loss](self.network(batch.inputs), batch.target)
+            torch.autograd.backward(loss)
+        value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
+        if math.isfinite(value):
+            self.optimiser.step()
+            if self.average is not None:
+                self.average.take(self.network)
+        return value
+
+    def state(self) -> dict[str, Any]:
+        """Weights, their average if there is one, and the optimiser's memory, for a checkpoint."""
+        state = self.optimiser.state_dict()
+        memory = [state["state"].get(place, {}) for place in range(len(list(self.network.parameters())))]
+        average = None if self.average is None else self.average.state()
+        return {"network": self.network.state_dict(), "average": average, "optimiser_state": memory}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`; the optimiser's own settings stay those of now.
+
+        An average that is not in it begins with its weights, as a run may go on with one that had none.
+        """
+        self.network.load_state_dict(state["network"])
+        memory = {place: values for place, values in enumerate(state["optimiser_state"]) if values}
+        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": memory})
+        if self.average is not None:
+            self.average.restore(state.get("average") or {"weights": state["network"], "steps": 0})

@@ -1,0 +1,351 @@
+"""The training loop: steps at the pace of the store, validation, checkpoints, exact resume."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.shared.core.estimate import group_means
+from photonfarm.shared.core.processes import Stop
+from photonfarm.trainer.data.dataset import Batch, SampleSource
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.growth import Following, Growth
+from photonfarm.trainer.predict.evaluation import batches, network_predictor
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.metrics_log import MetricsLog
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, waits
+from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.recovery import GoodState, settle
+from photonfarm.trainer.training.validation import Best, Comparison, Show, Validation, compared, validate
+
+T = TypeVar("T")
+
+LOG_EVERY = 50  # steps
+NAP_SECONDS = 0.05  # between looks at the feed while there is nothing to train on
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a session of training ended."""
+
+    step: int
+    reason: str  # "steps", "seconds" or "stopped"
+    last_error: float | None  # held-out, noise removed; None if it ended before the first validation
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """What SIGTERM and SIGINT set, for `train`; for the main thread of a process."""
+    stop = Stop()
+    names = (signal.SIGTERM, signal.SIGINT)
+    before = [signal.signal(name, lambda *_: stop.set()) for name in names]
+    try:
+        yield stop
+    finally:
+        for name, handler in zip(names, before, strict=True):
+            signal.signal(name, handler)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a session of training has around it; `train` says what each is for."""
+
+    run: Path
+    watch: Stopwatch
+    stop: Stop
+    group: Group
+    script: Growth | None
+    listen: Callable[[dict[str, Any]], object] | None
+    count: Callable[[int, int], None] | None
+    show: Show | None
+
+
+def train(
+    source: SampleSource,
+    settings: TrainSettings,
+    run: Path,
+    *,
+    stop: Stop | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    script: Growth | None = None,
+    listen: Callable[[dict[str, Any]], object] | None = None,
+    count: Callable[[int, int], None] | None = None,
+    waited: float = 0.0,
+    group: Group = ALONE,
+    show: Show | None = None,
+) -> Outcome:
+    """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
+
+    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
+    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
+    metrics.jsonl as it is written; `count`, after each step and where a run begins, how many draws there were by then
+    and how many samples have arrived. `waited` seconds have gone by already. Of a `group` this is rank 0. At each
+    validation `show` gets the step, targets and predictions of the first held-out samples. Raises SpecError for a run
+    of another network, scene or store, a device that is not there or a hold-out that leaves nothing, StoreError for a
+    folder that cannot be written or that another trainer has, DivergedError where a loss is not finite, or the held-out
+    error is that or much worse than it was, and there is nothing to go back to, or it has been gone back to too often;
+    the last checkpoint stays.
+    """
+    torch.set_num_threads(settings.threads)
+    usable_device(settings.device)
+    stop, watch = stop or Stop(), Stopwatch(clock, "wait_data", waited)
+    with held(run):
+        while not source.ready():
+            if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
+                return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
+        watch.turn("start")
+        with Feed(source, settings, clock) as feed:
+            around = Surroundings(run, watch, stop, group, script, listen, count, show)
+            return Session(feed, settings, around).run()
+
+
+class Session:
+    """One session of a run, from its start or its last checkpoint to its end."""
+
+    def __init__(self, feed: Feed, settings: TrainSettings, around: Surroundings) -> None:
+        self._feed, self._settings, self._around = feed, settings, around
+        self._run, self._watch, self._stop = around.run, around.watch, around.stop
+        self._log = MetricsLog(around.run / METRICS, around.listen)
+        self._learner = Learner(feed, settings, around.group)
+        self._good = GoodState(self._learner)
+        self._best: Best | None = None
+        self._following = Following(feed, settings, around.script, around.group)
+        self._step = 0
+        self._last_error: float | None = None
+        self._validated: int | None = None  # the step of the log's last validation
+        self._compared: Comparison | None = None  # of this session's last one, if it ended there
+        self._seconds_told: dict[str, float] = {}  # by the last validation
+
+    def run(self) -> Outcome:
+        """Train until something ends it."""
+        self._begin()
+        self._watch.turn("other")
+        while (reason := self._ended()) is None:
+            due = self._step % self._settings.validate_every == 0
+            if due and self._wait(self._can_validate) and self._step != self._validated:
+                self._validate()
+                self._keep_or_go_back()
+            if (batch := self._wait(self._next_batch)) is not None:
+                self._train_step(batch)
+            if self._step % self._settings.checkpoint_every == 0:
+                self._save()
+        if reason != "stopped" and self._following.held_out:
+            self._end_no_worse()
+        self._save()
+        self._log.write("end", step=self._step, reason=reason, **self._counts())
+        return Outcome(self._step, reason, self._last_error)
+
+    def _begin(self) -> None:
+        path = self._run / CHECKPOINT
+        changed = self._continue(path) if (continues := path.exists()) else self._start()
+        with store_errors("write the settings", self._run):
+            (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
+        kept = self._log.cut(self._step if continues else -1)
+        self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
+        if changed:
+            self._log.write("changes", step=self._step, changes=changed)
+        self._tell_count()
+
+    def _start(self) -> checkpoint.Changes:
+        self._tell_begin(continues=False)
+        settle(self._run, None)
+        checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
+        return {}
+
+    def _continue(self, path: Path) -> checkpoint.Changes:
+        """Go on from a checkpoint; returns which settings are others than they were."""
+        state = checkpoint.load(path)
+        changed = checkpoint.check_continues(path, state, self._identity())
+        checkpoint.check_same_store(path, state, self._feed.plan_requests())
+        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have none
+        settle(self._run, recovery["good"])
+        self._good.restore(state, self._run, recover=self._settings.recover)
+        if recovery["best"] and self._good.step is not None:  # with nothing to go back to, a best is of no use
+            self._best = Best.of(recovery["best"])
+        self._step, self._last_error = state["step"], state["last_error"]
+        self._watch.add(state["seconds"])
+        self._seconds_told = dict(state["seconds"])
+        self._tell_begin(continues=True)
+        self._following.restore(state["following"])
+        return changed
+
+    def _tell_begin(self, *, continues: bool) -> None:
+        told = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        self._around.group.tell("begin", told)
+
+    def _identity(self) -> dict[str, Any]:
+        return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
+
+    def _save(self) -> None:
+        with self._watch.on("save"):
+            samples = len(self._following.growth.rows)
+            state = {
+                **self._learner.state(),
+                **self._identity(),
+                "step": self._step,
+                "seconds": self._watch.seconds,
+                "last_error": self._last_error,
+                "following": self._following.state(),
+                "recovery": {**self._good.state(), "best": self._best.state() if self._best else None},
+                "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
+                "versions": checkpoint.versions(),
+            }
+            with self._good.saved_with(self._run, self._identity()):
+                checkpoint.save(self._run / CHECKPOINT, state)
+
+    def _ended(self) -> str | None:
+        if self._stop.is_set():
+            return "stopped"
+        if self._step >= self._settings.max_steps:
+            return "steps"
+        if self._settings.max_seconds is not None and self._watch.total >= self._settings.max_seconds:
+            return "seconds"
+        return None
+
+    # -----------------------------------------------------------------------------------------------------------------
+
+    def _wait(self, look: Callable[[], T | None]) -> T | None:
+        """Wait for data until `look` finds something, and return it; None once training has ended."""
+        while not (found := look()):
+            if self._ended() is not None:
+                return None
+            with self._watch.on("wait_data"):
+                self._stop.wait(NAP_SECONDS)
+        return found
+
+    def _next_batch(self) -> Batch | None:
+        if not self._following.draw_ahead(self._settings.max_steps):
+            return None
+        with self._watch.on("wait_read"):
+            return self._following.take()
+
+    def _can_validate(self) -> bool:
+        self._following.look()
+        if self._following.complete:
+            self._check_split()
+        return bool(self._following.held_out) and (self._step > 0 or self._following.may_draw())
+
+    def _check_split(self) -> None:
+        rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._following.growth.rows)} samples planned"
+        if not self._following.held_out:
+            raise SpecError(
+                f"{rule} none is held out, and one is needed to validate on; raise it (--hold-out), or plan more "
+                "configurations"
+            )
+        if not self._following.training_rows:
+            raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
+
+    def _validate(self) -> None:
+        """Log the held-out error of the network that predicts, and compare it with the best before."""
+        self._compared = None
+        rows = self._following.held_out[: self._settings.validation_samples]
+        with self._watch.on("validate"):
+            self._following.drop()
+            found = batches(self._feed, rows, self._settings.batch)
+            try:
+                predict, loss = network_predictor(self._learner.predicting), self._settings.loss
+                now = validate(predict, self._step, found, self._around.show, loss=loss)
+            except IncompleteError:  # a repair has taken all of them back, for now
+                return
+            finally:
+                self._following.ask_again()
+        self._validated = self._step
+        if self._settings.recover:
+            self._compare(now)
+        if now.is_finite or not self._settings.recover:
+            self._log_validation(now)
+
+    def _log_validation(self, now: Validation) -> None:
+        held_out = now.held_out
+        self._last_error = held_out.error.mean
+        self._log.write(
+            "validation",
+            step=self._step,
+            error=held_out.error.mean,
+            standard_error=held_out.error.standard_error,
+            shown_error=float(group_means(held_out.shown, held_out.units).mean()),
+            noise_floor=held_out.floor,
+            held_out=len(held_out.per_sample),
+            waits=waits(seconds := self._watch.seconds, self._seconds_told),
+            **self._counts(),
+        )
+        self._seconds_told = seconds
+
+    def _compare(self, now: Validation) -> None:
+        self._compared = compared(now, self._best)
+        if self._compared.is_best:
+            self._best = Best(now.step, now.errors, now.by_shown)
+
+    def _keep_or_go_back(self) -> None:
+        """Do what the last validation asks for, in all processes."""
+        found = self._compared
+        if found is not None and found.is_clearly_worse:
+            told = f"step {self._step}: {found.stated}"
+            self._around.group.tell("back", told)
+            self._good.go_back(told)
+            self._log_recovered("held-out error", found)
+        elif found is not None and not found.is_worse:
+            self._around.group.tell("keep", self._step)
+            self._good.keep(self._step)
+
+    def _end_no_worse(self) -> None:
+        """Validate the last step, and end with the last good state if that is worse than one may be."""
+        if self._step != self._validated:
+            self._validate()
+        found = self._compared
+        if found is not None and not found.is_worse:
+            self._good.keep(self._step)
+        elif found is not None:
+            self._good.give(f"step {self._step}: {found.stated}")
+            self._log_recovered("end", found)
+            self._validate()
+
+    def _log_recovered(self, cause: str, found: Comparison | None = None) -> None:
+        self._compared = None  # the learner is another one now
+        self._log.write(
+            "recovered",
+            step=self._step,
+            cause=cause,
+            back_to=self._good.step,
+            errors=found.document() if found else None,
+            recoveries=self._good.recoveries,
+            rate_factor=self._learner.rate_factor,
+        )
+
+    def _used(self) -> tuple[int, int]:
+        """Draws so far, and samples that have arrived."""
+        return self._step * self._settings.batch, len(self._following.growth.rows)
+
+    def _tell_count(self) -> None:
+        if self._around.count is not None:
+            self._around.count(*self._used())
+
+    def _counts(self) -> dict[str, Any]:
+        draws, samples = self._used()
+        ahead = round(samples_per_used(samples, draws), 3)
+        seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
+        return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}
+
+    def _train_step(self, batch: Batch) -> None:
+        with self._watch.on("train"):
+            value = self._good.step_or_go_back(self._step, batch)
+        if value is None:
+            self._log_recovered("loss")
+        self._step += 1
+        self._tell_count()
+        if value is not None and self._step % LOG_EVERY == 0:
+            rate = self._learner.rate(self._step - 1)
+            self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())

@@ -1,0 +1,123 @@
+"""What a run goes back to when it gets much worse: the learner's state at its last good validation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from photonfarm.shared.core.errors import store_errors
+from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.training.learner import DivergedError, Learner
+
+GOOD = "good.safetensors"
+NEXT = "good.next.safetensors"  # in the run's folder too, until the checkpoint that refers to it is written
+WITHOUT = "without this file the run goes on, with nothing to go back to before its next good validation"
+
+MOST = 8
+"""How often a run may go back: the rate is 1/256 then, and what still diverges does so for another reason."""
+
+FACTOR = 0.5
+"""What the rate is multiplied by each time."""
+
+
+class GoodState:
+    """The state of a learner that was good, and goes back to it; equal in all processes of a group."""
+
+    def __init__(self, learner: Learner) -> None:
+        self._learner = learner
+        self._kept: dict[str, Any] = {}  # in memory of its own
+        self._is_new = False  # it is in no file
+        self.step: int | None = None  # at which it was kept; None if nothing is
+        self.recoveries = 0
+
+    def keep(self, step: int) -> None:
+        """Keep the state that the learner has at a step."""
+        self._kept, self.step, self._is_new = _copied(self._learner.state()), step, True
+
+    def step_or_go_back(self, number: int, batch: Batch) -> float | None:
+        """The loss of a step of the learner; None if it was not finite, and the learner went back.
+
+        Raises DivergedError as `go_back` does.
+        """
+        value = self._learner.step(number, batch)
+        if math.isfinite(value):
+            return value
+        self.go_back(f"step {number}: the loss is {value} on rows {list(batch.rows)}")
+        return None
+
+    def go_back(self, found: str) -> None:
+        """Give the learner the state that was kept, and half the rate from now on.
+
+        Raises DivergedError, which says what was found, if nothing is kept, or after `MOST` times.
+        """
+        if self.recoveries == MOST:
+            raise DivergedError(f"{found}, after the run has gone back {MOST} times")
+        self.give(found)
+        self.recoveries += 1
+        self._learner.rate_factor *= FACTOR
+
+    def give(self, found: str) -> None:
+        """Give the learner the state that was kept; DivergedError, which says what was found, if nothing is."""
+        if self.step is None:
+            raise DivergedError(found)
+        self._learner.restore(_copied(self._kept))  # a copy, as the optimiser works on what it is given
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds of it; the rest is in a file beside, by `saved_with`."""
+        return {"good": self.step, "recoveries": self.recoveries, "rate_factor": self._learner.rate_factor}
+
+    def restore(self, state: dict[str, Any], run: Path, *, recover: bool) -> None:
+        """Continue, and have the learner continue, from a checkpoint's state and the file beside it.
+
+        Nothing is kept if that is gone, or unless told to `recover`. Raises StoreError if it cannot be read.
+        """
+        self._learner.restore(state)
+        if (own := state.get("recovery")) is None:  # of an older version
+            return
+        self.recoveries, self._learner.rate_factor = own["recoveries"], own["rate_factor"]
+        if recover and own["good"] is not None and (kept := _loaded(run / GOOD)).get("step") == own["good"]:
+            self._kept, self.step = kept, own["good"]
+
+    @contextmanager
+    def saved_with(self, run: Path, identity: Mapping[str, Any]) -> Iterator[None]:
+        """Write what is kept; within, a checkpoint that refers to it is written, and then it replaces the one before.
+
+        So a run that is killed at any moment finds that which its last checkpoint refers to, by `settle`.
+        """
+        if self._is_new:
+            checkpoint.save(run / NEXT, {**self._kept, "step": self.step, **identity})
+        yield
+        if self._is_new:
+            with store_errors("keep the last good state", run):
+                (run / NEXT).replace(run / GOOD)
+            self._is_new = False
+
+
+def settle(run: Path, step: int | None) -> None:
+    """Finish what a killed run may have left: what its last checkpoint refers to, kept at `step`, is GOOD."""
+    with store_errors("keep the last good state", run):
+        if step is None:
+            (run / GOOD).unlink(missing_ok=True)
+        if step is not None and _loaded(run / NEXT).get("step") == step:
+            (run / NEXT).replace(run / GOOD)
+        (run / NEXT).unlink(missing_ok=True)
+
+
+def _loaded(path: Path) -> dict[str, Any]:
+    """What was written there; empty if nothing was."""
+    return checkpoint.load(path, without=WITHOUT) if path.exists() else {}
+
+
+def _copied(value: Any) -> Any:
+    """The value with tensors of its own, on the CPU."""
+    if isinstance(value, Tensor):
+        return value.detach().to("cpu", copy=True)
+    if isinstance(value, Mapping):
+        return {key: _copied(member) for key, member in value.items()}
+    return [_copied(member) for member in value] if isinstance(value, list) else value

@@ -1,0 +1,159 @@
+"""The verbs `scene`, `submit`, `top-up`, `status` and `up`, which need neither Mitsuba nor torch."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photonfarm.shared.cli.options import json_option, redis_option, request_options, store_option
+
+
+@click.group()
+def scene() -> None:
+    """Scene specs."""
+
+
+@scene.command("show")
+@click.argument("spec")
+@json_option
+def scene_show(spec: str, as_json: bool) -> None:
+    """Check SPEC (a scene.toml, or the name of a ready one) and show what it says."""
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.scene.spec import Emitters, load_spec
+
+    loaded = load_spec(spec)
+    show.scene(loaded, as_json)
+    if not as_json and loaded.emitters != Emitters():
+        click.echo(f"\nthe scene's own lights: {loaded.emitters}")
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
+              "more at that cost; write nothing.")  # fmt: skip
+@click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
+@json_option
+def submit(
+    spec: str,
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    retry: bool,
+    dry_run: bool,
+    no_measure: bool,
+    as_json: bool,
+    **request: Any,
+) -> None:
+    """Plan samples of SPEC and queue them; what is planned already is not planned again."""
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.farm import submission
+
+    if dry_run:
+        from photonfarm.shared.farm.dry_run import rehearse
+
+        tell = partial(click.echo, err=True)
+        show.dry_run(rehearse(spec, store, measure=not no_measure, tell=tell, **request), as_json)
+    else:
+        url = None if no_queue else redis_url
+        show.submission(submission.submit(spec, store, url, retry=retry, **request), as_json)
+
+
+@click.command("top-up")
+@click.argument("spec")
+@click.option(
+    "--spp",
+    required=True,
+    metavar="[+]N",
+    help="Samples per pixel: +64 adds 64 to what is planned of each view, 256 goes up to 256 in all.",
+)
+@click.option("--where", multiple=True, metavar="CONDITION", help="Which views, instead of all; see above.")
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
+@json_option
+def top_up(
+    spec: str,
+    spp: str,
+    where: tuple[str, ...],
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    as_json: bool,
+    **options: bool,
+) -> None:
+    """Plan more noisy passes of views of SPEC that are planned already, and queue them.
+
+    A pass has 2 × half_spp samples per pixel, so N is rounded up to whole passes. New passes are independent of
+    the old ones and share the buffers and photons that are there. Repeating +N adds again; repeating N adds nothing.
+
+    \b
+    Conditions, of which a view must meet every one that is given:
+      views=first:N      the first N that were planned, of those that meet the others
+      view=KEY           the view with this content key, or with one that begins so
+      modification=KEY   views of the configuration with this content key, or beginning
+      rows=A-B           views that the samples in rows A to B show; rows=A for one
+      plan=P             views that plan P brought
+      held-out[=SHARE]   views that training with this hold-out never sees (default 0.125)
+    """  # noqa: D301 - click wants the character
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.farm import submission
+
+    result = submission.top_up(spec, store, None if no_queue else redis_url, spp, where=where, **options)
+    show.submission(result, as_json)
+    noun = "pass" if result.passes == 1 else "passes"
+    click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)
+
+
+@click.command()
+@store_option
+@redis_option
+@json_option
+def status(store: str | Path, redis_url: str, as_json: bool) -> None:
+    """Show what is planned, committed, queued and failed."""
+    from photonfarm.shared.cli import show
+
+    show.status(store, redis_url, as_json)
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
+@click.option("--run", type=click.Path(path_type=Path), default="run", show_default=True, help="The trainer's folder.")
+@click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.125,
+    show_default=True,
+    help="Share of the configurations never trained on; a small plan needs a large one.",
+)
+@click.option("--reference-views", type=click.IntRange(0), default=0, show_default=True,
+              help="Held-out views that get references, for the report; 0: none.")  # fmt: skip
+@click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
+              help="Samples per pixel of each reference.")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
+def up(spec: str, store: str | Path, **options: Any) -> None:
+    """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
+
+    Ctrl-C stops it within seconds; the same command goes on from there.
+    """
+    from photonfarm.shared.farm.up import run_farm
+
+    try:
+        run_farm(spec, store, **options)
+    except KeyboardInterrupt:
+        click.echo("stopped; the same command goes on from here", err=True)
+        sys.exit(130)

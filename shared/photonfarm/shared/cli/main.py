@@ -1,0 +1,49 @@
+"""The command `photonfarm`: its verbs, its configuration file, and its exit codes."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+import click
+from click.core import ParameterSource
+from rich import markup
+from rich.console import Console
+
+from photonfarm.shared.cli.settings import file_defaults
+from photonfarm.shared.cli.verbs import Umbrella, options_by_command
+from photonfarm.shared.core.errors import PhotonfarmError, StoreError
+
+
+@click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="photonfarm-shared", prog_name="photonfarm")
+@click.option("--config", type=click.Path(path_type=Path), envvar="PHOTONFARM_CONFIG", default="photonfarm.toml",
+              show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
+@click.pass_context
+def umbrella(ctx: click.Context, config: Path) -> None:
+    """Unbiased training data for neural light transport, and training on it while it grows.
+
+    Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
+    to stdout, talk goes to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5 Redis, 6 this
+    machine cannot render, 7 incomplete, 8 training diverged, 130 `up` after Ctrl-C, 1 anything else.
+    """
+    named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
+    if named or config.is_file():
+        ctx.default_map = file_defaults(config, options_by_command(umbrella))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the command line; an error of ours becomes one sentence and its exit code."""
+    try:
+        umbrella(args, prog_name="photonfarm")
+    except PhotonfarmError as error:
+        _fail(str(error), error.exit_code)
+    except OSError as error:  # a file that a user named, and nobody closer to it could say more
+        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
+
+
+def _fail(sentence: str, exit_code: int) -> NoReturn:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print("[bold red]photonfarm:[/]", markup.escape(sentence), highlight=False)
+    sys.exit(exit_code)

@@ -1,0 +1,93 @@
+"""Options that several verbs share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from click.core import ParameterSource
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class StorePlace(click.Path):
+    """A folder, as a Path; or the URL of a bucket, as it is written."""
+
+    name = "folder or url"
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The Path or the URL; fails for a URL that is not that of a bucket."""
+        from photonfarm.shared.store.io.storage import SCHEMES, is_url
+
+        if not is_url(value):
+            return super().convert(value, param, ctx)
+        scheme, _, bucket = value.partition("://")
+        if scheme not in SCHEMES or not bucket.strip("/"):
+            self.fail(f"{value!r} is neither a folder nor {'://…, '.join(SCHEMES)}://… with a bucket.", param, ctx)
+        return value
+
+
+def store_option(command: Command) -> Command:
+    """`--store`, the sample store."""
+    return click.option(
+        "--store", type=StorePlace(), metavar="DIR|URL", envvar="PHOTONFARM_STORE", default="store", show_default=True,
+        help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
+    )(command)  # fmt: skip
+
+
+def redis_option(command: Command) -> Command:
+    """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
+    return click.option(
+        "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
+        help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
+        "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
+        "redis://default@host for a Redis with requirepass.", show_envvar=True, callback=_with_password,
+    )(command)  # fmt: skip
+
+
+def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
+    if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
+    if not (file := os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")):
+        return url
+    from photonfarm.shared.queue import with_password_of
+
+    return with_password_of(Path(file), url)
+
+
+def _refuse_password(url: str) -> None:
+    from photonfarm.shared.queue import has_password
+
+    if has_password(url):
+        raise click.BadParameter(
+            "a password on the command line can be read by everybody on this machine, and stays in the shell's "
+            "history; give the URL without it, and put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE "
+            "names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as `redis` in the configuration file.)"
+        )
+
+
+def json_option(command: Command) -> Command:
+    """`--json`: machine-readable results."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
+
+
+def request_options(command: Command) -> Command:
+    """The options that make a request."""
+    options = (
+        click.option("--modifications", type=click.IntRange(1), default=128, show_default=True,
+                     help="Random configurations; a static scene has one, of which modifications × views are planned."),
+        click.option("--views", type=click.IntRange(1), default=2, show_default=True, help="Views per configuration."),
+        click.option("--passes", type=click.IntRange(1), default=1, show_default=True, help="Noisy passes per view."),
+        click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
+        click.option("--shard-rows", type=click.IntRange(1, 4096), default=None,
+                     help="Samples per job, fixed for a scene by its first plan.  [default: 32]"),
+    )  # fmt: skip
+    for option in reversed(options):
+        command = option(command)
+    return command

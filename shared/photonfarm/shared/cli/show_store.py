@@ -1,0 +1,237 @@
+"""What `photonfarm store …` prints: sentences and tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shlex
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.store.check.check import Progress as Tell
+from photonfarm.shared.store.check.check import SceneReport, StoreReport, said
+from photonfarm.shared.store.read.find import FoundSample, Matches
+from photonfarm.shared.store.read.merge import Merged
+from photonfarm.shared.store.write.findings import Finding, Group, Remedy
+
+if TYPE_CHECKING:
+    from photonfarm.shared.farm.upgrade import SceneUpgrade, Upgrade
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Tell]:
+    """Something to tell how far a check is: a bar on a terminal, a line per scene elsewhere; both to stderr."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _line
+        return
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[read]}"), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def tell(scene: str, done: int, total: int, size_bytes: int) -> None:
+            if scene not in tasks:
+                tasks[scene] = bars.add_task(scene, total=total, read="")
+            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs, {size_bytes / 1e6:,.0f} MB")
+
+        yield tell
+
+
+def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
+    if done == total:
+        click.echo(f"{scene}: {total} jobs read, {size_bytes / 1e6:,.1f} MB", err=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------- check
+
+
+def check(report: StoreReport, as_json: bool) -> None:
+    """What was read and found, by scene and cause, and what to do."""
+    if as_json:
+        click.echo(json.dumps(_document(report), indent=2))
+        return
+    for scene in report.scenes:
+        _scene(scene)
+    if report.parts:
+        click.echo(f"tmp: {report.parts} unfinished files; workers sweep those of the dead")
+    if report.quarantine:
+        click.echo(f"set aside to {report.quarantine}, with a record of why; workers render what is missing now")
+    wrong = sum(_wrong(scene) for scene in report.scenes)
+    if not wrong:
+        click.echo("nothing is wrong")
+    elif not report.repaired:
+        click.echo(f"{wrong} findings; --repair sets aside what can be written again")
+    elif report.exit_code == StoreError.exit_code:
+        click.echo(
+            "something is still wrong that --repair cannot mend: see above for what helps. A plan comes back from a "
+            "copy of its folder below plans/; jobs and base need no copy, and are rendered again"
+        )
+
+
+def _wrong(scene: SceneReport) -> int:
+    return sum(group.count for group in scene.groups if group.cause.remedy is not Remedy.LOOK)
+
+
+def _scene(scene: SceneReport) -> None:
+    guides = f", guides of {scene.guide_jobs} jobs" if scene.guide_jobs else ""
+    read = f"{scene.jobs} jobs, {scene.samples} samples{guides}, {scene.size_bytes / 1e6:,.1f} MB"
+    click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
+    if scene.halves is not None:
+        click.echo(f"  A against B: {said(scene.halves)}")
+    if scene.back_facing_share is not None:
+        click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
+    for group in scene.groups:
+        click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")
+        for finding in group.first:
+            click.echo(f"      {_named(finding)}")
+        if group.count > len(group.first):
+            click.echo(f"      and {group.count - len(group.first)} more")
+    if scene.set_aside:
+        click.echo(f"  set aside: {', '.join(scene.set_aside)}")
+
+
+def _named(finding: Finding) -> str:
+    of = "guides of job" if finding.guides else "job"
+    job, row = (f"{what} {n}" if n is not None else "" for what, n in ((of, finding.job), ("row", finding.row)))
+    return ", ".join(part for part in (job, row, finding.file or "") if part) + f": {finding.detail}"
+
+
+def _document(report: StoreReport) -> dict[str, Any]:
+    return {
+        "exit_code": report.exit_code,
+        "quarantine": report.quarantine,
+        "parts": report.parts,
+        "scenes": [
+            {**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes
+        ],
+    }  # fmt: skip
+
+
+def _group(group: Group) -> dict[str, Any]:
+    first = [
+        {"job": f.job, "guides": f.guides, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
+    ]  # fmt: skip
+    cause = group.cause
+    return {"cause": cause.label, "means": cause.sentence, "remedy": cause.remedy.value, "count": group.count,
+            "first": first}  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------------- find
+
+
+def found(matches: Matches, store: str | Path, as_json: bool) -> None:
+    """Samples: what they are, where they lie, and how to look at one and render it."""
+    if as_json:
+        samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
+        click.echo(json.dumps({"count": matches.count, "nearest": matches.nearest, "samples": samples}, indent=2))
+        return
+    for sample in matches.samples:
+        _sample(sample, store)
+    if matches.count > len(matches.samples):
+        click.echo(f"{matches.count - len(matches.samples)} more; --limit shows more of them", err=True)
+    if not matches.count:
+        near = "" if matches.nearest is None else f"; the nearest is {matches.nearest:g} scene units away"
+        click.echo(f"no sample fits{near}", err=True)
+
+
+def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_json: bool) -> None:
+    """Write merged views, of so many passes at the least, into a folder that is made for them, and tell of each.
+
+    Raises StoreError if there is none, or where they cannot be written.
+    """
+    written = []
+    for key, view in views:
+        file = folder / f"{key}.npz"
+        view.write(file)
+        mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
+        written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})
+        if not as_json:
+            passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
+            click.echo(f"{file}: {passes}, mean {mean:.4g}, standard error of a value {error:.2g} (RMS)")
+    if as_json:
+        click.echo(json.dumps(written, indent=2))
+    if not written:
+        what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
+        raise StoreError(f"{what}; `photonfarm store find` shows what there is")
+
+
+def _sample(sample: FoundSample, store: str | Path) -> None:
+    state = "complete" if sample.complete else "not complete"
+    click.echo(f"{sample.scene_name} {sample.scene_id}, row {sample.row}, pass {sample.pass_}: {state}")
+    click.echo(f"  key           {sample.key}")
+    vector = ", ".join(f"{value:.9g}" for group in sample.modification for value in group) or "static"
+    click.echo(f"  modification  {sample.modification_key}  row {sample.modification_row}: {vector}")
+    view = ", ".join(f"{value:.9g}" for value in sample.view)
+    click.echo(f"  view          {sample.view_key}  row {sample.view_row}: {view}")
+    for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
+        click.echo(f"  job           {job}: {'committed' if committed else 'missing'}")
+    if sample.guided is not None:
+        click.echo(f"  guides        of job {sample.jobs[1]}: {'committed' if sample.guided else 'missing'}")
+    for place in sample.places:
+        held = "" if place.there else "  (not there)"
+        click.echo(f"  {place.array:<16} {place.file}  inner chunk {place.chunk}, index {place.index}{held}")
+    for what, command in commands(sample, store).items():
+        click.echo(f"  {what:<13} {command}")
+
+
+def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
+    """The command lines to look at a sample, and to render what is missing of it."""
+    listed = {}
+    if sample.complete:
+        program = (
+            "from photonfarm.shared.store import SceneReader; "
+            f"r = SceneReader({str(store)!r}, {sample.scene_id!r}); r.refresh(); print(r.read({sample.row}))"
+        )
+        listed["look at it"] = shlex.join(["python", "-c", program])
+    lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
+    if sample.guided is False:
+        lacking.add(sample.jobs[1])  # which is rendered for its view's guides alone, if it is committed
+    for job in dict.fromkeys(sample.jobs):
+        if job in lacking:
+            words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
+            listed[f"render job {job}"] = shlex.join(words)
+    return listed
+
+
+# -------------------------------------------------------------------------------------------------------------- upgrade
+
+
+def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
+    """What became of an upgrade, scene by scene, and how it goes on.
+
+    Raises StoreError at the end if a scene cannot be upgraded.
+    """
+    if as_json:
+        click.echo(json.dumps(asdict(result), indent=2))
+    else:
+        for scene in result.scenes:
+            _upgraded(scene, dry_run=result.dry_run)
+        if any(scene.jobs_lacking for scene in result.scenes) and not result.dry_run:
+            queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
+            command = shlex.join(["photonfarm", "work", "--until-complete", "--store", str(store)])
+            click.echo(f"{queued}; go on with: {command}")
+    if result.failed:
+        raise StoreError("; ".join(f"scene {scene_id}: {error}" for scene_id, error in result.failed.items()))
+
+
+def _upgraded(scene: SceneUpgrade, *, dry_run: bool) -> None:
+    asked = "guides are asked for already"
+    if scene.asked:
+        asked = "guides would be asked for" if dry_run else "guides are asked for"
+    click.echo(f"{scene.name} {scene.scene_id}: {asked}, with {scene.light_samples} light samples")
+    jobs = "1 job" if scene.jobs_lacking == 1 else f"{scene.jobs_lacking} jobs"
+    click.echo(f"  {scene.views_lacking} of {scene.views} views lack them: {jobs} to render")
+    most = scene.guide_bytes_per_sample / 1e3
+    if scene.bytes_per_sample is None:
+        click.echo(f"  no sample is complete; guides take at most {most:,.1f} kB per sample")
+    else:
+        before = scene.bytes_per_sample / 1e3
+        sizes = f"{before:,.1f} kB per sample without guides, at most {before + most:,.1f} kB with them"
+        click.echo(f"  {sizes} (less once compressed)")

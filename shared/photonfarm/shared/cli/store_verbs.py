@@ -1,0 +1,162 @@
+"""The verbs `photonfarm store …`: looking into a store, without Mitsuba or torch; `upgrade` alone talks to Redis."""
+
+from __future__ import annotations
+
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from photonfarm.shared.cli.options import json_option, redis_option, store_option
+
+
+def scene_option(command: click.decorators.FC) -> click.decorators.FC:
+    """`--scene ID`, one scene of the store."""
+    return click.option("--scene", metavar="ID", help="This scene alone: its id, how it begins, or its name.")(command)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
+@json_option
+def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> None:
+    """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
+
+    Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
+    that differ by more than chance, views from behind. Safe while workers and trainers are at work.
+
+    --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
+    missing and render them again. Damaged inputs of a plan it copies there, and writes them again from the plan's
+    request. It deletes nothing.
+
+    Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
+    4 something is wrong (also what --repair cannot repair, which the text says).
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.check.check import check_store
+    from photonfarm.shared.store.read.find import scene_named
+
+    opened = Store(store)
+    scene_id = None if scene is None else scene_named(opened, scene)
+    with show_store.progress() as tell:
+        report = check_store(
+            opened, scene_id, when=datetime.now(UTC).isoformat(timespec="seconds"), repair=repair, tell=tell
+        )
+    show_store.check(report, as_json)
+    sys.exit(report.exit_code)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--modification", metavar="VECTOR|KEY", help="4 numbers per movable group (x, y, z, present), or a key.")
+@click.option("--view", metavar="VECTOR|KEY", help="6 numbers (camera position, look-at point), or a key.")
+@click.option("--sample", metavar="KEY", help="The sample of a key: 32 hexadecimal digits.")
+@click.option("--row", type=click.IntRange(0), help="The sample in a row.")
+@click.option("--job", type=click.IntRange(0), help="The samples of a job.")
+@click.option("--tolerance", type=click.FloatRange(0), default=1e-3, show_default=True,
+              help="How far a position may be from the one given, in scene units; 0: bit by bit.")  # fmt: skip
+@click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="Samples to print.")
+@json_option
+def find(
+    store: str | Path,
+    scene: str | None,
+    modification: str | None,
+    view: str | None,
+    sample: str | None,
+    row: int | None,
+    job: int | None,
+    tolerance: float,
+    limit: int,
+    as_json: bool,
+) -> None:
+    """Look samples up by what they are: their rows, passes, files, and whether they are complete.
+
+    Conditions narrow each other; without any, all samples are listed. The nearest come first. Vectors are numbers
+    with commas or blanks between them, as printed.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import Query, find_samples, scene_named
+
+    opened = Store(store)
+    query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
+    ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
+    show_store.found(find_samples(opened, ids, query, limit=limit), store, as_json)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
+@click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
+@click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
+@click.option("--least", type=click.IntRange(1), default=1, show_default=True,
+              help="Leave out views with fewer complete passes: only what was topped up is merged.")  # fmt: skip
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="A folder.")
+@json_option
+def merge(
+    store: str | Path,
+    scene: str | None,
+    modification: str | None,
+    view: str | None,
+    row: int | None,
+    least: int,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Merge all complete passes of views into reference images: FOLDER/<view key>.npz.
+
+    Each is a NumPy archive of `mean`, `m2`, `half_a`, `half_b` and `standard_error`, (H, W, 3) float64 linear radiance,
+    and the number of `passes`, of two independent halves each. Exact, and the same in any order; merge again when more
+    passes have arrived. Without conditions all views are merged.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import Query, scene_named
+    from photonfarm.shared.store.read.merge import merge_views
+
+    opened = Store(store)
+    query = Query.of(modification=modification, view=view, row=row)
+    ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
+    merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
+    show_store.merged(merged, out, least, as_json)
+
+
+@click.command()
+@store_option
+@scene_option
+@click.option("--light-samples", type=click.IntRange(0, 64), default=None, metavar="N",
+              help="Shadow rays of each of a pixel's 16 sub-pixels, 0: none, for scenes that have no guides yet.  "
+              "[default: 3]")  # fmt: skip
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only ask for guides; idle workers find them by themselves.")
+@click.option("--dry-run", is_flag=True, help="Say what would be rendered and stored; write and queue nothing.")
+@json_option
+def upgrade(
+    store: str | Path,
+    scene: str | None,
+    light_samples: int | None,
+    redis_url: str,
+    no_queue: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Add guides to scenes that an older photonfarm has rendered; no sample is rendered again.
+
+    Guides are what is known of each view before anything is learned: noise-free buffers, and direct light. Networks may
+    be given them. Workers render them, job by job, and readers see them arrive; all else in the store stays as it is.
+    A scene that has guides, or has been asked for some, keeps its settings. It may be stopped and repeated at any time.
+
+    Exit codes: 0 asked for, also before; 4 the store or one of its scenes cannot be read, and the others are done; 5
+    Redis does not answer, and workers find by themselves what is to be rendered.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.farm.upgrade import upgrade as upgraded
+
+    url = None if no_queue else redis_url
+    result = upgraded(store, url, scene=scene, light_samples=light_samples, dry_run=dry_run)
+    show_store.upgrade(result, store, as_json)

@@ -1,0 +1,45 @@
+"""NumPy archives by which one service hands arrays to another: a file is there whole or not at all."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import StoreError, store_errors
+
+_DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
+"""What reading raises of files that are no such archive."""
+
+
+def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> None:
+    """Store arrays by name; `what` they are, messages say. Raises StoreError where the disk refuses."""
+    part = file.with_suffix(".partial.npz")
+    with store_errors(f"write the {what}", file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(part, allow_pickle=False, **arrays)
+        part.replace(file)
+
+
+@contextmanager
+def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+    """The arrays of a file by name, each read when it is asked for.
+
+    Raises StoreError where there is no such file, it cannot be read, or it is damaged, and where what is made of the
+    arrays inside the `with` raises KeyError, IndexError, TypeError or ValueError; the message names `what` it should
+    hold, and the `verb` that writes it.
+    """
+    try:
+        with file.open("rb") as archive, np.load(archive, allow_pickle=False) as stored:  # it leaves damaged ones open
+            yield stored
+    except FileNotFoundError as error:
+        raise StoreError(f"{file}: there is no such file") from error
+    except OSError as error:
+        raise StoreError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGED as error:
+        raise StoreError(f"{file}: holds no {what} that `photonfarm {verb}` wrote") from error

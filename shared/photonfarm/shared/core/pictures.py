@@ -1,0 +1,59 @@
+"""Arrays as pictures that a person can look at. For display only: nothing here is on the way to the store.
+
+Shape letters: H W image.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.records import F32
+
+Picture = NDArray[np.uint8]  # (H, W, 3)
+
+GAMMA = 2.2
+
+
+def display_values(exposed: F32) -> F32:
+    """clip(I, 0, 1)^(1/2.2) of exposed linear radiance, in any shape: what a display is given, in [0, 1]."""
+    shown: F32 = np.clip(exposed, 0, 1) ** np.float32(1 / GAMMA)
+    return shown
+
+
+def display(radiance: F32, exposure: float) -> Picture:
+    """Linear radiance (H, W, 3) as clip(exposure · I, 0, 1)^(1/2.2)."""
+    return _bytes(display_values(exposure * np.nan_to_num(radiance)))
+
+
+def of_albedo(albedo: F32) -> Picture:
+    """Reflectance (H, W, 3) in [0, 1], gamma 2.2."""
+    return _bytes(display_values(albedo))
+
+
+def of_normal(normal: F32) -> Picture:
+    """World normals (H, W, 3) as colours: −1…1 becomes 0…255."""
+    return _bytes(0.5 + 0.5 * np.clip(normal, -1, 1))
+
+
+def of_depth(depth: F32) -> Picture:
+    """Depth (H, W) in greys, near bright; 0 (nothing hit) is black."""
+    hit = depth > 0
+    far = np.percentile(depth[hit], 99) if hit.any() else 1.0
+    return _bytes(np.repeat((hit * (1 - 0.9 * np.clip(depth / far, 0, 1)))[..., None], 3, axis=2))
+
+
+def png_uri(picture: Picture, scale: int = 1) -> str:
+    """The picture as a `data:` address of a PNG, each pixel drawn `scale` × `scale`."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(picture.repeat(scale, axis=0).repeat(scale, axis=1)).save(stream, "PNG")
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+
+
+def _bytes(unit: NDArray[np.floating]) -> Picture:
+    return np.round(255 * unit).astype(np.uint8)

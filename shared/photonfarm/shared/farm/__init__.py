@@ -1,0 +1,1 @@
+"""The farm: submitting work, running all of its processes, and predicting its cost."""

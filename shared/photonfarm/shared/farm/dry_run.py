@@ -1,0 +1,128 @@
+"""What a request would plan, store and cost, and what would be learned more from at that cost; nothing is written."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from photonfarm.shared.core.commands import command, is_installed
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.processes import usable_cores
+from photonfarm.shared.farm.submission import Submission, request_of
+from photonfarm.shared.plan.allocation import Allocation, Terms
+from photonfarm.shared.plan.request import Extent, Request
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.format.schema import bytes_of_rows
+from photonfarm.shared.store.io.storage import is_vacant
+
+VERB = ("scene", "cost")  # of the renderer
+
+WORTH_A_CHANGE = 0.05
+"""Share of the excess error that a suggestion must save: costs and noise are medians of a few views."""
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """Settings of a spec and a request that should teach more than those asked for, at their cost."""
+
+    half_spp: int
+    modifications: int | None  # None of a static scene, as its views are all that there is to choose
+    views: int | None  # of each configuration; None of a static scene
+    samples: int  # of one pass each
+
+
+@dataclass(frozen=True, slots=True)
+class DryRun(Submission):
+    """What would become of a request. What follows from a measurement is None where there is none."""
+
+    extent: Extent = field(kw_only=True)
+    size_bytes: int = field(kw_only=True)  # before compression
+    cores: int = field(kw_only=True)  # of this machine, as far as this process may use them
+    costs: SampleCosts | None = field(default=None, kw_only=True)
+    core_s: float | None = field(default=None, kw_only=True)  # of rendering what would be planned
+    wall_s: float | None = field(default=None, kw_only=True)  # with a worker on each of the cores
+    reduction: float | None = field(default=None, kw_only=True)  # of the excess error by the best of the same cost
+    suggestion: Suggestion | None = field(default=None, kw_only=True)  # that one, if it is worth a change
+
+
+def rehearse(
+    spec: str,
+    store: str | Path,
+    *,
+    measure: bool,
+    tell: Callable[[str], None],
+    shard_rows: int | None = None,
+    **request: int,
+) -> DryRun:
+    """What `submission.submit` would plan; with `measure`, also what it costs, and whether that is well spent.
+
+    `tell` is told why nothing is known of the cost. Raises SpecError and StoreError as `submit` does.
+    """
+    loaded, wanted = load_spec(spec), request_of(**request)
+    found = _counted(loaded, wanted, store, shard_rows)
+    costs = measured_costs(spec) if measure and found.planned else None
+    if isinstance(costs, str):
+        tell(f"cost and time are not known: {costs}")
+    return with_costs(found, loaded, wanted, costs) if isinstance(costs, SampleCosts) else found
+
+
+def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
+    """What would be planned, and its size."""
+    if is_vacant(store):
+        new, known, extent = wanted.samples, 0, wanted.extent(loaded)
+    else:
+        planned = Store(store).plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
+        new, known, extent = planned.new, planned.known, planned.extent
+    of = bytes_of_rows(loaded)
+    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
+    return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
+
+
+def measured_costs(spec: str) -> SampleCosts | str:
+    """What the renderer measures of a spec, or has measured before; or why it does not: what it said is on stderr."""
+    name = " ".join(VERB)
+    if not is_installed(".".join(VERB)):
+        return "the renderer, which measures them, is not installed here"
+    done = subprocess.run(command(*VERB, "--json", "--", spec), stdout=subprocess.PIPE, check=False)
+    if done.returncode:
+        return f"`photonfarm {name}` ended with exit code {done.returncode} here"
+    try:
+        return SampleCosts.read(done.stdout)
+    except StoreError as error:
+        return f"`photonfarm {name}` said {error}"
+
+
+def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
+    """What would be planned, with its cost, and the suggestion.
+
+    There is none where samples of the request are planned already: another half_spp would be another scene, and
+    render all of them again.
+    """
+    of, spp = found.extent, 2 * spec.transport.half_spp
+    core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
+    timed = replace(found, costs=costs, core_s=core_s, wall_s=core_s / found.cores)
+    if found.planned_before:
+        return timed
+    reduction, better = _best(spec, wanted, costs)
+    worth = reduction >= WORTH_A_CHANGE
+    return replace(timed, reduction=reduction, suggestion=_suggested(better, spec) if worth else None)
+
+
+def _best(spec: SceneSpec, wanted: Request, costs: SampleCosts) -> tuple[float, Allocation]:
+    """The share of the excess error that the best allocation of the request's cost saves, at least 0, and that one."""
+    terms = Terms.of(costs, static=not spec.groups)
+    spp = 2 * spec.transport.half_spp
+    asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
+    if not spec.groups:
+        asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
+    found = terms.best(terms.seconds(asked))
+    return max(0.0, 1 - terms.excess(found) / terms.excess(asked)), found
+
+
+def _suggested(of: Allocation, spec: SceneSpec) -> Suggestion:
+    modifications, views = (of.modifications, of.views) if spec.groups else (None, None)
+    return Suggestion(of.spp // 2, modifications, views, of.samples)

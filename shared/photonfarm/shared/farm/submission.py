@@ -1,0 +1,133 @@
+"""From a spec's name and a few numbers to planned and queued samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import QueueError, SpecError
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.scene.spec import SceneSpec, find_scene, find_spec, load_spec
+from photonfarm.shared.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """What became of a request."""
+
+    scene_id: str
+    plan: int | None  # number of the new plan; None if nothing was new or nothing was written
+    planned: int  # samples planned by this request
+    planned_before: int  # samples of the request that older plans hold
+    queued: int | None  # jobs queued, also those of older plans that were missing; None: not queued
+    dry_run: bool = False  # nothing was written
+    scenes: str | None = None  # folder that workers must have in PHOTONFARM_SCENES to find the scene file, if any must
+
+
+@dataclass(frozen=True, slots=True)
+class TopUpSubmission(Submission):
+    """What became of a top-up."""
+
+    spp_per_pass: int = field(kw_only=True)  # samples per pixel of one pass, both halves together
+    passes: int = field(kw_only=True)  # how many passes the samples per pixel are that were asked for, rounded up
+
+
+def submit(
+    spec: str,
+    store: str | Path,
+    redis_url: str | None,
+    *,
+    retry: bool = False,
+    shard_rows: int | None = None,
+    **request: int,
+) -> Submission:
+    """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
+
+    Jobs that have failed are tried again; those that were set aside as well with `retry`.
+    Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
+    """
+    loaded, wanted = load_spec(spec), request_of(**request)
+    opened = Store(store, create=True)
+    opened.add(loaded).guides.want(loaded.guides)
+    planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
+    queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
+    scenes = _folder_for_workers(loaded, spec)
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=scenes)
+
+
+def top_up(
+    spec: str,
+    store: str | Path,
+    redis_url: str | None,
+    spp: str,
+    *,
+    where: Sequence[str] = (),
+    retry: bool = False,
+    dry_run: bool = False,
+) -> TopUpSubmission:
+    """Plan more passes of what is planned, and queue all that is missing of the store unless `redis_url` is None.
+
+    `spp` and `where` are as `TopUp.of` takes them. Raises what `submit` does.
+    """
+    loaded, wanted = load_spec(spec), TopUp.of(spp, where)
+    opened = Store(store)
+    if loaded.scene_id not in opened.scene_ids():
+        raise SpecError(
+            f"{spec}: {store} has no samples of scene {loaded.scene_id} that could be topped up; `photonfarm submit` "
+            "plans the first ones"
+        )
+    planned = opened.scene(loaded.scene_id).plan(wanted, dry_run=dry_run)
+    queued = None if redis_url is None or dry_run else queue_missing(opened, redis_url, retry=retry)
+    return TopUpSubmission(
+        planned.scene_id,
+        planned.plan,
+        planned.new,
+        planned.known,
+        queued,
+        dry_run,
+        spp_per_pass=spp_per_pass(loaded),
+        passes=wanted.passes(loaded),
+    )
+
+
+def queue_missing(
+    store: Store,
+    redis_url: str,
+    *,
+    scene_id: str | None = None,
+    retry: bool = False,
+    stored: str = "The plan is stored",
+    verb: str = "submits",
+) -> int:
+    """Queue all that is missing of a store, or of one scene; how many jobs that were.
+
+    Jobs that have failed are tried again; those that were set aside as well with `retry`. Raises QueueError, which says
+    what is `stored` nevertheless, and what --no-queue {verb} without Redis.
+    """
+    try:
+        connection = queue.connect(redis_url)
+        return queue.reconcile(store, connection, scene_id=scene_id, retry_failed=True, retry_set_aside=retry)
+    except queue.OtherStoreError as error:
+        raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
+    except QueueError as error:
+        raise QueueError(
+            f"{str(error).rstrip('.')}. {stored}, and idle workers will find it; --no-queue {verb} without Redis"
+        ) from error
+
+
+def _folder_for_workers(loaded: SceneSpec, spec: str) -> str | None:
+    """The spec's folder, if its scene file is found there alone: workers have the store, and not the spec's file."""
+    if loaded.scene.file is not None:
+        try:
+            find_scene(loaded.scene.file, spec)
+        except SpecError:
+            return str(find_spec(spec).absolute().parent)
+    return None
+
+
+def request_of(*, modifications: int, views: int, passes: int, seed: int) -> Request:
+    """A request by the names of the options; raises SpecError."""
+    return Request.of(modifications=modifications, views_per_modification=views, passes=passes, seed=seed)

@@ -1,0 +1,255 @@
+"""The whole farm on one machine: an embedded Redis, render workers and the trainer, as processes of one terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any, cast
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from photonfarm.shared.core.commands import command
+from photonfarm.shared.core.errors import IncompleteError, store_errors
+from photonfarm.shared.core.estimate import stated
+from photonfarm.shared.core.processes import tied
+from photonfarm.shared.farm.hold_out_check import check_hold_out
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.submission import request_of, submit, top_up
+from photonfarm.shared.plan.top_up import spp_per_pass
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, find_spec, load_spec
+from photonfarm.shared.store import SceneStore, Store
+
+POLL_S = 0.5
+PLAIN_LINE_S = 15.0  # between lines where there is no terminal to draw bars on
+STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives us 10 s
+AT_ONCE_S = 1.0  # for them to end when asked again, which is in the middle of a job
+
+Process = subprocess.Popen[bytes]
+Count = tuple[int, int]
+"""How many are committed, and how many planned."""
+
+
+def run_farm(
+    spec: str,
+    store: str | Path,
+    *,
+    workers: int,
+    run: Path,
+    train_steps: int,
+    hold_out: float,
+    out: Path,
+    reference_views: int = 0,
+    reference_spp: int = 256,
+    shard_rows: int | None = None,
+    **request: int,
+) -> None:
+    """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
+
+    So many of the first views that are held out get `reference_spp` samples per pixel, and the report shows and
+    measures networks against them.
+
+    What the trainer would refuse is refused before anything is written: SpecError for a hold-out that leaves one side
+    empty, click's UsageError for settings. Started again after any interruption it goes on where it was, as the store
+    and the trainer's checkpoints last.
+    """
+    training = ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
+    if train_steps:
+        _check_arguments(training)
+        check_hold_out(load_spec(spec), store, hold_out, request_of(**request))
+    console = Console(stderr=True, highlight=False)
+    with store_errors("keep the logs of a run here", run):
+        run.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        stack.enter_context(_unwound_by_sigterm())
+        redis = stack.enter_context(EmbeddedRedis(run / "redis"))
+        planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
+        console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        if references := train_steps > 0 and reference_views > 0:
+            where = (f"held-out={hold_out}", f"views=first:{reference_views}")
+            added = top_up(spec, store, redis.url, str(reference_spp), where=where, retry=True)
+            console.print(f"{added.planned} passes more for references, {added.planned_before} planned before")
+        scene = Store(store).scene(planned.scene_id)
+        rows = scene.plans()[0].shard_rows
+        console.print(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
+        environment = _environment(spec, store, redis.url)
+        work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
+        verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
+        if train_steps:
+            verbs["trainer"] = training
+        running = stack.enter_context(_processes(verbs, environment, run, console))
+        preview = ["preview", spec, "--out", str(out / "preview.html")]
+        try:
+            _watch(running, _Farm(scene, run, train_steps), redis, console)
+            if train_steps:
+                beside: list[str] = []
+                if references:
+                    passes = -(-reference_spp // spp_per_pass(scene.spec))
+                    folder = str(out / "references")
+                    merge = ["--scene", planned.scene_id, "--least", str(passes), "--out", folder]
+                    _call(["store", "merge", *merge], environment)
+                    beside = ["--references", folder]
+                _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
+        except IncompleteError:
+            _call(preview, environment)  # what has been rendered can still be looked at
+            raise
+        _call(preview, environment)
+
+
+def _check_arguments(arguments: list[str]) -> None:
+    """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
+    root = click.get_current_context().find_root()
+    verb = cast(click.Group, root.command).get_command(root, arguments[0])
+    if verb is None:
+        raise click.UsageError(
+            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
+        )
+    verb.make_context(arguments[0], arguments[1:], parent=root).close()
+
+
+@contextmanager
+def _unwound_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end us as Ctrl-C does, so that what we started is stopped."""
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]:
+    """What our processes are told; also the folder of the spec, where its scene file may lie."""
+    scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
+    told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
+    return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
+
+
+def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
+    code = subprocess.run(command(*arguments), env=environment, check=False).returncode
+    if code:
+        raise IncompleteError(f"photonfarm {arguments[0]} ended with exit code {code}; what it said stands above")
+
+
+@contextmanager
+def _processes(
+    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, console: Console
+) -> Iterator[dict[str, Process]]:
+    """Each verb as a process of its own; on the way out all are asked to stop at once, and waited for together."""
+    running: dict[str, Process] = {}
+    try:
+        for name, verb in verbs.items():
+            running[name] = _start(verb, environment, logs / f"{name}.log")
+        yield running
+    finally:
+        alive = [process for process in running.values() if process.poll() is None]
+        if alive:
+            console.print("stopping; a job in hand that is not nearly done will be rendered again")
+            _stop(alive)
+
+
+def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
+    with log.open("ab") as output:
+        return subprocess.Popen(
+            tied(command(*arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
+        )  # fmt: skip
+
+
+def _stop(processes: list[Process]) -> None:
+    """End them gracefully, or less so after STOP_S or at a second Ctrl-C or SIGTERM; none is left."""
+    try:
+        _ask(processes, STOP_S)
+    finally:
+        _ask(processes, AT_ONCE_S)
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def _ask(processes: list[Process], seconds: float) -> None:
+    """Send SIGTERM to all that are alive, and wait until they have ended or the time is over."""
+    for process in processes:
+        process.terminate()
+    end = time.monotonic() + seconds
+    with suppress(subprocess.TimeoutExpired):
+        for process in processes:
+            process.wait(max(end - time.monotonic(), 0.0))
+
+
+class _Farm:
+    """Where rendering and training are, as their files say."""
+
+    def __init__(self, scene: SceneStore, run: Path, steps: int) -> None:
+        self.scene = scene
+        self.run = run
+        self.steps = steps
+        self.step = 0
+        self.note = ""
+
+    def look(self) -> tuple[Count, Count]:
+        """Samples by now, and further passes of their views; `step` and `note` follow the trainer's log."""
+        for record in self._records():
+            self.step = record.get("step", self.step)
+            if record.get("kind") == "validation":
+                self.note = f", held-out error {stated(record['error'], record['standard_error'])}"
+        found = self.scene.progress()
+        passes = found.committed_passes, found.planned_passes
+        return (found.committed_samples - passes[0], found.planned_samples - passes[1]), passes
+
+    def _records(self) -> list[dict[str, Any]]:
+        """The trainer's log as it is now; read whole, since a trainer that resumes takes back what it will redo."""
+        path = self.run / "metrics.jsonl"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, console: Console) -> None:
+    """Show progress until every process has ended; raises IncompleteError as soon as one has failed."""
+    last_line = started = time.monotonic()
+    with _bars(console) as bars:
+        samples = bars.add_task("samples", total=None)
+        passes = bars.add_task("further passes", total=None, visible=False)
+        steps = bars.add_task("training steps", total=farm.steps, visible=farm.steps > 0)
+        while True:
+            redis.keep_running()
+            alive = any(process.poll() is None for process in running.values())
+            counts = farm.look()
+            for bar, (committed, planned) in zip((samples, passes), counts, strict=True):
+                bars.update(bar, completed=committed, total=planned, visible=bar == samples or planned > 0)
+            bars.update(steps, completed=farm.step, description=f"training steps{farm.note}")
+            now = time.monotonic()
+            if not console.is_terminal and (now - last_line > PLAIN_LINE_S or not alive):
+                last_line = now
+                console.print(f"{now - started:4.0f} s  {_line(farm, *counts)}")
+            for name, process in running.items():
+                if process.poll():
+                    log = farm.run / f"{name}.log"
+                    raise IncompleteError(f"{name} ended with exit code {process.returncode}; {log} says: {_tail(log)}")
+            if not alive:
+                return
+            time.sleep(POLL_S)
+
+
+def _line(farm: _Farm, samples: Count, passes: Count) -> str:
+    """How far it is, in words."""
+    further = f"  further passes {passes[0]}/{passes[1]}" if passes[1] else ""
+    return f"samples {samples[0]}/{samples[1]}{further}  steps {farm.step}/{farm.steps}{farm.note}"
+
+
+def _tail(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "nothing"
+
+
+def _bars(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, disable=not console.is_terminal)

@@ -1,0 +1,100 @@
+"""`photonfarm store upgrade`: scenes of older stores get guides, and no sample is rendered again.
+
+All that is written here is one small file for each scene, which asks for guides; workers render them, as jobs that are
+missing. So an upgrade may be broken off anywhere, and asked for again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.farm.submission import queue_missing
+from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.format.schema import most_guide_bytes
+from photonfarm.shared.store.read.find import scene_named
+from photonfarm.shared.store.write.guides import jobs_with_views
+from photonfarm.shared.store.write.status import scene_status
+
+
+@dataclass(frozen=True, slots=True)
+class SceneUpgrade:
+    """How far the guides of one scene are."""
+
+    scene_id: str
+    name: str
+    asked: bool  # they were asked for now, or would be; False: before
+    light_samples: int  # that they are rendered with
+    views: int  # planned
+    views_lacking: int  # of these, those without guides
+    jobs_lacking: int  # to render for them
+    bytes_per_sample: float | None  # of what is stored, without guides; None while no sample is complete
+    guide_bytes_per_sample: float  # that guides of all views add, at most
+
+
+@dataclass(frozen=True, slots=True)
+class Upgrade:
+    """What became of an upgrade."""
+
+    scenes: tuple[SceneUpgrade, ...]
+    queued: int | None  # jobs queued, with those that were missing before; None: not queued
+    dry_run: bool  # nothing was written
+    failed: dict[str, str]  # why scenes cannot be upgraded, by scene id
+
+
+def upgrade(
+    store: str | Path,
+    redis_url: str | None,
+    *,
+    scene: str | None = None,
+    light_samples: int | None = None,
+    dry_run: bool = False,
+) -> Upgrade:
+    """Ask for guides of every scene of a store, or of one, and queue what is missing unless `redis_url` is None.
+
+    A scene that has guides keeps the settings that it has. Damage of one scene concerns no other. Raises SpecError for
+    a number of light samples that cannot be, StoreError for a store or the one scene that cannot be read, and
+    QueueError; guides are asked for then, and idle workers queue them later.
+    """
+    wanted, opened = _wanted(light_samples), Store(store)
+    scene_id = None if scene is None else scene_named(opened, scene)
+    if scene_id is not None:
+        done, failed = {scene_id: _scene_upgrade(opened.scene(scene_id), wanted, dry_run=dry_run)}, {}
+    else:
+        done, errors = opened.each(lambda each: _scene_upgrade(each, wanted, dry_run=dry_run))
+        failed = {each: str(error) for each, error in errors.items()}
+    queued = None
+    if redis_url is not None and not dry_run:
+        stored = "The wish for guides is stored"
+        queued = queue_missing(opened, redis_url, scene_id=scene_id, stored=stored, verb="upgrades")
+    return Upgrade(tuple(done.values()), queued, dry_run, failed)
+
+
+def _wanted(light_samples: int | None) -> GuideSpec:
+    try:
+        return GuideSpec() if light_samples is None else GuideSpec(light_samples=light_samples)
+    except ValueError as error:
+        raise SpecError(f"light_samples = {light_samples}: 0 to 64 are allowed") from error
+
+
+def _scene_upgrade(scene: SceneStore, wanted: GuideSpec, *, dry_run: bool) -> SceneUpgrade:
+    """Ask for guides unless the scene has been asked; how far they are."""
+    asked = scene.guides.settings() is None if dry_run else scene.guides.ask(wanted)
+    settings = scene.guides.settings() or wanted
+    status, found = scene_status(scene), scene.plans()
+    jobs = sum(len(jobs_with_views(plan)) for plan in found)
+    most = most_guide_bytes(scene.spec, status.views_planned, jobs, found[0].shard_rows) if found else 0
+    samples = status.size_bytes - status.guide_bytes
+    return SceneUpgrade(
+        scene.scene_id,
+        scene.spec.name,
+        asked,
+        settings.light_samples,
+        status.views_planned,
+        status.views_planned - (status.views_guided or 0),
+        len(scene.guides.without(found)),
+        samples / status.samples_complete if status.samples_complete else None,
+        most / max(status.samples_planned, 1),
+    )

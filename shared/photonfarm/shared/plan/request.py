@@ -1,0 +1,284 @@
+"""A request for samples, expanded into rows and jobs, without what is planned already.
+
+Shape letters: R rows of a plan, G movable groups. J is `shard_rows`, the samples of one job.
+
+A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
+passes of each view. Configurations that come out equal (both objects removed, say) are one modification with
+as many views more, so that no view is drawn twice and the share of each configuration among the samples stays that
+of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
+different views of it. Views that come out equal, since the spec fixes the camera, are one view: no sample is planned
+twice.
+
+The views of a configuration are numbered from 0; growing any number of a request therefore names a superset of the
+old samples, and only the new ones are planned. New views and passes refer to the rows that are there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import KEY_BYTES, Key, make_key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.sampling import contents, modification_keys, modification_vectors, sample_keys, view_vectors
+from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
+
+SHARD_ROWS = 32
+"""Samples per job, where neither the caller nor an older plan of the scene says otherwise."""
+
+MAX_SHARD_ROWS = 4096
+MAX_SAMPLES = 10_000_000
+"""Samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
+
+UNUSED = -1
+"""A row reference of a row that holds nothing."""
+
+Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """What is rendered for new samples, beside themselves."""
+
+    configurations: int = 0  # that they show, new or not
+    modifications: int = 0  # of them, the new ones: their photons are stored
+    views: int = 0  # new ones: their buffers are stored
+
+
+class Request(Frozen):
+    """What to plan: modifications × views × passes, under one master seed."""
+
+    kind: Literal["samples"] = "samples"  # tells it from other requests in the store
+    modifications: Count = 1
+    views_per_modification: Count = 1
+    passes: Annotated[int, Field(ge=1, le=65536)] = 1
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+
+    @model_validator(mode="after")
+    def _is_not_too_large(self) -> Self:
+        if self.samples > MAX_SAMPLES:
+            raise ValueError(f"names {self.samples} samples; at most {MAX_SAMPLES} fit one request")
+        return self
+
+    @property
+    def samples(self) -> int:
+        """How many samples it names, planned already or not."""
+        return self.modifications * self.views_per_modification * self.passes
+
+    def extent(self, spec: SceneSpec) -> Extent:
+        """What is rendered for it where nothing is planned, if no two of its configurations are equal."""
+        configurations = self.modifications if spec.groups else 1
+        return Extent(configurations, configurations, self.modifications * self.views_per_modification)
+
+    @classmethod
+    def of(cls, **values: Any) -> Request:
+        """The checked request; raises SpecError with a sentence for each broken rule."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            raise SpecError(f"the request: {'; '.join(sentences(error))}") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedRows:
+    """The inputs of a plan, R rows each; row numbers run through all plans of a scene."""
+
+    modification: F32  # (R, G, 4) modification vectors; NaN where no modification has its row
+    view: F32  # (R, 6) origin and look-at point; NaN where no view has its row
+    sample_modification: NDArray[np.int64]  # (R,) row of the sample's modification, or UNUSED
+    sample_view: NDArray[np.int64]  # (R,) row of the sample's view, or UNUSED
+    sample_pass: NDArray[np.int32]  # (R,) pass number, or UNUSED
+    sample_key: NDArray[np.uint8]  # (R, 16)
+
+    @classmethod
+    def empty(cls, rows: int, groups: int) -> PlannedRows:
+        """Rows that hold nothing yet."""
+        return cls(
+            np.full((rows, groups, 4), np.nan, np.float32),
+            np.full((rows, 6), np.nan, np.float32),
+            np.full(rows, UNUSED, np.int64),
+            np.full(rows, UNUSED, np.int64),
+            np.full(rows, UNUSED, np.int32),
+            np.zeros((rows, KEY_BYTES), np.uint8),
+        )
+
+
+class Known:
+    """What the older plans of a scene hold, for lookup by content; each table is made when it is first asked for."""
+
+    def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
+        """Take the plans in their order, each with the number of its first row."""
+        self.plans = list(plans)
+
+    @cached_property
+    def modifications(self) -> dict[bytes, int]:
+        """The row of each modification, by the bytes of its vector."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, _ = _own(rows.sample_modification, first_row)
+            _add(found, contents(rows.modification[row - first_row]), row)
+        return found
+
+    @cached_property
+    def views(self) -> dict[bytes, int]:
+        """The row of each view, by its `view_contents`."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, sample = _own(rows.sample_view, first_row)
+            _add(found, view_contents(rows.sample_modification[sample], rows.view[row - first_row]), row)
+        return found
+
+    @cached_property
+    def samples(self) -> set[Key]:
+        """The keys of all samples."""
+        found: set[Key] = set()
+        for _, rows in self.plans:
+            data = rows.sample_key[rows.sample_modification != UNUSED].tobytes()
+            found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
+        return found
+
+
+def _add(found: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
+    for key, row in zip(keys, rows.tolist(), strict=True):
+        found.setdefault(key, row)
+
+
+def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct rows of a plan that its own samples refer to, and the first sample that does."""
+    rows, first = np.unique(references, return_index=True)
+    own = (rows >= first_row) & (rows < first_row + len(references))
+    return rows[own], first[own]
+
+
+def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[bytes]:
+    """What views (N, 6) of the modifications in some rows (N,) are looked up by."""
+    rows = modification_rows.astype("<i8").tobytes()
+    return [rows[8 * i : 8 * i + 8] + view for i, view in enumerate(contents(views))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
+
+    modification: F32  # (M, G, 4)
+    modification_row: NDArray[np.int64]  # (M,) the row of one that is planned already, or UNUSED
+    view: F32  # (V, 6)
+    view_row: NDArray[np.int64]  # (V,) the row of one that is planned already, or UNUSED
+    sample_modification: NDArray[np.int64]  # (S,) which of the modifications
+    sample_view: NDArray[np.int64]  # (S,) which of the views
+    sample_pass: NDArray[np.int32]  # (S,)
+    sample_key: NDArray[np.uint8]  # (S, 16)
+
+    def extent(self) -> Extent:
+        """What is rendered for them."""
+        modifications, views = np.unique(self.sample_modification), np.unique(self.sample_view)
+        new_modifications = np.count_nonzero(self.modification_row[modifications] == UNUSED)
+        new_views = np.count_nonzero(self.view_row[views] == UNUSED)
+        return Extent(len(modifications), int(new_modifications), int(new_views))
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """A request as rows: `rows` is None where nothing of it is new."""
+
+    rows: PlannedRows | None
+    new: int  # samples
+    known: int  # samples named by the request and planned already
+    extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
+
+
+def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+    """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
+
+    Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
+    the job of its first sample; so does everything that a job must render lie in the job's own rows.
+    """
+    candidates, named = _candidates(spec, request, known)
+    rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    new = len(candidates.sample_pass)
+    return Expansion(rows, new, named - new, candidates.extent())
+
+
+def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:
+    """The new samples of a request, and how many it names, known or new."""
+    modifications, counts = _configurations(spec, request)
+    of_view = np.repeat(np.arange(len(counts)), counts)
+    index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
+    of_modification = modification_keys(spec, modifications)
+    views = view_vectors(spec, [of_modification[m] for m in of_view.tolist()], request.seed, index)
+    modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
+    view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
+
+    view = np.repeat(np.arange(len(views)), request.passes)
+    pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
+    keys = sample_keys(spec.scene_id, modifications[of_view[view]], views[view], pass_)
+    distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
+    new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
+    found = Candidates(
+        modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
+        np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
+    )  # fmt: skip
+    return found, len(distinct)
+
+
+def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int) -> Key:
+    """The content key of one sample; `view` is the view's vector (6,)."""
+    return make_key("sample", scene_id, modification.vector, view, pass_)
+
+
+def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.int64]]:
+    """The distinct configurations of a request in order of appearance (M, G, 4), each with its number of views (M,).
+
+    The n-th appearance of a configuration stands for views n·V … n·V + V − 1 of it.
+    """
+    each = request.views_per_modification
+    if not spec.groups:
+        return rest(spec).vector[None], np.array([request.modifications * each])
+    vectors = modification_vectors(spec, request.seed, request.modifications)
+    counts = Counter(contents(vectors))
+    distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, len(spec.groups), 4)
+    return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
+
+
+def pack(candidates: Candidates, *, first_row: int, shard_rows: int) -> PlannedRows | None:
+    """Samples as rows from `first_row` on, in their order; None if there are none."""
+    count = len(candidates.sample_pass)
+    if not count:
+        return None
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
+    modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
+    rows.modification[modification_row[new] - first_row] = candidates.modification[new]
+    view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
+    rows.view[view_row[new] - first_row] = candidates.view[new]
+    rows.sample_modification[:count] = modification_row[candidates.sample_modification]
+    rows.sample_view[:count] = view_row[candidates.sample_view]
+    rows.sample_pass[:count] = candidates.sample_pass
+    rows.sample_key[:count] = candidates.sample_key
+    return rows
+
+
+def _place(
+    references: NDArray[np.int64], known_row: NDArray[np.int64], first_row: int, shard_rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The row of each thing that samples refer to, and which of the things are new.
+
+    A new one takes the next free row in the job of the first sample that refers to it.
+    """
+    thing, sample = np.unique(references, return_index=True)
+    order = np.argsort(sample)
+    thing, sample = thing[order], sample[order]
+    new = known_row[thing] == UNUSED
+    thing, job = thing[new], sample[new] // shard_rows
+    before = np.searchsorted(job, job)  # new things of earlier jobs: `job` ascends
+    rows = known_row.copy()
+    rows[thing] = first_row + job * shard_rows + np.arange(len(thing)) - before
+    return rows, thing

@@ -1,0 +1,1 @@
+"""The scene: its spec, its configurations, its views and its point cloud."""

@@ -1,0 +1,97 @@
+"""Camera paths: a smooth curve through views that a user gives, or a walk around the scene.
+
+Shape letters: K key views, F frames.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.scene.view import View
+
+MOST_FRAMES = 10_000
+ORBIT = 0.9
+"""Size of the ellipse of an orbit over that of the box of origins."""
+
+Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class KeyView(_Frozen):
+    """A view that the path passes through."""
+
+    origin: Point
+    look_at: Point
+
+
+class CameraPath(_Frozen):
+    """What a file says: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}."""
+
+    frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
+    views: Annotated[tuple[KeyView, ...], Field(min_length=1)]
+    closed: bool = False  # from the last view back to the first; a film of it repeats without a jump
+
+    @classmethod
+    def load(cls, file: Path) -> CameraPath:
+        """The path in a JSON file; raises SpecError for what is none."""
+        try:
+            return cls.model_validate(json.loads(file.read_text()))
+        except ValidationError as error:
+            raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
+        except OSError as error:
+            raise SpecError(f"{file}: cannot be read: {error.strerror}") from error
+        except ValueError as error:
+            raise SpecError(f"{file}: is not a camera path in JSON: {error}") from error
+
+    def sampled(self) -> list[View]:
+        """The views of all frames, at equal steps of the curve's parameter, which is 1 between two key views.
+
+        Origin and look-at point each follow a Catmull–Rom spline [Catmull and Rom, 1974], which goes through all of
+        them; the ends of an open path are repeated. Raises SpecError where a camera would look at itself.
+        """
+        keys = np.array([[*view.origin, *view.look_at] for view in self.views])
+        spans = len(keys) if self.closed else len(keys) - 1
+        at = np.linspace(0, spans, self.frames, endpoint=not self.closed)
+        found = [View.from_vector(vector) for vector in _spline(keys, at, closed=self.closed).astype(np.float32)]
+        for i, view in enumerate(found):
+            if np.array_equal(view.origin, view.target):
+                raise SpecError(f"camera path: in frame {i} the camera stands where it looks at; move a view")
+        return found
+
+
+def orbit(spec: SceneSpec, frames: int) -> list[View]:
+    """Once around: on an ellipse in the middle of the spec's box of origins, looking at the middle of the other box.
+
+    It lies across the axis nearest to up. What stands in the way is walked through.
+    """
+    low, high = np.array(spec.view.origin.low), np.array(spec.view.origin.high)
+    target = 0.5 * (np.array(spec.view.look_at.low) + np.array(spec.view.look_at.high))
+    up = int(np.abs(spec.view.up).argmax())
+    first, second = (axis for axis in range(3) if axis != up)
+    angle = 2 * np.pi * np.arange(frames) / frames
+    origins = np.repeat(0.5 * (low + high)[None], frames, axis=0)
+    origins[:, first] += ORBIT * 0.5 * (high - low)[first] * np.cos(angle)
+    origins[:, second] += ORBIT * 0.5 * (high - low)[second] * np.sin(angle)
+    return [View(origin.astype(np.float32), target.astype(np.float32)) for origin in origins]
+
+
+def _spline(keys: NDArray[np.float64], at: NDArray[np.float64], *, closed: bool) -> NDArray[np.float64]:
+    """The uniform Catmull–Rom spline through keys (K, 6) at parameters (F,) → (F, 6)."""
+    count = len(keys)
+    span = np.minimum(np.floor(at), max(count - (1 if closed else 2), 0)).astype(np.int64)
+    t = (at - span)[:, None]
+    places = [span + step for step in (-1, 0, 1, 2)]
+    before, start, end, after = (keys[place % count if closed else place.clip(0, count - 1)] for place in places)
+    bend = t * (end - before) + t**2 * (2 * before - 5 * start + 4 * end - after)
+    return start + 0.5 * (bend + t**3 * (3 * start - before - 3 * end + after))

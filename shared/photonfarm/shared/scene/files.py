@@ -1,0 +1,130 @@
+"""What can be known of a Mitsuba scene file without Mitsuba: its shape ids, its files, and what we cannot render."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Iterator, Set
+from dataclasses import dataclass
+from pathlib import Path
+
+from photonfarm.shared.core.errors import SpecError
+
+BUILTIN_REVISION = 1
+"""Raised whenever a built-in room changes, as its content is code and not a file."""
+
+_CORNELL = "floor ceiling back-wall left-wall right-wall tall-block short-block ceiling-light"
+_ROOM = """
+    floor ceiling wall-back wall-front wall-left wall-right skirting door painting-frame painting rug
+    table-wood table-bowl chair-1-wood chair-1-cushion chair-2-wood chair-2-cushion sofa-fabric sofa-pillows sofa-feet
+    shelf-wood shelf-books-red shelf-books-blue shelf-books-cream lamp-stand lamp-shade
+    pedestal-stone pedestal-ball mirror-frame mirror-glass vase-copper ceiling-light-1 ceiling-light-2
+"""
+
+BUILTIN_SHAPES = {"cornell": frozenset(_CORNELL.split()), "room": frozenset(_ROOM.split())}
+"""The shape ids of the built-in rooms, said here so that a spec can be checked without Mitsuba."""
+
+BUILTIN_EMITTING = {
+    "cornell": frozenset({"ceiling-light"}),
+    "room": frozenset({"lamp-shade", "ceiling-light-1", "ceiling-light-2"}),
+}
+"""Those of them that are lights."""
+
+ENVIRONMENT = "environment"
+"""The name of the light that comes from all around; a scene has one at most."""
+
+_ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
+
+_UNSUPPORTED = {
+    "medium": "participating media are not supported; only surfaces are",
+    "phase": "participating media are not supported; only surfaces are",
+    "volume": "volumes are not supported; only surfaces are",
+}
+_UNSUPPORTED_BSDFS = {
+    "measured_polarized": "polarisation is not supported",
+    "polarizer": "polarisation is not supported",
+    "retarder": "polarisation is not supported",
+    "circular": "polarisation is not supported",
+}
+_SHAPES = ("obj", "ply", "serialized", "rectangle", "cube", "sphere", "disk", "cylinder")
+"""Shapes with a base point cloud; instances and curves have none."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFile:
+    """The facts of one scene file."""
+
+    path: Path
+    shape_ids: frozenset[str]
+    emitting: frozenset[str]  # ids of the shapes that are lights
+    shapeless: frozenset[str]  # of the lights that are no shapes: ENVIRONMENT, and the ids of others that have one
+    digest: str  # of the file and of every file it names
+
+    @classmethod
+    def read(cls, path: Path) -> SceneFile:
+        """Read and check a scene; raises SpecError for a missing file or an unsupported feature."""
+        root = _parse(path)
+        _refuse_unsupported(root, path)
+        shapes = {node.get("id", ""): node for node in root.iter("shape") if node.get("id")}
+        lights = {node.get("id") for node in root.iter("emitter")} - {None}
+        emitting = {name for name, node in shapes.items() if _emits(node, lights)}
+        digest = _digest(path, _named_files(root, path))
+        return cls(path, frozenset(shapes), frozenset(emitting), frozenset(_shapeless(root)), digest)
+
+
+def _emits(shape: ElementTree.Element, lights: Set[str | None]) -> bool:
+    return any(part.tag == "emitter" or (part.tag == "ref" and part.get("id") in lights) for part in shape)
+
+
+def _shapeless(root: ElementTree.Element) -> Iterator[str]:
+    for node in root.findall("emitter"):
+        if node.get("type") in _ENVIRONMENTS:
+            yield ENVIRONMENT
+        elif node.get("type") != "area" and node.get("id"):  # one of type area is for a shape to refer to
+            yield node.get("id", "")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Up to three known names like a wrong one, for a message."""
+    return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.3)) or "none"
+
+
+def _parse(path: Path) -> ElementTree.Element:
+    try:
+        return ElementTree.parse(path).getroot()  # noqa: S314 - the user's own scene, and expat bounds entities
+    except (OSError, ElementTree.ParseError) as error:
+        raise SpecError(f"{path}: is not a readable Mitsuba scene file: {error}") from error
+
+
+def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
+    for node in root.iter():
+        reason = _UNSUPPORTED.get(node.tag)
+        if node.tag == "bsdf":
+            reason = _UNSUPPORTED_BSDFS.get(node.get("type", ""))
+        if node.tag == "shape" and node.get("type") not in _SHAPES:
+            reason = f"shapes of type {node.get('type')!r} are not supported; only {', '.join(_SHAPES)}"
+        if node.tag == "include":
+            reason = "included scene files are not supported; join them into one file"
+        if reason:
+            name = node.get("id") or node.get("name") or node.get("type")
+            raise SpecError(f"{path}: <{node.tag}> {name!r}: {reason}")
+
+
+def _named_files(root: ElementTree.Element, path: Path) -> list[Path]:
+    files = []
+    for node in root.iter("string"):
+        if node.get("name") == "filename":
+            file = path.parent / node.get("value", "")
+            if not file.is_file():
+                raise SpecError(f"{path}: filename = {node.get('value')!r} is not there")
+            files.append(file)
+    return sorted(set(files))
+
+
+def _digest(path: Path, files: list[Path]) -> str:
+    digest = hashlib.sha256(path.read_bytes())
+    for file in files:
+        with file.open("rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+    return digest.hexdigest()

@@ -1,0 +1,100 @@
+"""Views: where the camera stands and looks, and the ray through each pixel centre.
+
+Convention: the camera looks along its forward axis; x runs right and y down in the image, as pixels do; the field of
+view is measured along the image's width. `depth` is the distance along the forward axis, not along the ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.scene.spec import SceneSpec, ViewSpec
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera position and the point it looks at; all that is stored of a view."""
+
+    origin: NDArray[np.float32]  # (3,) scene units
+    target: NDArray[np.float32]  # (3,) scene units
+
+    @property
+    def vector(self) -> NDArray[np.float32]:
+        """Origin, then target; (6,)."""
+        return np.concatenate([self.origin, self.target])
+
+    @classmethod
+    def from_vector(cls, vector: NDArray[np.float32]) -> View:
+        """The inverse of `vector`; (6,)."""
+        return cls(np.asarray(vector[:3], np.float32), np.asarray(vector[3:], np.float32))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A pinhole camera in world coordinates, in float64: what a view means for one film."""
+
+    origin: NDArray[np.float64]  # (3,)
+    right: NDArray[np.float64]  # (3,) unit
+    down: NDArray[np.float64]  # (3,) unit
+    forward: NDArray[np.float64]  # (3,) unit
+    focal_px: float  # focal length in pixels, equal along both axes
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, view: View, spec: SceneSpec) -> Camera:
+        """The camera of a view through the spec's film; no roll about the viewing direction."""
+        origin = view.origin.astype(np.float64)
+        forward = _unit(view.target.astype(np.float64) - origin)
+        right = np.cross(forward, upright(view, spec.view))
+        right = _unit(right)
+        focal_px = 0.5 * spec.film.width / np.tan(0.5 * np.radians(spec.view.fov_deg))
+        return cls(origin, right, np.cross(forward, right), forward, float(focal_px), spec.film.width, spec.film.height)
+
+    @property
+    def world_to_camera(self) -> NDArray[np.float64]:
+        """(3, 4): rows right, down, forward; maps homogeneous world points to camera coordinates."""
+        rotation = np.stack([self.right, self.down, self.forward])
+        return np.concatenate([rotation, -(rotation @ self.origin)[:, None]], axis=1)
+
+    def rays(self, u: float = 0.5, v: float = 0.5) -> NDArray[np.float32]:
+        """Unit world directions through one point of each pixel, (H, W, 3): normalise(T⁻¹ K⁻¹ (x+u, y+v, 1)).
+
+        Through the pixels' centres, unless told otherwise.
+        """
+        x = (np.arange(self.width) + u - 0.5 * self.width) / self.focal_px
+        y = (np.arange(self.height) + v - 0.5 * self.height) / self.focal_px
+        direction = x[None, :, None] * self.right + y[:, None, None] * self.down + self.forward
+        return _unit(direction).astype(np.float32)
+
+
+def upright(view: View, spec: ViewSpec) -> NDArray[np.float64]:
+    """The up vector to build the camera with: the spec's, or another axis where the view is along it."""
+    up = np.array(spec.up, np.float64)
+    forward = _unit(view.target.astype(np.float64) - view.origin.astype(np.float64))
+    if np.linalg.norm(np.cross(forward, _unit(up))) > 1e-6:
+        return up
+    return np.roll(up, 1)
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+def sample_view(spec: SceneSpec, modification_key: Key, seed: int, index: int) -> View:
+    """The `index`-th random view of one configuration under a master seed [supplement 2.2].
+
+    Origin and look-at point are uniform in their boxes and independent; origins inside objects are not rejected. Only
+    a look-at point nearer than 1e-4 of the boxes' joint diagonal is drawn again.
+    """
+    stream = Stream(make_key("view", modification_key, seed, index), "placement")
+    boxes = (spec.view.origin, spec.view.look_at)
+    diagonal = np.linalg.norm(np.max([b.high for b in boxes], axis=0) - np.min([b.low for b in boxes], axis=0))
+    while True:
+        origin, target = (stream.uniform_in(box.low, box.high).astype(np.float32) for box in boxes)
+        if np.linalg.norm(target.astype(np.float64) - origin.astype(np.float64)) >= 1e-4 * diagonal:
+            return View(origin, target)

@@ -1,0 +1,260 @@
+"""`photonfarm store check`: reads everything that a store holds, says what is wrong with it, and sets that aside.
+
+Nothing is deleted and no value is changed. One scene after the other, and one row after the other: memory is what the
+plans take, 32 bytes a sample, and one row of each array for each thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from math import ceil
+
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.guide_check import GuideCheck
+from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
+from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_pool import JobPool
+from photonfarm.shared.store.check.plan_check import PlanCheck
+from photonfarm.shared.store.check.plan_repair import PlanRepair
+from photonfarm.shared.store.check.repeated_seeds import equal_samples
+from photonfarm.shared.store.check.unplanned_files import strangers
+from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.io.storage import TMP, Storage
+from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.findings import Cause, Finding, Findings, Group, JobPart, Remedy
+from photonfarm.shared.store.write.guides import GUIDES
+from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
+from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
+from photonfarm.shared.store.write.store import Store
+
+Progress = Callable[[str, int, int, int], None]
+"""Is told the scene's name, jobs checked, jobs to check, and bytes read."""
+
+
+AT_ONCE = 32
+"""Jobs handed to the threads at a time, in whose order findings are told."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneReport:
+    """What was read and found of one scene."""
+
+    scene_id: str
+    name: str | None  # None if its spec cannot be read
+    jobs: int  # committed ones that were checked
+    guide_jobs: int  # those of them whose guides were checked
+    samples: int
+    size_bytes: int
+    back_facing_share: float | None  # of the pixels that meet something; None if none does
+    halves: HalvesResult | None
+    groups: tuple[Group, ...]
+    set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
+
+
+@dataclass(frozen=True, slots=True)
+class StoreReport:
+    """What was read and found of a store."""
+
+    scenes: tuple[SceneReport, ...]
+    parts: int  # unfinished files
+    repaired: bool  # whether what can be repaired was set aside
+    quarantine: str | None  # the folder that it was moved to
+
+    @property
+    def exit_code(self) -> int:
+        """0: nothing is wrong; 7: what was wrong is set aside, to be written again; 4: something is still wrong."""
+        remedies = {group.cause.remedy for scene in self.scenes for group in scene.groups} - {Remedy.LOOK}
+        if not remedies:
+            return 0
+        return StoreError.exit_code if Remedy.REPORT in remedies or not self.repaired else IncompleteError.exit_code
+
+
+def check_store(
+    store: Store, scene_id: str | None = None, *, when: str, repair: bool = False, tell: Progress | None = None
+) -> StoreReport:
+    """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
+
+    Safe while workers, readers and other checks are at work. Raises StoreError if the scene is not there, or the store
+    cannot be read.
+    """
+    storage = store.storage
+    with store_errors("check the store", storage.where):
+        ids = scene_ids(storage) if scene_id is None else [scene_id]
+        if scene_id is not None and not storage.names(f"{SCENES}/{scene_id}"):
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}")
+        quarantine = Quarantine(storage, when)
+        reports = []
+        for each in ids:
+            checking = _SceneChecking(storage, each, len(ids), tell or (lambda *_: None))
+            reports.append(checking.run(quarantine if repair else None))
+        return StoreReport(
+            tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
+        )
+
+
+def said(halves: HalvesResult) -> str:
+    """The outcome of the test between A and B in words."""
+    few = "" if halves.tells else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
+    return few + (
+        f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
+        f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
+        f"± {halves.standard_error:.2%} over {halves.samples} samples"
+    )
+
+
+class _SceneChecking:
+    """One scene on its way through the check."""
+
+    def __init__(self, storage: Storage, scene_id: str, scenes: int, tell: Progress) -> None:
+        self._storage = storage
+        self._scene_id = scene_id
+        self._name = f"{SCENES}/{scene_id}"
+        self._tell = tell
+        self._findings = Findings()
+        self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
+        self._same: dict[int, bool] = {}  # of such jobs: whether they came out the same when they were rendered again
+        self._scenes = scenes
+        self._tally, self._guide_tally = Tally(HalvesTest(scenes)), Tally(HalvesTest(scenes))
+
+    def run(self, quarantine: Quarantine | None) -> SceneReport:
+        """Check everything; set aside what is damaged, unless `quarantine` is None."""
+        try:
+            spec = read_spec(self._storage, self._scene_id)
+        except StoreError as error:
+            detail = str(error).partition(": ")[2]
+            self._add([Finding(Cause.SPEC, detail, self._scene_id, file=f"{self._name}/spec.json")])
+            aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
+            return self._report(None, aside)
+        committed = markers.jobs(self._storage, self._name)
+        guided = markers.jobs(self._storage, f"{self._name}/{GUIDES}")
+        inputs, done = self._plans(spec, quarantine)
+        self._add(inputs.check_base(committed))
+        scene = None
+        if inputs.shard_rows is not None:
+            scene = Checked(
+                self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
+            )
+            self._jobs(scene, sorted(committed))
+            done += self._guides(scene.of_guides(), guided, quarantine)
+        return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
+
+    def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
+        """The plans once they are checked, and which were written again; before the jobs, which need them."""
+        check = PlanCheck(self._storage, spec, self._name)
+        found = list(check.check_plans())
+        self._add(found)
+        damaged = [finding for finding in found if finding.cause is Cause.PLAN_INPUTS]
+        if quarantine is None or not damaged:
+            return check, []
+        rewritten = []
+        repair = PlanRepair(self._storage, spec, self._name, quarantine)
+        for number in range(plans.count(self._storage, self._name)):
+            folder = f"{plans.folder(self._name, number)}/"
+            if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
+                try:
+                    repair.run(number, why)
+                    rewritten.append(f"plan {number}, written again from its request")
+                except StoreError as error:
+                    self._add([Finding(Cause.PLAN, str(error).partition(": ")[2], self._scene_id, file=folder[:-1])])
+        check = PlanCheck(self._storage, spec, self._name)
+        self._add([finding for finding in check.check_plans() if finding not in found])
+        return check, rewritten
+
+    def _jobs(self, scene: Checked, committed: list[int]) -> None:
+        self._read(scene, committed, self._tally, scene.spec.name)
+        self._add(self._again(equal_samples(scene, self._tally)))
+        if (halves := self._tally.halves.result()) is not None and not halves.passed:
+            self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+
+    def _guides(self, guides: Checked, committed: set[int], quarantine: Quarantine | None) -> list[str]:
+        """Check the scene's guides, if it has some; what of their settings and declarations has been mended."""
+        if not self._storage.names(guides.name):
+            return []
+        check = GuideCheck(guides, committed)
+        found = list(check.run())
+        self._add(found)
+        self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
+        return check.repair(quarantine, found) if quarantine else []
+
+    def _read(self, scene: Checked, committed: list[int], total: Tally, called: str) -> None:
+        """Read all that committed jobs have stored there, and look for what they have not."""
+        with JobPool(scene, self._scenes) as pool:
+            for done in range(0, len(committed), AT_ONCE):
+                jobs = committed[done : done + AT_ONCE]
+                self._tell(called, done, len(committed), pool.size_bytes)
+                for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
+                    if found:
+                        self._markers[scene.guides, job] = marker
+                        self._add(self._again(found))
+            for tally in pool.tallies:
+                total.add(tally)
+        self._tell(called, len(committed), len(committed), total.size_bytes)
+        self._add(strangers(scene))
+
+    def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
+        """Findings; equal halves that came out equal when they were rendered again are not set aside once more."""
+        for finding in found:
+            equal = finding.cause in (Cause.EQUAL_HALVES, Cause.EQUAL_SAMPLES)
+            again = equal and finding.job is not None and self._came_out_the_same(finding.job)
+            yield replace(finding, cause=Cause.SAME_AGAIN) if again else finding
+
+    def _came_out_the_same(self, job: int) -> bool:
+        if job not in self._same:
+            self._same[job] = False
+            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or a finding of its own
+                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker((False, job)))
+        return self._same[job]
+
+    def _marker(self, part: JobPart) -> bytes:
+        """The marker that findings of a job are about; raises FileNotFoundError if it is set aside in the meantime."""
+        if part not in self._markers:  # found when all samples were looked at
+            self._markers[part] = self._storage.read(markers.name_of(self._name, part[1]))
+        return self._markers[part]
+
+    def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
+        self._findings.add(found)
+
+    def _report(self, name: str | None, set_aside: list[str]) -> SceneReport:
+        tally, guides = self._tally, self._guide_tally
+        share = tally.back_facing_pixels / tally.hit_pixels if tally.hit_pixels else None
+        return SceneReport(
+            self._scene_id, name, tally.jobs, guides.jobs, tally.samples, tally.size_bytes + guides.size_bytes, share,
+            tally.halves.result(), self._findings.groups(), tuple(set_aside),
+        )  # fmt: skip
+
+    # ----------------------------------------------------------------------------------------------------------- repair
+
+    def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
+        aside = []
+        for (guides, job), why in sorted(self._findings.jobs.items(), key=lambda found: found[0]):
+            if scene is None or scene.plans is None:
+                detail = "stays until the plans are whole"
+                self._add([Finding(Cause.LEFT, detail, self._scene_id, job, guides=guides)])
+            elif self._set_aside(scene.of_guides() if guides else scene, quarantine, job, why):
+                aside.append(f"guides of job {job}" if guides else f"job {job}")
+        if why := self._findings.of(Cause.BASE):
+            if quarantine.base(self._name, why):
+                aside.append("base")
+            committed = markers.jobs(self._storage, self._name)
+            jobs = scene.plans[-1].end_job if scene is not None and scene.plans else 0
+            if scene is not None and committed.issuperset(range(jobs)) and jobs:
+                # nothing is missing, and only a job that is rendered writes the base
+                reason = Finding(Cause.BASE, "this job is whole: it is rendered again for the base", self._scene_id)
+                self._set_aside(scene, quarantine, jobs - 1, [reason])
+                aside.append(f"job {jobs - 1} (whole; rendered again, as a job writes the base)")
+        return aside
+
+    def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
+        files = set(scene.files_of(job).values())
+        try:
+            marker = self._marker((scene.guides, job))
+            files.update(markers.files(marker, scene.name, job))
+        except FileNotFoundError:  # another repair has been here
+            return False
+        except CorruptError:
+            pass
+        return quarantine.job(scene.name, job, marker, sorted(files), why)

@@ -1,0 +1,82 @@
+"""Checks several jobs at a time: reading, checksums and arithmetic run beside each other."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import TracebackType
+from typing import Self
+
+from photonfarm.shared.core.processes import usable_cores
+from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.halves import HalvesTest
+from photonfarm.shared.store.check.job_check import Checked, JobCheck
+from photonfarm.shared.store.io.storage import renew_copy
+from photonfarm.shared.store.write.findings import Cause, Finding
+
+MOST_THREADS = 4
+"""More of them would wait for the disk, or for each other."""
+
+
+class JobPool:
+    """Threads that check jobs, each with memory of its own; a context manager."""
+
+    def __init__(self, scene: Checked, scenes: int) -> None:
+        self.tallies: list[Tally] = []
+        self._own = threading.local()
+        self._scene = scene
+        self._scenes = scenes
+        self._threads = ThreadPoolExecutor(min(MOST_THREADS, usable_cores()))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._threads.shutdown(cancel_futures=True)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes read so far."""
+        return sum(tally.size_bytes for tally in self.tallies)
+
+    def run(self, jobs: list[int]) -> Iterator[tuple[list[Finding], bytes]]:
+        """What is found of each job, and its marker, in order."""
+        return self._threads.map(self._check, jobs)
+
+    def _check(self, job: int) -> tuple[list[Finding], bytes]:
+        if not hasattr(self._own, "checker"):
+            self._own.checker = _Checker(self._scene, self._scenes)
+            self.tallies.append(self._own.checker.tally)
+        found: tuple[list[Finding], bytes] = self._own.checker.run(job)
+        return found
+
+
+class _Checker:
+    """Checks jobs of a scene one after the other; knows damage of the store from that of this machine's copies."""
+
+    def __init__(self, scene: Checked, scenes: int) -> None:
+        self.tally = Tally(HalvesTest(scenes))
+        self._scene = scene
+        self._scenes = scenes
+        self._check = JobCheck(scene)
+
+    def run(self, job: int) -> tuple[list[Finding], bytes]:
+        """What is found of a job, and its marker; where copies may be to blame, of new ones."""
+        found, marker, tally = self._run(job)
+        if self._renewed(found):
+            found, marker, tally = self._run(job)
+        self.tally.add(tally)
+        return found, marker
+
+    def _run(self, job: int) -> tuple[list[Finding], bytes, Tally]:
+        tally = Tally(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
+        return *self._check.run(job, tally), tally
+
+    def _renewed(self, found: list[Finding]) -> bool:
+        """Whether what was read differs from what was committed, and was a copy: then the copies are new now."""
+        damaged = {finding.file for finding in found if finding.cause is Cause.CHECKSUM and finding.file}
+        renewed = [renew_copy(self._scene.storage, file) for file in sorted(damaged)]
+        return any(renewed)

@@ -1,0 +1,71 @@
+"""Samples that have a half in common: a seed was used twice.
+
+Seeds have 32 bits, so that among many samples some have one in common by chance. Rendered again, these would come out
+the same; so they are told from those that a fault has made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.store.check.content_check import Tally, is_constant
+from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.format.shards import Shard
+from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.findings import Cause, Finding
+
+DRAWN = 4
+"""Seeds of a half that a renderer may draw: three are tried, and one may be the other half's."""
+
+
+def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
+    """Samples that have a half in common. Constant halves may rightly be equal: there is no noise in them."""
+    for rows in tally.fingerprints.suspects():
+        read = ((row, halves) for row in rows if (halves := _halves(scene, row)) is not None)
+        first, reference = next(read, (0, None))
+        if reference is None or any(is_constant(half) for half in reference):
+            continue
+        causes = {
+            row: Cause.SAME_SEED if _seeds(scene, row) & _seeds(scene, first) else Cause.EQUAL_SAMPLES
+            for row, halves in read
+            if any(np.array_equal(a, b) for a in reference for b in halves)
+        }
+        for row, cause in causes.items():
+            yield _shared(scene, cause, row, first)
+        for cause in dict.fromkeys(causes.values()):
+            yield _shared(scene, cause, first, max(row for row in causes if causes[row] is cause))
+
+
+def _shared(scene: Checked, cause: Cause, row: int, other: int) -> Finding:
+    detail = f"has a half in common with row {other}"
+    return Finding(cause, detail, scene.scene_id, row // scene.shard_rows, row)
+
+
+def _seeds(scene: Checked, row: int) -> set[int]:
+    """The seeds that the halves of a sample may have been rendered with, by its key; none if no plan tells that."""
+    sample = plans.sample_at(scene.plans, row) if scene.plans else None
+    if sample is None:
+        return set()
+    purposes = [f"half {half}{again}" for half in "AB" for again in ("", *(f", attempt {n}" for n in range(1, DRAWN)))]
+    return {seed_of(sample.key, purpose) for purpose in purposes}
+
+
+def _halves(scene: Checked, row: int) -> NDArray[np.floating] | None:
+    """The stored halves of a row; None if they cannot be read (any more)."""
+    job, i = divmod(row, scene.shard_rows)
+    arrays, files = schema.output_arrays(scene.spec), scene.files_of(job)
+    for name in ("radiance", "radiance_wide"):
+        if name in files and scene.storage.exists(files[name]):
+            try:
+                halves = Shard(scene.storage.local(files[name]), arrays[name], scene.shard_rows).read(i)
+            except CorruptError:  # found already, or set aside in the meantime
+                return None
+            if halves is not None:
+                return halves
+    return None

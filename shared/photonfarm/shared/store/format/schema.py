@@ -1,0 +1,189 @@
+"""The arrays of one scene: their shapes, and how they are laid out in chunks and shards, and encoded.
+
+Shape letters: R rows of a plan, J `shard_rows`, H W image, P points, K photon slots.
+
+A row of an output array is one inner chunk, and a job's J rows are one shard: one file, written once and whole. Noise
+does not compress and is stored as it is; everything else is Blosc LZ4 behind a byte shuffle. CRC-32C comes last
+in every chain, since Blosc alone lets flipped bits through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.core.records import LIT_POINTS
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, Declared
+
+if TYPE_CHECKING:
+    import zarr
+
+    from photonfarm.shared.store.io.storage import Storage
+
+Kind = Literal["sample", "view", "modification"]
+
+INPUT_ROWS_PER_CHUNK = 65536
+BLOSC: dict[str, Any] = {
+    "cname": "lz4",
+    "clevel": 1,
+    "shuffle": "shuffle",
+}  # byte shuffle: floats compress by their exponents
+
+_INDEX_ENTRY, _CRC, _BLOSC_HEADER = 16, 4, 16
+_ROW_OVERHEAD = _BLOSC_HEADER + _CRC
+"""Bytes of a shard beside its values: of each of its rows in the index, of each checksum, and of what is compressed."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySchema:
+    """One output array of a scene: a row of it belongs to one sample, view or modification."""
+
+    name: str
+    kind: Kind
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fill: float | int  # of rows that are not written; a legal value of written ones in `photon_bounce` and bits only
+    compressed: bool
+    dimensions: tuple[str, ...]  # names of the axes after the row
+    attributes: dict[str, Any]
+
+    def shard_name(self, job: int) -> str:
+        """File name of one shard, counted within the plan, in the array's folder."""
+        return ".".join(["c", str(job), *("0" for _ in self.shape)])
+
+
+def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
+    """The output arrays of a scene, by name; a scene without photons has none for them."""
+    return _arrays(OUTPUTS, spec)
+
+
+def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
+    """The arrays of a scene's guides, by name; each row belongs to a view."""
+    return _arrays(GUIDES, spec)
+
+
+def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySchema]:
+    points, photons = (-(-count // 8) for count in bit_counts(spec).values())
+    lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
+    lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
+    wanted = [each for each in declared if all(lengths.get(str(n), 1) for n in each.shape)]
+    return {each.name: _resolved(each, lengths, spec) for each in wanted}
+
+
+def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
+    """Stored bytes of one sample, one view with its guides, and one modification, before compression, with inputs."""
+    found: dict[Kind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
+    for name, array in output_arrays(spec).items():
+        if name != "radiance_wide":  # few rows need it
+            found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
+    found["view"] += sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in guide_arrays(spec).values())
+    return found
+
+
+def most_guide_bytes(spec: SceneSpec, views: int, jobs: int, shard_rows: int) -> int:
+    """Stored bytes of the guides of so many views, in so many jobs, where nothing of them can be compressed."""
+    arrays = guide_arrays(spec).values()
+    rows = sum(int(np.prod(array.shape)) * array.dtype.itemsize + _ROW_OVERHEAD for array in arrays)
+    return views * rows + jobs * len(arrays) * (_INDEX_ENTRY * shard_rows + _CRC)
+
+
+def bit_counts(spec: SceneSpec) -> dict[str, int]:
+    """The bits of a row in the arrays that hold bits: one for each point, and one for each photon slot."""
+    return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
+
+
+def _resolved(declared: Declared, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
+    exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
+    scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
+    return ArraySchema(
+        declared.name,
+        cast("Kind", declared.axes[0]),
+        tuple(n if isinstance(n, int) else lengths[n] for n in declared.shape[1:]),
+        np.dtype(declared.dtype),
+        declared.fill,
+        declared.compressed,
+        declared.axes[1:],
+        {**declared.attributes, **scale},
+    )
+
+
+# ------------------------------------------------------------------------------------------------ arrays through zarr
+
+
+def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, shard_rows: int) -> None:
+    """Declare arrays of a plan's outputs at their full size; nothing is ever appended or resized."""
+    for array in arrays:
+        group.create_array(
+            array.name,
+            shape=(rows, *array.shape),
+            chunks=(1, *array.shape),
+            shards=(shard_rows, *array.shape),
+            dtype=array.dtype,
+            fill_value=array.fill,
+            compressors=_codecs(compressed=array.compressed),
+            filters=None,
+            dimension_names=(array.kind, *array.dimensions),
+            attributes=array.attributes,
+            chunk_key_encoding=_FLAT,
+        )
+
+
+def create_input(group: zarr.Group, declared: Declared, data: NDArray[Any]) -> None:
+    """Store one whole array of inputs or of the base, compressed and with checksums; `data` has the declared type."""
+    chunks = (min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:]))
+    little = data.astype(declared.dtype, casting="equiv", copy=False)
+    array = group.create_array(
+        declared.name,
+        shape=data.shape,
+        chunks=chunks,
+        dtype=little.dtype,
+        fill_value=declared.fill,
+        compressors=_codecs(compressed=declared.compressed),
+        filters=None,
+        dimension_names=declared.axes,
+        attributes=declared.attributes,
+        chunk_key_encoding=_FLAT,
+        config={"write_empty_chunks": True},
+    )
+    if data.size:
+        array[...] = little
+
+
+def chunk_names(array: Any) -> Iterator[str]:
+    """The file names of all chunks of an array of inputs or of the base, in the array's folder."""
+    if array.size:
+        grid = [-(-length // chunk) for length, chunk in zip(array.shape, array.chunks, strict=True)]
+        for index in np.ndindex(*grid):
+            yield ".".join(["c", *map(str, index)])
+
+
+def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
+    """One whole array of inputs or of the base, which lies in a folder.
+
+    Raises CorruptError for a chunk that is missing, which zarr reads as fill values, and ValueError, with the array's
+    name, for others that zarr cannot read.
+    """
+    held = set(storage.names(folder))
+    for name in chunk_names(array):
+        if name not in held:
+            raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
+    try:
+        return np.asarray(array[...])
+    except (ValueError, KeyError, RuntimeError) as error:
+        reason = str(error).partition(" Stored: b")[0].rstrip(".")  # bytes of checksums tell nobody anything
+        raise ValueError(f"{array.path}: {reason}") from error
+
+
+_FLAT: Any = {"name": "default", "configuration": {"separator": "."}}  # c.0.0 in one folder, which is synced once
+
+
+def _codecs(*, compressed: bool) -> list[Any]:
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    return [BloscCodec(**BLOSC), Crc32cCodec()] if compressed else [Crc32cCodec()]

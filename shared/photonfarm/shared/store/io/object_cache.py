@@ -1,0 +1,108 @@
+"""Copies of a bucket's objects on this machine: as many as fit, those used last.
+
+A copy's name tells the version of its object, so a stale one is never used. Copies appear whole, by rename, and any
+number of processes share them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Self
+
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.store.io.local import LocalStorage, sync
+from photonfarm.shared.store.io.storage import discard
+
+FOLDER_VARIABLE = "PHOTONFARM_CACHE"
+"""Where copies and unfinished files lie; ~/.cache/photonfarm by default."""
+
+LIMIT_VARIABLE = "PHOTONFARM_CACHE_GB"
+LIMIT_GB = 20.0
+"""For the copies of one store, by default."""
+
+KEPT_S = 60.0
+"""A copy used so lately is kept whatever the limit: its reader may be about to open it."""
+
+FILES = "files"
+
+
+class ObjectCache:
+    """The copies of one store's objects, and its unfinished files."""
+
+    def __init__(self, folder: Path, limit_bytes: float) -> None:
+        """Name the folder; it is made when it is needed."""
+        self._files = folder / FILES
+        self._parts = LocalStorage(folder)
+        self._limit_bytes = limit_bytes
+        self._added_bytes = limit_bytes  # by this process since it last looked; so that it looks the first time
+
+    @classmethod
+    def of(cls, url: str) -> Self:
+        """The cache of a store, where and as large as the variables say; raises StoreError for one that is wrong."""
+        named = os.environ.get(FOLDER_VARIABLE)
+        root = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "photonfarm"
+        told = os.environ.get(LIMIT_VARIABLE) or LIMIT_GB
+        try:
+            limit_gb = float(told)
+        except ValueError as error:
+            raise StoreError(f"{LIMIT_VARIABLE} = {told!r}: a number of gigabytes is required") from error
+        return cls(root / "objects" / hashlib.sha256(url.encode()).hexdigest()[:16], limit_gb * 1e9)
+
+    def path(self, name: str, version: str | None) -> Path:
+        """Where the copy of an object's version lies, or would lie; nothing lies at that of no version."""
+        return self._files / (name if version is None else f"{name}@{version}")
+
+    def has(self, copy: Path, size: int) -> bool:
+        """Whether a copy of so many bytes is there; if so, it has been used now."""
+        try:
+            os.utime(copy)
+            return copy.stat().st_size == size
+        except FileNotFoundError:
+            return False
+
+    @contextlib.contextmanager
+    def filling(self, copy: Path) -> Iterator[BinaryIO]:
+        """A file to write a copy to; it is there, whole, after the block, unless that raises."""
+        part = self.part()
+        try:
+            with part.open("xb") as file:
+                yield file
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            self._make_room(part.stat().st_size)
+            sync(part, data_only=True)  # a copy that a power cut emptied would be taken for the object
+            part.replace(copy)
+        finally:
+            discard(part)
+
+    def part(self) -> Path:
+        """A new path to write to, on the same file system."""
+        return self._parts.part()
+
+    def sweep(self, *, stray_age_s: float) -> int:
+        """Remove parts that dead processes left; how many."""
+        return self._parts.sweep(stray_age_s=stray_age_s)
+
+    def _make_room(self, size: int) -> None:
+        """Remove the copies that were used longest ago, if need be; looks once per sixteenth of the limit."""
+        self._added_bytes += size
+        if self._added_bytes < self._limit_bytes / 16:
+            return
+        self._added_bytes = 0.0
+        copies = []
+        for path in self._files.rglob("*"):
+            with contextlib.suppress(FileNotFoundError):  # another process was faster, here and below
+                if path.is_file():
+                    about = path.stat()
+                    copies.append((about.st_mtime, about.st_size, path))
+        total = size + sum(about[1] for about in copies)
+        for used, bytes_, path in sorted(copies):
+            if total <= self._limit_bytes * 15 / 16 or used > time.time() - KEPT_S:
+                return
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+            total -= bytes_

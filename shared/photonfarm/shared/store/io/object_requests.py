@@ -1,0 +1,107 @@
+"""How a bucket is asked: connected to, with patience, and with errors as those of a file system."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import re
+import time
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from typing import Any, TypeVar
+
+from obstore.exceptions import BaseError, GenericError, PermissionDeniedError, UnauthenticatedError
+from obstore.store import from_url
+
+from photonfarm.shared.core.errors import StoreError
+
+PATIENCE_S = 60.0
+"""How long a server that fails, or cannot be reached, is asked again: it may be restarted meanwhile."""
+
+PAUSES_S = (0.3, 1.0, 3.0, 5.0)
+"""Before each new attempt of ours, the last one again and again; the library has its own, within an attempt."""
+
+RETRIES = 1000
+"""Of the library within a request; PATIENCE_S ends them. It leaves out what may have worked already, and what breaks
+off in the middle of an answer."""
+
+LONGEST_PAUSE_S = 5.0
+
+T = TypeVar("T")
+
+
+def connect(url: str, timeout_s: float) -> Any:
+    """The library's store; nothing is sent yet."""
+    try:
+        return from_url(
+            url,
+            client_options={
+                "allow_http": True,  # where the endpoint's URL says so, as within a cluster
+                "timeout": timedelta(seconds=timeout_s),
+            },
+            retry_config={
+                "max_retries": RETRIES,
+                "retry_timeout": timedelta(seconds=PATIENCE_S),
+                "backoff": {
+                    "init_backoff": timedelta(seconds=PAUSES_S[0]),
+                    "max_backoff": timedelta(seconds=LONGEST_PAUSE_S),
+                    "base": 2,
+                },
+            },
+        )
+    except (BaseError, ValueError) as error:
+        raise StoreError(f"{url}: cannot be used as a store: {_first_line(error)}") from error
+
+
+def patiently(action: Callable[[], T], *passing: type[Exception], times: int = 1) -> T:
+    """What an action returns, tried again for PATIENCE_S while the server fails, or with one of the `passing` errors.
+
+    At least `times` times, however long each takes: a transfer may break off after minutes. Whether a put that failed
+    has worked is not known; whoever tries it must find out.
+    """
+    failures: tuple[type[Exception], ...] = (GenericError, *passing)
+    deadline = time.monotonic() + PATIENCE_S
+    for tried, pause_s in enumerate(itertools.chain(PAUSES_S, itertools.repeat(PAUSES_S[-1])), 1):
+        try:
+            return action()
+        except failures as error:
+            if (tried >= times and time.monotonic() + pause_s > deadline) or _is_refusal(error):
+                raise
+        time.sleep(pause_s)
+    raise AssertionError("pauses without end have ended")
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether the server has refused, as it will the next time (all but "too slow" and "too many requests")."""
+    return isinstance(error, GenericError) and re.search(r"\b4(?!08|29)\d\d [A-Z]", _first_line(error)) is not None
+
+
+@contextlib.contextmanager
+def os_errors(name: str) -> Iterator[None]:
+    """Turn the library's errors into those of a file system, with the name of the object."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        if "<Code>NoSuchBucket</Code>" in str(error):  # else what is not there would be looked for in it
+            raise OSError(errno.EIO, "the bucket does not exist", name) from error
+        raise FileNotFoundError(errno.ENOENT, "no such object, or no such bucket", name) from error
+    except (PermissionDeniedError, UnauthenticatedError) as error:
+        raise PermissionError(errno.EACCES, _reason(error), name) from error
+    except BaseError as error:
+        if "404 Not Found" in _first_line(error):  # how the library tells that a bucket cannot be listed
+            raise FileNotFoundError(errno.ENOENT, "no such bucket", name) from error
+        raise OSError(errno.EIO, _reason(error), name) from error
+
+
+def _reason(error: Exception) -> str:
+    """What the library says, and code and message of the server's answer instead of its XML, in a line."""
+    said = re.split(r"<\?xml|<Error>", _first_line(error))[0].rstrip(": ")
+    answer = str(error).partition("\n\nDebug source:")[0]
+    told = [match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))]
+    return " ".join(": ".join([said, *told]).split())
+
+
+def _first_line(error: Exception) -> str:
+    """What the library says, without what is meant for its developers."""
+    return str(error).partition("\n")[0]

@@ -1,0 +1,172 @@
+"""Where the files of a store lie: names with bytes, each written once, whole, and by whoever comes first.
+
+A name is a path below the store, with / between its parts. What is to be stored is written to a `part` on this machine
+and adopted under its name; after `settle` it stays, whatever happens to the machine. `local` has the folder on a POSIX
+file system; `objects` the bucket.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from photonfarm.shared.core.errors import StoreError, store_errors
+
+if TYPE_CHECKING:
+    import zarr.abc.store
+
+FORMAT_FILE = "photonfarm.json"
+"""What a store has at its root, and nothing else has."""
+
+TMP = "tmp"
+"""The folder of what is not adopted yet."""
+
+STRAY_AGE_S = 60.0
+"""Parts of a dead process of this machine are swept at this age…"""
+
+FOREIGN_AGE_S = 86400.0
+"""…and those of other machines, whose processes cannot be asked after, at this one."""
+
+
+class Storage(Protocol):
+    """Files by name. Any method may raise OSError; none leaves half a file under a name."""
+
+    @property
+    def where(self) -> str:
+        """The store's folder or URL, for messages."""
+
+    def local(self, name: str) -> Path:
+        """A file of this machine with the bytes of a name; it need not exist for a name that does not."""
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a name; raises FileNotFoundError."""
+
+    def exists(self, name: str) -> bool:
+        """Whether a name has bytes."""
+
+    def size(self, name: str) -> int:
+        """How many bytes a name has; raises FileNotFoundError."""
+
+    def names(self, folder: str) -> list[str]:
+        """The last parts of the names and folders right below a folder, in no order; none if it does not exist."""
+
+    def zarr(self, folder: str) -> zarr.abc.store.Store:
+        """A folder as zarr-python reads it."""
+
+    def part(self) -> Path:
+        """A new path on this machine, to write a file or folder to before it is adopted, or removed."""
+
+    def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
+        """Give a part its name; False if the name was taken, which keeps what is there, and the part.
+
+        With `replace` it takes the place of what is there, at once.
+        """
+
+    def adopt_folder(self, part: Path, folder: str) -> bool:
+        """Give a folder that is a Zarr group its name, at once; False if the name was taken, which keeps the part."""
+
+    def move(self, name: str, new_name: str) -> None:
+        """Give the bytes of a name another one, which nothing has; raises FileNotFoundError.
+
+        The bytes are never without a name; in between they may have both.
+        """
+
+    def move_folder(self, folder: str, new_folder: str) -> None:
+        """Give all names below a folder that is a Zarr group to another folder, which does not exist.
+
+        The group's own zarr.json goes first, if not all go at once. Raises FileNotFoundError if there is none.
+        """
+
+    def settle(self, names: Iterable[str]) -> None:
+        """Return once these names are as durable as their bytes."""
+
+    def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
+        """Remove parts that dead writers left; how many."""
+
+    def founding(self) -> contextlib.AbstractContextManager[None]:
+        """While a store is being made here: without its format file nothing is written otherwise."""
+
+    def require(self) -> None:
+        """Raise StoreError if the store's place is there no more, so that nothing in it is taken for missing."""
+
+
+@runtime_checkable
+class Copying(Protocol):
+    """A storage whose `local` files are copies, which may rot on this machine while the store is whole."""
+
+    def renew(self, name: str) -> None:
+        """Make the copy of a name anew, as `local` made it."""
+
+
+def renew_copy(storage: Storage, name: str) -> bool:
+    """Make this machine's copy of a name anew, whose bytes are not what was committed; False if it is no copy."""
+    if not isinstance(storage, Copying):
+        return False
+    storage.renew(name)
+    return True
+
+
+SCHEMES = ("s3", "gs", "az")
+"""Of the URLs of buckets."""
+
+
+def is_url(root: str | Path) -> bool:
+    """Whether a store's place is meant as a URL."""
+    return isinstance(root, str) and "://" in root
+
+
+def open_storage(root: str | Path) -> Storage:
+    """The storage of a folder's path or of a bucket's URL, which need not exist yet; raises StoreError for others."""
+    if not is_url(root):
+        from photonfarm.shared.store.io.local import LocalStorage
+
+        return LocalStorage(Path(root), FORMAT_FILE)
+    if str(root).partition("://")[0] not in SCHEMES:
+        raise StoreError(f"{root}: is no URL of a bucket; they begin with {'://, '.join(SCHEMES)}://")
+    try:
+        from photonfarm.shared.store.io.objects import ObjectStorage
+    except ModuleNotFoundError as error:
+        raise StoreError(
+            f"{root}: a store in a bucket needs the package {error.name}; pip install 'photonfarm-shared[objects]'"
+        ) from error
+    return ObjectStorage(str(root))
+
+
+def is_vacant(root: str | Path) -> bool:
+    """Whether nothing lies where a store could be, so that one may be made there; raises StoreError."""
+    storage = open_storage(root)
+    with store_errors("look into the store", storage.where):
+        return set(storage.names("")) <= {TMP}
+
+
+def read_or_none(storage: Storage, name: str) -> bytes | None:
+    """The bytes of a name; None if it has none."""
+    try:
+        return storage.read(name)
+    except FileNotFoundError:
+        return None
+
+
+def discard(part: Path) -> None:
+    """Remove a part's file if it is still there; where the disk refuses that, a sweep does it later.
+
+    So that what is told is the error that is under way, and a name that has been given is not taken for one that is
+    not.
+    """
+    with contextlib.suppress(OSError):
+        part.unlink(missing_ok=True)
+
+
+def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
+    """Store a JSON document durably under a new name; False if the name was taken, which keeps what is there."""
+    part = storage.part()
+    try:
+        part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        placed = storage.adopt(part, name)
+    finally:
+        discard(part)
+    storage.settle([name])
+    return placed

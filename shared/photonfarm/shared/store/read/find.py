@@ -1,0 +1,56 @@
+"""`photonfarm store find`: samples by their content (modification, view, keys), or by row and job."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.store.read.query import Query
+from photonfarm.shared.store.read.scene_match import FoundSample, Place, SceneMatch
+from photonfarm.shared.store.write.store import Store
+
+__all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named"]
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """What was found."""
+
+    count: int
+    samples: tuple[FoundSample, ...]  # the nearest, then by scene and row
+    nearest: float | None  # distance of the nearest sample, also of one too far; None if there is none at all
+
+
+def scene_named(store: Store, text: str) -> str:
+    """The id of a scene by its id, the beginning of its id, or its name; StoreError if that is none or several."""
+    ids = store.scene_ids()
+    found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
+    found = found or [each for each in ids if _has_name(store, each, text)]
+    if len(found) != 1:
+        held = f"{len(found)} scenes" if found else "no scene"
+        raise StoreError(f"{store.storage.where}: holds {held} that {text!r} stands for; it holds {', '.join(ids)}")
+    return found[0]
+
+
+def _has_name(store: Store, scene_id: str, name: str) -> bool:
+    try:
+        return store.scene(scene_id).spec.name == name
+    except StoreError:  # unreadable: it has to be named by its id
+        return False
+
+
+def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
+    """The samples of some scenes that a query fits, described for the first `limit` of them.
+
+    A scene with another number of movable groups than the vector asked for fits nothing. Raises StoreError.
+    """
+    found = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
+    order = sorted(
+        ((float(d), index, int(row), match) for index, match in found
+         for row, d in zip(match.rows[:limit], match.distance[:limit], strict=True)),
+        key=lambda entry: entry[:3],
+    )  # fmt: skip
+    nearest = [match.nearest for _, match in found if match.nearest is not None]
+    described = tuple(match.describe(row, distance) for distance, _, row, match in order[:limit])
+    return Matches(sum(len(match.rows) for _, match in found), described, min(nearest, default=None))

@@ -1,0 +1,369 @@
+"""The store as the trainer sees it: complete samples, while more of them arrive.
+
+Shape letters: B batch, R rows of the scene, H W image.
+
+A sample is complete when the jobs of its own row, of its view's row and of its modification's row are committed. Rows
+are read straight from the shards, every byte checked against its checksum.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.keys import Key, view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
+from photonfarm.shared.plan.sampling import modification_keys, view_keys
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store.format import markers, schema
+from photonfarm.shared.store.format.shards import Shard
+from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
+from photonfarm.shared.store.read.batch import Batch
+from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.guides import GuideStore, beside, has_guides
+from photonfarm.shared.store.write.plans import StoredPlan
+from photonfarm.shared.store.write.scene_store import SCENES, is_there, read_base, read_spec
+from photonfarm.shared.store.write.store import check_format
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One complete sample, as it is trained on."""
+
+    row: int
+    modification: Modification
+    view: View
+    radiance: F32  # (2, H, W, 3) linear, unscaled; two independent noisy estimates A and B
+    buffers: ViewBuffers
+    visibility: Visibility
+    pass_: int
+    guides: Guides | None = None  # of a reader that reads them
+
+
+GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
+
+OPEN_SHARDS = 400
+"""Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
+
+
+class SceneReader:
+    """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
+
+    def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
+        """Name what to follow; store, scene and plans may appear later. With `guides` as after `follow_guides`."""
+        self._with_guides = guides
+        self._guides: GuideStore | None = None
+        self._guided: set[int] = set()  # jobs whose guides are there
+        self._storage = open_storage(root)
+        self._scene_id = scene_id
+        self._name = f"{SCENES}/{scene_id}"
+        self._spec: SceneSpec | None = None
+        self._arrays: dict[str, schema.ArraySchema] = {}
+        self._plans: list[StoredPlan] = []
+        self.plan_requests: list[dict[str, Any]] = []  # what was asked for with each: all that its rows follow from
+        self._committed: set[int] = set()
+        self._complete = np.zeros(0, np.bool_)
+        self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found complete no longer: a repair
+        self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
+        self._shards = _OpenShards()
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec; raises StoreError while the scene is not there."""
+        if self._spec is None:
+            check_format(self._storage)
+            self._spec = read_spec(self._storage, self._scene_id)
+            self._arrays = schema.output_arrays(self._spec)
+            if self._with_guides:
+                self._guides = GuideStore(self._storage, self._name, self._spec)
+                self._arrays |= schema.guide_arrays(self._spec)
+        return self._spec
+
+    def follow_guides(self) -> None:
+        """Read guides too, from the next refresh on: a sample is complete only if its view has them.
+
+        Raises StoreError while the scene is not there, and SpecError for a scene without guides.
+        """
+        if GuideStore(self._storage, self._name, self.spec).settings() is None:
+            raise SpecError(
+                f"scene {self._scene_id} ({self.spec.name}) has no guides, which an older photonfarm did not render; "
+                f"`photonfarm store upgrade --scene {self._scene_id}` and `photonfarm work` add them, and render no "
+                "sample again"
+            )
+        if not self._with_guides:
+            self._with_guides, self._spec = True, None
+            self._committed, self._complete = set(), np.zeros(0, np.bool_)
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether spec and base are there; the base comes with the scene's first job."""
+        return all(self._storage.exists(f"{self._name}/{name}") for name in ("spec.json", "base/zarr.json"))
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """The rows of all samples that were complete at the last refresh, ascending."""
+        return np.flatnonzero(self._complete)
+
+    @property
+    def planned(self) -> int:
+        """The number of samples in all plans at the last refresh, complete or not."""
+        return sum(plan.samples for plan in self._plans)
+
+    def refresh(self) -> NDArray[np.int64]:
+        """The rows of the samples that have become complete since the last refresh; none while nothing is there.
+
+        Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
+        """
+        self.taken_back = np.zeros(0, np.int64)
+        if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
+            if not self._storage.exists(FORMAT_FILE):
+                return np.zeros(0, np.int64)
+            check_format(self._storage)
+            if not is_there(self._storage, self._scene_id):
+                return np.zeros(0, np.int64)
+        _ = self.spec
+        committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
+        guided = self._guides.committed_jobs() if self._guides else set()
+        self._load_plans()
+        if committed == self._committed and guided == self._guided:
+            return np.zeros(0, np.int64)
+        complete = plans.complete_rows(self._plans, committed)
+        if self._with_guides:
+            complete[complete] = has_guides(self._plans, guided)[self._view_row[complete]]
+        if (self._committed - committed) | (self._guided - guided):  # taken back by a repair
+            self._shards.clear()
+        self._guided = guided
+        before = np.zeros(len(complete), np.bool_)
+        before[: len(self._complete)] = self._complete
+        self._committed, self._complete = committed, complete
+        self.taken_back = np.flatnonzero(before & ~complete)
+        return np.flatnonzero(complete & ~before)
+
+    def _load_plans(self) -> None:
+        known, self._plans = len(self._plans), plans.load_all(self._storage, self._name, self._plans)
+        if len(self._plans) > known:
+            inputs = [plan.rows for plan in self._plans]
+            self._view_row = np.concatenate([rows.sample_view for rows in inputs])
+            self._modification_row = np.concatenate([rows.sample_modification for rows in inputs])
+            self._pass = np.concatenate([rows.sample_pass for rows in inputs])
+            self.plan_requests += [
+                {"first_row": plan.first_row, "samples": plan.samples, "request": plan.request.model_dump(mode="json")}
+                for plan in self._plans[known:]
+            ]
+
+    # ---------------------------------------------------------------------------------------------------------- samples
+
+    def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
+        """Complete samples in the order of `rows`, in the types they are stored in; every byte has been checked.
+
+        They are read into the first places of `out`, and what is returned is these; without, into new memory. Raises
+        CorruptError if their bytes are not what was committed; what `out` holds is then undefined.
+        """
+        chosen = np.asarray(rows, np.int64)
+        self._check_complete(chosen)
+        if out is None:
+            out = Batch.empty(self.spec, len(chosen), guides=self._with_guides)
+        if len(chosen) > len(out):
+            raise ValueError(f"rows: {len(chosen)} samples do not fit a batch of {len(out)}")
+        batch = out.first(len(chosen))
+        batch.rows[:], batch.view_rows[:] = chosen, self._view_row[chosen]
+        batch.modification_rows[:] = self._modification_row[chosen]
+        batch.wide.clear()
+        with store_errors("read samples", self._storage.where):
+            for place, row in enumerate(chosen.tolist()):
+                self._read_radiance(row, place, batch)
+            for name, memory in (*batch.buffers.items(), *batch.guides.items(), *batch.seen.items()):
+                for place, row in enumerate(batch.view_rows.tolist()):
+                    self._read_into(name, row, memory[place])
+        return batch
+
+    def read(self, row: int) -> Sample:
+        """One complete sample; raises CorruptError if its bytes are not what was committed."""
+        batch = self.read_batch([row])
+        buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
+        modification, view, pass_ = self.inputs(row)
+        known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
+        guides = Guides(**known) if known else None
+        seen = ViewBuffers(**buffers), batch.visibility(0)
+        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_, guides)
+        if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
+            raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
+        return sample
+
+    def inputs(self, row: int) -> tuple[Modification, View, int]:
+        """The configuration, the view and the number of the noisy pass of a complete sample."""
+        modification = plans.modification_at(self._plans, self.modification_row(row))
+        return modification, plans.view_at(self._plans, int(self._view_row[row])), int(self._pass[row])
+
+    def read_photons(self, row: int) -> Photons:
+        """The photons of a sample's modification; raises StoreError for a scene without photons."""
+        if not self.spec.photons.paths:
+            raise StoreError(f"scene {self._scene_id} has photons.paths = 0; no photons are stored")
+        modification_row = self.modification_row(row)
+        with store_errors("read photons", self._storage.where):
+            bounce = self._read("photon_bounce", modification_row)
+            floats = [f.name for f in fields(Photons) if f.name != "bounce"]
+            read = {
+                name: self._read(f"photon_{name}", modification_row).astype(np.float32, copy=False) for name in floats
+            }
+        return Photons(**read, bounce=bounce)
+
+    def rows_of_view(self, view_row: int) -> NDArray[np.int64]:
+        """The complete samples that show the view in a row, ascending: its passes."""
+        rows = np.flatnonzero(self._view_row == view_row)
+        rows = rows[rows < len(self._complete)]  # a plan may be younger than the last marker
+        return rows[self._complete[rows]]
+
+    def view_row(self, row: int) -> int:
+        """The row of a sample's view: equal for all its passes."""
+        self._check_complete(np.array([row]))
+        return int(self._view_row[row])
+
+    def modification_row(self, row: int) -> int:
+        """The row of a sample's modification: equal for all samples of one configuration."""
+        self._check_complete(np.array([row]))
+        return int(self._modification_row[row])
+
+    def modification_key(self, row: int) -> Key:
+        """The content key of a sample's configuration, by whose hash samples are held out."""
+        return plans.modification_at(self._plans, self.modification_row(row)).key(self._scene_id)
+
+    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of the configurations of many samples, each hashed once."""
+        chosen = np.asarray(rows, np.int64)
+        self._check_complete(chosen)
+        if not len(chosen):
+            return []
+        distinct, place = np.unique(self._modification_row[chosen], return_inverse=True)
+        keys = modification_keys(self.spec, plans.vectors_at(self._plans, "modification", distinct))
+        return [keys[i] for i in place.tolist()]
+
+    def view_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of the configurations and views of many samples, each hashed once."""
+        of_row = self.modification_keys(rows)
+        if not of_row:
+            return []
+        distinct, first, place = np.unique(self._view_row[np.asarray(rows)], return_index=True, return_inverse=True)
+        vectors = plans.vectors_at(self._plans, "view", distinct)
+        keys = view_keys([of_row[i] for i in first.tolist()], vectors)
+        return [keys[i] for i in place.tolist()]
+
+    def view_key(self, row: int) -> Key:
+        """The content key of a sample's configuration and view: equal for all passes of one view."""
+        modification_key = self.modification_key(row)
+        view = plans.view_at(self._plans, int(self._view_row[row]))
+        return view_key(modification_key, view.vector)
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """Geometry and base point cloud; raises StoreError while they are not there."""
+        return read_base(self._storage, self._name)
+
+    # ----------------------------------------------------------------------------------------------------------- arrays
+
+    def _check_complete(self, rows: NDArray[np.int64]) -> None:
+        if len(rows) and rows.min() >= 0 and rows.max() < len(self._complete) and self._complete[rows].all():
+            return
+        there = (rows >= 0) & (rows < len(self._complete))
+        there[there] = self._complete[rows[there]]
+        if not there.all():
+            raise StoreError(f"row {int(rows[~there][0])} of scene {self._scene_id} is not complete")
+
+    def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
+        shard, within = self._shard("radiance", row)
+        if shard is not None and within in shard:
+            self._read_from(shard, "radiance", row, batch.radiance[place])
+            return
+        batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
+        batch.wide[place] = self._read("radiance_wide", row)
+
+    def _read(self, name: str, row: int) -> NDArray[Any]:
+        array = self._arrays[name]
+        values = np.empty(array.shape, array.dtype)
+        self._read_into(name, row, values)
+        return values
+
+    def _read_into(self, name: str, row: int, values: NDArray[Any]) -> None:
+        shard, within = self._shard(name, row)
+        if shard is None or within not in shard:
+            file = self._file(name, row // self._plans[0].shard_rows)
+            self._storage.require()
+            raise CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
+        self._read_from(shard, name, row, values)
+
+    def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
+        """A row of an open shard; of the file that is there now, where that fails: it may have been repaired since.
+
+        Of a bucket's, of a new copy: this machine's may be damaged.
+        """
+        job, within = divmod(row, self._plans[0].shard_rows)
+        try:
+            shard.read_into(within, values)
+        except CorruptError:
+            renew_copy(self._storage, self._file(name, job))
+            again, _ = self._shard(name, row, anew=True)
+            if again is None or within not in again:
+                raise
+            again.read_into(within, values)
+
+    def _file(self, name: str, job: int) -> str:
+        plan = plans.plan_of(self._plans, job * self._plans[0].shard_rows)
+        if self._guides is not None and name in GUIDE_NAMES:
+            plan = beside(plan, self._guides.name)
+        return plan.shard(name, self._arrays[name], job)
+
+    def _shard(self, name: str, row: int, *, anew: bool = False) -> tuple[Shard | None, int]:
+        """The shard of a row, and which of its rows it is; None if there is none, which may be of radiance alone."""
+        job, within = divmod(row, self._plans[0].shard_rows)
+        shard = None if anew else self._shards.get((name, job))
+        if shard is None:
+            file, array = self._file(name, job), self._arrays[name]
+            if array.kind == "sample" and not self._storage.exists(file):
+                return None, within
+            shard = self._open(file, array)
+            self._shards.put((name, job), shard)
+        return shard, within
+
+    def _open(self, file: str, array: schema.ArraySchema) -> Shard:
+        """A file of the store; of a new copy, if it is a copy and damaged."""
+        shard_rows = self._plans[0].shard_rows
+        try:
+            return Shard(self._storage.local(file), array, shard_rows)
+        except CorruptError:
+            self._storage.require()
+            if not renew_copy(self._storage, file):
+                raise
+        return Shard(self._storage.local(file), array, shard_rows)
+
+
+class _OpenShards:
+    """The shards used last, by array and job; one that is dropped is closed once nobody reads it any more."""
+
+    def __init__(self) -> None:
+        self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[str, int]) -> Shard | None:
+        with self._lock:
+            if key in self._shards:
+                self._shards.move_to_end(key)
+            return self._shards.get(key)
+
+    def put(self, key: tuple[str, int], shard: Shard) -> None:
+        with self._lock:
+            self._shards[key] = shard
+            while len(self._shards) > OPEN_SHARDS:
+                self._shards.popitem(last=False)
+
+    def clear(self) -> None:
+        with self._lock:
+            self._shards.clear()

@@ -1,0 +1,219 @@
+"""The samples of one scene that a query fits, found over the plans' inputs at once.
+
+Shape letters: R rows of a scene, N rows that match, G movable groups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.core.keys import Key, view_key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import UNUSED
+from photonfarm.shared.plan.sampling import modification_keys, view_keys
+from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.format.shards import Shard
+from photonfarm.shared.store.io.storage import renew_copy
+from photonfarm.shared.store.read.query import Query
+from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.guides import beside
+from photonfarm.shared.store.write.plans import StoredPlan
+from photonfarm.shared.store.write.scene_store import SceneStore
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a row of an array lies."""
+
+    array: str
+    file: str  # its name in the store
+    chunk: int  # the inner chunk of that shard
+    index: int  # along the first axis of the plan's array
+    there: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSample:
+    """A sample and all that is known of it without reading it."""
+
+    scene_id: str
+    scene_name: str
+    key: str
+    row: int
+    pass_: int
+    modification_row: int
+    modification_key: str
+    modification: tuple[tuple[float, ...], ...]  # G times x, y, z, present
+    view_row: int
+    view_key: str
+    view: tuple[float, ...]  # camera position, look-at point
+    distance: float  # of the positions asked for, the farthest, in scene units
+    plan: int
+    jobs: tuple[int, ...]  # of its own row, its view's and its modification's
+    committed: tuple[bool, ...]  # these jobs
+    guided: bool | None  # whether its view has guides, by its job's marker; None: the scene is to have none
+    places: tuple[Place, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of its jobs are committed."""
+        return all(self.committed)
+
+
+class SceneMatch:
+    """The samples of one scene that a query fits: their rows (N,), nearest first, and their distances (N,)."""
+
+    rows: NDArray[np.int64]
+    distance: F64
+
+    def __init__(self, scene: SceneStore, query: Query) -> None:
+        """Look; over the plans' inputs at once."""
+        self._scene = scene
+        self._plans = scene.plans()
+        self._committed: set[int] | None = None
+        self.nearest: float | None = None  # distance, also where it is too far
+        self.rows, self.distance = np.zeros(0, np.int64), np.zeros(0)
+        if self._plans:
+            self._look(query)
+
+    def _look(self, query: Query) -> None:
+        modification, view = (_inputs(self._plans, f"sample_{name}") for name in ("modification", "view"))
+        rows = np.flatnonzero(modification != UNUSED)
+        if query.row is not None:
+            rows = rows[rows == query.row]
+        if query.job is not None:
+            rows = rows[rows // self._plans[0].shard_rows == query.job]
+        if query.sample is not None:
+            wanted = np.frombuffer(query.sample, "<u8")
+            rows = rows[(_inputs(self._plans, "sample_key")[rows].view("<u8") == wanted).all(axis=1)]
+        distance = np.zeros(len(rows))
+        for condition, references, of_row in (
+            (query.modification, modification, self._from_modification),
+            (query.view, view, self._from_view),
+        ):
+            if condition is not None and len(rows):
+                distinct, place = np.unique(references[rows], return_inverse=True)
+                distance = np.maximum(distance, of_row(distinct, condition, modification, view)[place])
+        if np.isfinite(distance).any():
+            self.nearest = float(distance.min())
+        fits = distance <= query.tolerance
+        order = np.argsort(distance[fits], kind="stable")
+        self.rows, self.distance = rows[fits][order], distance[fits][order]
+
+    def _from_modification(self, rows: NDArray[np.int64], wanted: F32 | Key, *_: NDArray[np.int64]) -> F64:
+        """How far the modifications in some rows are from the one asked for; infinite if they are not alike."""
+        vectors = _inputs(self._plans, "modification")[rows]
+        if isinstance(wanted, bytes):
+            return _unless_equal(modification_keys(self._scene.spec, vectors), wanted)
+        if wanted.size != vectors[0].size:
+            return np.full(len(rows), np.inf)
+        target = wanted.reshape(vectors.shape[1:])
+        distance = np.linalg.norm(vectors[..., :3].astype(np.float64) - target[:, :3], axis=-1).max(axis=1, initial=0)
+        return np.where(((vectors[..., 3] != 0) == (target[:, 3] != 0)).all(axis=1), distance, np.inf)
+
+    def _from_view(
+        self, rows: NDArray[np.int64], wanted: F32 | Key, modification: NDArray[np.int64], view: NDArray[np.int64]
+    ) -> F64:
+        """How far the views in some rows are from the one asked for, by the farther of position and look-at point."""
+        vectors = _inputs(self._plans, "view")[rows]
+        if not isinstance(wanted, bytes):
+            apart = (vectors.astype(np.float64) - wanted).reshape(-1, 2, 3)
+            return np.asarray(np.linalg.norm(apart, axis=-1).max(axis=1))
+        seen, first = np.unique(view, return_index=True)  # by some sample
+        of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
+        keys = modification_keys(self._scene.spec, of_view)
+        return _unless_equal(view_keys(keys, vectors), wanted)
+
+    # ------------------------------------------------------------------------------------------------------- describing
+
+    def describe(self, row: int, distance: float) -> FoundSample:
+        """All that is known of the sample in a row."""
+        sample = plans.sample_at(self._plans, row)
+        if sample is None:
+            raise StoreError(f"row {row} of scene {self._scene.scene_id} is not used")
+        if self._committed is None:
+            self._committed = self._scene.committed_jobs()
+        modification = plans.modification_at(self._plans, sample.modification_row)
+        view = plans.view_at(self._plans, sample.view_row)
+        key = modification.key(self._scene.scene_id)
+        plan = plans.plan_of(self._plans, row)
+        rows = {"sample": row, "view": sample.view_row, "modification": sample.modification_row}
+        jobs = tuple(each // plan.shard_rows for each in rows.values())
+        return FoundSample(
+            scene_id=self._scene.scene_id,
+            scene_name=self._scene.spec.name,
+            key=sample.key.hex(),
+            row=row,
+            pass_=sample.pass_,
+            modification_row=sample.modification_row,
+            modification_key=key.hex(),
+            modification=tuple(tuple(map(float, group)) for group in modification.vector),
+            view_row=sample.view_row,
+            view_key=view_key(key, view.vector).hex(),
+            view=tuple(map(float, view.vector)),
+            distance=distance,
+            plan=plan.number,
+            jobs=jobs,
+            committed=tuple(job in self._committed for job in jobs),
+            guided=self._guided(jobs[1]),
+            places=(*self._places(rows), *self._guide_places(sample.view_row)),
+        )
+
+    def _guided(self, job: int) -> bool | None:
+        guides = self._scene.guides
+        return None if guides.settings() is None else guides.is_committed(job)
+
+    def _places(self, rows: dict[str, int]) -> list[Place]:
+        found = []
+        for name, array in schema.output_arrays(self._scene.spec).items():
+            row = rows[array.kind]
+            place = self._place(plans.plan_of(self._plans, row), name, array, row)
+            if place.there or name != "radiance_wide":  # which few samples need
+                found.append(place)
+        if any(place.array == "radiance_wide" for place in found):  # and those have nothing in the other
+            found = [place for place in found if place.array != "radiance" or place.there]
+        return found
+
+    def _guide_places(self, view_row: int) -> list[Place]:
+        """Those of the guides of a view; none if the scene is to have none."""
+        if self._scene.guides.settings() is None:
+            return []
+        plan = beside(plans.plan_of(self._plans, view_row), self._scene.guides.name)
+        arrays = schema.guide_arrays(self._scene.spec)
+        return [self._place(plan, name, array, view_row) for name, array in arrays.items()]
+
+    def _place(self, plan: StoredPlan, name: str, array: schema.ArraySchema, row: int) -> Place:
+        job, chunk = divmod(row, plan.shard_rows)
+        file = plan.shard(name, array, job)
+        return Place(name, file, chunk, row - plan.first_row, self._is_there(file, array, chunk, plan.shard_rows))
+
+    def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
+        storage = self._scene.storage
+        if not storage.exists(file):
+            return False
+        try:
+            return chunk in Shard(storage.local(file), array, shard_rows)
+        except CorruptError:
+            if not renew_copy(storage, file):
+                return False
+        try:
+            return chunk in Shard(storage.local(file), array, shard_rows)
+        except CorruptError:
+            return False
+
+
+def _inputs(found: list[StoredPlan], name: str) -> NDArray[Any]:
+    """One input of all rows of a scene, (R, …)."""
+    return np.concatenate([getattr(plan.rows, name) for plan in found])
+
+
+def _unless_equal(keys: Sequence[Key], wanted: Key) -> F64:
+    return np.where([key == wanted for key in keys], 0.0, np.inf)

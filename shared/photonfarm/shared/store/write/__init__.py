@@ -1,0 +1,1 @@
+"""Writing: plans, a job's rows and its commit, guides, and what is set aside."""

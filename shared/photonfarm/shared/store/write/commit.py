@@ -1,0 +1,404 @@
+"""One job's outputs on their way into the store: row by row while it is rendered, and then all at once.
+
+Rows are written by a thread of their own, so that rendering does not wait for the disk, to parts that nobody sees; the
+commit names them, makes them durable, and announces them by the job's marker.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from types import TracebackType
+from typing import Any, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, store_errors
+from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store.format import markers, schema
+from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
+from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
+from photonfarm.shared.store.write.findings import Cause, Finding
+from photonfarm.shared.store.write.plans import JobRows, StoredPlan
+from photonfarm.shared.store.write.quarantine import Quarantine
+
+WAITING_ROWS = 8
+"""Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
+
+
+T = TypeVar("T")
+
+ATTEMPTS = 3
+"""At a commit among others that change the job's files; a second one takes two of them at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What a job cost and how it went; kept in its marker."""
+
+    core_s: float  # processor time, all threads
+    wall_s: float
+    redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
+    worker: str
+    versions: Mapping[str, str]
+
+
+Clock = Callable[[], datetime]
+
+
+def _utc_now() -> datetime:
+    return datetime.now(UTC)
+
+
+class Committed(Protocol):
+    """What files are committed to: a scene, or its guides."""
+
+    @property
+    def storage(self) -> Storage:
+        """Where it lies."""
+
+    @property
+    def name(self) -> str:
+        """Of its folder, which has plans and markers."""
+
+    @property
+    def scene_id(self) -> str:
+        """The scene's id."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    def is_committed(self, job: int) -> bool:
+        """Whether a job has its marker there."""
+
+
+class RowWriter(ABC):
+    """Takes rows of a job's arrays in any order, and commits them once all are there: into a `Committed`.
+
+    A context manager: leaving it without `commit` leaves nothing behind. Arrays that are given must not be changed
+    afterwards. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
+    StoreError once the disk has refused something.
+    """
+
+    def __init__(
+        self, scene: Committed, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
+    ) -> None:
+        """Begin; `plan` tells in which folder the arrays lie."""
+        self._scene = scene
+        self._rows = rows
+        self._plan = plan
+        self._storage = scene.storage
+        self._arrays = arrays
+        self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
+        self._shards: dict[str, ShardWriter] = {}
+        self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """The writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the thread and remove what has not been committed, if the disk lets us: a sweep does it otherwise."""
+        self._join()
+        for shard in self._shards.values():
+            with contextlib.suppress(OSError):  # why a disk refuses is told by the error that is under way
+                shard.close()
+            discard(shard.part)
+
+    # ------------------------------------------------------------------------------------------------------------- rows
+
+    def _claim(self, kind: schema.Kind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
+        if row not in expected or row in self._given[kind]:
+            raise IncompleteError(f"{what} of job {self._rows.job}: row {row} is not the job's, or is there already")
+        self._given[kind].add(row)
+
+    def _put(self, row: int, name: str, values: NDArray[Any]) -> None:
+        array = self._arrays[name]
+        if values.shape != array.shape:
+            raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
+        if not _stays_finite(values, array.dtype):
+            raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
+        self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
+        self._raise_error()
+
+    def _write(self) -> None:
+        """The thread: after an error it only empties the queue, so that nobody waits for it."""
+        while (taken := self._waiting.get()) is not None:
+            if self._error is not None:
+                continue
+            name, row, content = taken
+            try:
+                if name not in self._shards:
+                    self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
+                self._shards[name].append(row, content)
+            except Exception as error:
+                self._error = error
+
+    def _join(self) -> None:
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            with self._errors():
+                raise self._error
+
+    def _errors(self) -> contextlib.AbstractContextManager[None]:
+        return store_errors(f"commit job {self._rows.job}", self._storage.where)
+
+    # ----------------------------------------------------------------------------------------------------------- commit
+
+    def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
+        """Make the rows part of the store, all or nothing; False if another worker's commit came first.
+
+        False too if a repair has set aside files that we had named already, with a commit that relied on them, say; the
+        job is missing then, and rendered again.
+
+        Files that another writer left are kept where every row of the job can be read from them and ours, and are
+        replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError
+        if others go on changing the files meanwhile. `clock` tells when a marker of other files is set aside.
+
+        Who meets files of others may meet those at work too: a repair, which has taken the marker back, and goes on to
+        move the files, and a writer that replaces what it cannot read. Each acts first and looks then, so that one of
+        two sees the other: a repair looks for a new marker once it has moved the files, and we compare marker and files
+        once the marker is placed. Who meets nobody compares nothing, and only looks whether the files are still there:
+        however long ago they were named, others may have committed them since, and a repair may have moved them.
+        """
+        self._check_complete()
+        self._join()
+        self._raise_error()
+        with self._errors():
+            ours = {name: shard.finish() for name, shard in self._shards.items()}
+            for _ in range(ATTEMPTS):
+                if self._scene.is_committed(self._rows.job):
+                    return False
+                alone = self._adopt_all()
+                if alone is None:
+                    return False
+                described = ours if alone else self._summaries()
+                self._storage.settle([self._file(name) for name in described])
+                if not alone and not (self._is_readable() and self._summaries() == described):
+                    continue
+                placed = self._place(described, figures)
+                if (placed and alone and self._are_there(described)) or self._is_marker_right(clock):
+                    return placed
+            raise CorruptError(
+                f"{self._storage.where}/{self._scene.name}: the files of job {self._rows.job} change while it is "
+                "committed, by a repair or another worker; it is not committed"
+            )
+
+    def _adopt_all(self) -> bool | None:
+        """Have every row of the job lie under its names; whether all files are ours.
+
+        None if the job is committed, or files of ours are set aside.
+        """
+        self._storage.require()  # a store that is gone has none of our parts either, and they are not adopted
+        left = [name for name, shard in self._shards.items() if shard.part.exists()]
+        kept = [name for name in left if not self._adopt(name)]
+        others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
+        if not kept and not others and len(left) == len(self._shards):
+            return True
+        if not self._is_readable():
+            # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
+            if self._scene.is_committed(self._rows.job) or self._is_set_aside():
+                return None
+            for name in kept:
+                self._adopt(name, replace=True)
+            self._check_readable()
+        return False
+
+    def _adopt(self, name: str, *, replace: bool = False) -> bool:
+        return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
+
+    def _is_set_aside(self) -> bool:
+        """Whether a file that we have named is gone: only a repair moves one."""
+        self._storage.require()
+        named = [name for name, shard in self._shards.items() if not shard.part.exists()]
+        return not self._are_there(named)
+
+    def _are_there(self, names: Iterable[str]) -> bool:
+        return all(self._storage.exists(self._file(name)) for name in names)
+
+    def _summaries(self) -> dict[str, dict[str, Any]]:
+        """Size and checksum of the files that are there, by array; none of those that cannot be read."""
+        found = {}
+        for name in self._arrays:
+            if self._storage.exists(self._file(name)):
+                with contextlib.suppress(CorruptError):  # moved in the meantime
+                    found[name] = self._look(name, Shard.summary)
+        return found
+
+    def _place(self, described: Mapping[str, Mapping[str, Any]], figures: Figures) -> bool:
+        files = {self._file(name): about for name, about in described.items()}
+        return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
+
+    def _is_marker_right(self, clock: Clock) -> bool:
+        """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside.
+
+        A file that it does not name takes nothing from those that it does: a writer that was late, and whose render
+        needs float32, has added it. Only `radiance` would be read instead of `radiance_wide`.
+        """
+        name = markers.name_of(self._scene.name, self._rows.job)
+        try:
+            marker = self._storage.read(name)
+        except FileNotFoundError:  # a repair has seen it first
+            return False
+        told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
+        wrong = self._told_wrong(told)
+        renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
+        if any(renewed):
+            wrong = self._told_wrong(told)
+        if not wrong:
+            return True
+        detail = "files were moved or replaced while the job was committed; those that are there stay"
+        why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
+        when = clock().isoformat(timespec="seconds")
+        Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
+        return False
+
+    def _told_wrong(self, told: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """The arrays whose files are not what a marker tells of them."""
+        there = self._summaries()
+        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
+        return [name for name in relevant if not _is_told(told.get(self._plan_file(name)), there.get(name))]
+
+    def _plan_file(self, name: str) -> str:
+        return self._file(name).removeprefix(f"{self._scene.name}/")
+
+    @abstractmethod
+    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+        """What must be given of each kind of rows: what it is called, and the rows."""
+
+    def _check_complete(self) -> None:
+        for kind, (what, rows) in self._expected().items():
+            if missing := rows - self._given[kind]:
+                raise IncompleteError(f"{what} of job {self._rows.job}: row {min(missing)} is missing")
+
+    def _file(self, name: str) -> str:
+        return self._plan.shard(name, self._arrays[name], self._rows.job)
+
+    def _shard(self, name: str) -> Shard:
+        return Shard(self._storage.local(self._file(name)), self._arrays[name], self._plan.shard_rows)
+
+    def _look(self, name: str, look: Callable[[Shard], T]) -> T:
+        """What a look at an array's file gives; of a bucket's, at a new copy where this machine's is damaged."""
+        try:
+            return look(self._shard(name))
+        except CorruptError:
+            if not renew_copy(self._storage, self._file(name)):
+                raise
+        return look(self._shard(name))
+
+    def _is_readable(self) -> bool:
+        try:
+            self._check_readable()
+        except CorruptError:
+            return False
+        return True
+
+    @abstractmethod
+    def _check_readable(self) -> None:
+        """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
+
+    def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
+        """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
+        if not wanted:
+            return set()
+        rows = self._plan.shard_rows
+        missing = self._look(name, lambda shard: {row for row in wanted if shard.read(row % rows) is None})
+        if missing and not may_be_missing:
+            raise CorruptError(f"{self._storage.where}/{self._file(name)}: row {min(missing)} is missing")
+        return missing
+
+
+class JobWriter(RowWriter):
+    """Takes what a job renders: radiance of its samples, what its new views show, photons of new modifications."""
+
+    def __init__(self, scene: Committed, rows: JobRows, plan: StoredPlan) -> None:
+        """Begin; `SceneStore.job_writer` calls this."""
+        super().__init__(scene, rows, plan, schema.output_arrays(scene.spec))
+
+    def radiance(self, row: int, halves: F32) -> None:
+        """The half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
+        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
+        self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
+
+    def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
+        """What a new view row shows: its buffers, and which points and photons it sees."""
+        self._claim("view", row, "view", self._rows.new_views)
+        for name, values in arrays_of(buffers).items():
+            self._put(row, name, values)
+        self._put_bits(row, "point_seen", visibility.points)
+        self._put_bits(row, "photon_seen", visibility.photons)
+
+    def photons(self, row: int, photons: Photons) -> None:
+        """The photons of a new modification row."""
+        self._claim("modification", row, "photons", self._photon_rows())
+        for name, values in arrays_of(photons).items():
+            self._put(row, f"photon_{name}", values)
+
+    def _photon_rows(self) -> frozenset[int]:
+        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
+
+    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
+        count = schema.bit_counts(self._scene.spec)[name]
+        if seen.shape != (count,):
+            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
+        if count:
+            self._put(row, name, np.packbits(seen, bitorder="little"))
+
+    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+        return {
+            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
+            "view": ("view", self._rows.new_views),
+            "modification": ("photons", self._photon_rows()),
+        }
+
+    def _check_readable(self) -> None:
+        """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
+        wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
+        for name, array in self._arrays.items():
+            if array.kind != "sample":
+                self._check_rows(name, wanted[array.kind])
+        samples = {sample.row for sample in self._rows.samples}
+        if self._storage.exists(self._file("radiance")):
+            samples = self._check_rows("radiance", samples, may_be_missing=True)
+        self._check_rows("radiance_wide", samples)
+
+
+def _is_told(told: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
+    """Whether a marker says of a file what it is: size and checksum, or that there is none."""
+    return told == there if told is None or there is None else all(told[key] == there[key] for key in there)
+
+
+def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
+    """Which array takes a sample, and what it is given: scaled, or as it is where float16 cannot hold that."""
+    with np.errstate(over="ignore", under="ignore"):
+        scaled = radiance * np.float32(2.0**exponent)
+    return ("radiance", scaled) if _stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
+
+
+def _stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
+    """Whether all values are finite in the type that they are stored in, to which the writer's thread rounds them.
+
+    65504 is the largest float16 and 65520 the first number that rounds to infinity; likewise for float32. NaN is in no
+    range.
+    """
+    if stored.kind != "f":
+        return True
+    end = {2: 65520.0, 4: 2.0**128 - 2.0**103}[stored.itemsize]
+    return -end < float(values.min()) and float(values.max()) < end

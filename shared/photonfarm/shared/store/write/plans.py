@@ -1,0 +1,307 @@
+"""Plans as they lie in the store: written once aside and renamed into place, then only read.
+
+Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job r // J.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from photonfarm.shared.core.errors import CorruptError, store_errors
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.request import UNUSED, Expansion, Known, PlannedRows, Request, expand
+from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store.format import declarations, schema
+from photonfarm.shared.store.io.storage import Storage
+
+PLANS = "plans"
+NAME_DIGITS = 6
+
+MISSING = (
+    "the plan is missing, or its zarr.json is; it says what the rows of its jobs are, and cannot be made anew: put the "
+    "folder back from a copy of the store"
+)
+"""Of a plan."""
+
+RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a copy of the store"
+"""What helps a plan whose request cannot be read."""
+
+REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
+"""What helps against most damage of a plan."""
+
+_REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredPlan:
+    """One plan of a scene with its inputs in memory."""
+
+    number: int
+    folder: str  # its name in the storage
+    request: Request | TopUp
+    first_job: int
+    jobs: int
+    shard_rows: int
+    rows: PlannedRows
+
+    @property
+    def end_job(self) -> int:
+        """Number of the job after its last."""
+        return self.first_job + self.jobs
+
+    @property
+    def first_row(self) -> int:
+        """Number of its first row, in the scene."""
+        return self.first_job * self.shard_rows
+
+    @property
+    def end_row(self) -> int:
+        """Number of the row after its last."""
+        return self.end_job * self.shard_rows
+
+    @property
+    def samples(self) -> int:
+        """How many samples it holds; the rest of its last job's rows is unused."""
+        return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
+
+    def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
+        """The file of one job's rows of an array."""
+        return f"{self.folder}/{name}/{array.shard_name(job - self.first_job)}"
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What the attributes of a plan's group tell."""
+
+    request: Request | TopUp
+    first_job: int
+    jobs: int
+    shard_rows: int
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRow:
+    """The inputs of one sample."""
+
+    row: int
+    modification_row: int
+    view_row: int
+    pass_: int
+    key: Key
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobRows:
+    """What one job must produce, and every input that it refers to, also in older plans."""
+
+    job: int
+    samples: tuple[SampleRow, ...]  # by modification, view and pass
+    modifications: dict[int, Modification]  # by row: all that the samples refer to
+    views: dict[int, View]  # by row: all that the samples refer to
+    new_modifications: frozenset[int]  # rows whose photons this job produces
+    new_views: frozenset[int]  # rows whose buffers this job produces
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def folder(scene: str, number: int) -> str:
+    """The folder of a plan, in the scene's."""
+    return f"{scene}/plans/{number:0{NAME_DIGITS}d}"
+
+
+def expanded(
+    spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
+) -> Expansion:
+    """The rows of a request that the plans before it do not have: a function of these, the same each time."""
+    known = Known((plan.first_row, plan.rows) for plan in before)
+    if isinstance(request, TopUp):
+        return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
+    return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
+
+
+def build(
+    part: Path, spec: SceneSpec, request: Request | TopUp, rows: PlannedRows, *, first_job: int, shard_rows: int
+) -> None:
+    """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
+    import zarr
+
+    from photonfarm.shared.store.write.staging import group_in
+
+    count = len(rows.sample_modification)
+    attributes: Any = {
+        **declarations.stamp(),
+        "scene": spec.scene_id,
+        "request": request.model_dump(mode="json"),
+        "first_job": first_job,
+        "jobs": count // shard_rows,
+        "shard_rows": shard_rows,
+    }
+    with group_in(part) as store:
+        group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+        for declared in declarations.PLAN_INPUTS:
+            schema.create_input(group, declared, getattr(rows, declared.name))
+        schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
+
+
+def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
+    """The plans of a scene in order, those already loaded taken over; all, or those before number `until`.
+
+    Raises CorruptError if one of them is missing or is not as it was written: later rows refer to its rows, and a plan
+    that is left out would be planned again without end.
+    """
+    with store_errors("read the plans", f"{storage.where}/{scene}"):
+        end = count(storage, scene, len(loaded)) if until is None else until
+        return loaded + [_load(storage, scene, n) for n in range(len(loaded), end)]
+
+
+def count(storage: Storage, scene: str, loaded: int = 0) -> int:
+    """How many plans a scene must have, by the last one's number; the first `loaded` are known to be there.
+
+    The last one does not count yet while it is being written, which can be seen in a bucket alone: it is claimed there,
+    and its zarr.json comes last.
+    """
+    names = [name for name in storage.names(f"{scene}/{PLANS}") if name.isascii() and name.isdecimal()]
+    found = max((int(name) + 1 for name in names if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
+    if found <= loaded:
+        return loaded
+    last = folder(scene, found - 1)
+    is_being_written = not storage.exists(f"{last}/zarr.json") and storage.exists(f"{last}.claim")
+    return found - 1 if is_being_written else found
+
+
+def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
+    """A plan with its inputs; raises CorruptError if it is not as it was written."""
+    import zarr
+
+    name = folder(scene, number)
+    try:
+        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+        check_version(group.attrs, f"{storage.where}/{name}")
+        names = [field.name for field in fields(PlannedRows)]
+        rows = PlannedRows(**{each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in names})
+        about = about_plan(dict(group.attrs))
+    except FileNotFoundError as error:
+        raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
+    except (ValueError, KeyError, RuntimeError) as error:
+        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
+    return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+
+
+def reason(error: Exception) -> str:
+    """One line of why a plan cannot be read."""
+    if isinstance(error, ValidationError):
+        return "; ".join(sentences(error))
+    return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+
+
+def check_version(attributes: Mapping[str, Any], where: str) -> None:
+    """Return for the attributes of a plan of this program's version; raises StoreError, with a sentence."""
+    declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
+
+
+def about_plan(attributes: dict[str, Any]) -> About:
+    """The attributes of a plan's group; raises ValueError or KeyError."""
+    request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # of a later program
+    return About(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
+
+
+def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
+    """The plan that a row belongs to."""
+    for plan in reversed(plans):
+        if plan.first_row <= row < plan.end_row:
+            return plan
+    raise IndexError(f"row {row} belongs to no plan of this scene")
+
+
+def modification_at(plans: list[StoredPlan], row: int) -> Modification:
+    """The modification in a modification row."""
+    plan = plan_of(plans, row)
+    return Modification.from_vector(plan.rows.modification[row - plan.first_row])
+
+
+def view_at(plans: list[StoredPlan], row: int) -> View:
+    """The view in a view row."""
+    plan = plan_of(plans, row)
+    return View.from_vector(plan.rows.view[row - plan.first_row])
+
+
+def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
+    """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
+    of_row = np.searchsorted([plan.first_row for plan in plans], rows, side="right") - 1
+    vectors = np.empty((len(rows), *getattr(plans[0].rows, kind).shape[1:]), np.float32)
+    for number, plan in enumerate(plans):
+        own = of_row == number
+        vectors[own] = getattr(plan.rows, kind)[rows[own] - plan.first_row]
+    return vectors
+
+
+def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
+    """The inputs of the sample in a row; None for an unused row."""
+    plan = plan_of(plans, row)
+    inputs, i = plan.rows, row - plan.first_row
+    if inputs.sample_modification[i] == UNUSED:
+        return None
+    return SampleRow(
+        row,
+        int(inputs.sample_modification[i]),
+        int(inputs.sample_view[i]),
+        int(inputs.sample_pass[i]),
+        inputs.sample_key[i].tobytes(),
+    )
+
+
+def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
+    """Everything that one job needs; raises IndexError for a job of no plan."""
+    for plan in plans:
+        if plan.first_job <= job < plan.first_job + plan.jobs:
+            break
+    else:
+        raise IndexError(f"job {job} belongs to no plan of this scene")
+    own = range(job * plan.shard_rows, (job + 1) * plan.shard_rows)
+    samples = [sample for row in own if (sample := sample_at(plans, row))]
+    samples.sort(key=lambda s: (s.modification_row, s.view_row, s.pass_))
+    modifications = {s.modification_row: modification_at(plans, s.modification_row) for s in samples}
+    views = {s.view_row: view_at(plans, s.view_row) for s in samples}
+    return JobRows(
+        job,
+        tuple(samples),
+        modifications,
+        views,
+        frozenset(row for row in modifications if row in own),
+        frozenset(row for row in views if row in own),
+    )
+
+
+def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:
+    """Whether each row of the scene holds a complete sample, (rows of all plans,).
+
+    That is one whose own job, whose view's job and whose modification's job are committed.
+    """
+    if not plans:
+        return np.zeros(0, np.bool_)
+    shard_rows = plans[0].shard_rows
+    done = np.zeros(plans[-1].first_job + plans[-1].jobs, np.bool_)
+    done[[job for job in committed if job < len(done)]] = True
+    complete = np.zeros(plans[-1].end_row, np.bool_)
+    for plan in plans:
+        modification, view = plan.rows.sample_modification, plan.rows.sample_view
+        own = np.arange(plan.first_row, plan.end_row)
+        complete[plan.first_row : plan.end_row] = (
+            (modification != UNUSED)
+            & done[own // shard_rows]
+            & done[view // shard_rows]
+            & done[modification // shard_rows]
+        )
+    return complete

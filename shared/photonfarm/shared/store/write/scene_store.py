@@ -1,0 +1,287 @@
+"""One scene of a store as those see it who plan and render: its spec, plans, jobs, base and markers.
+
+Plans and markers are the truth. Nothing here needs a lock: a name appears once, and the first one stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.store.format import declarations, markers, schema
+from photonfarm.shared.store.io.storage import Storage
+from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.commit import JobWriter
+from photonfarm.shared.store.write.guides import GuideStore, GuideWriter, has_guides
+from photonfarm.shared.store.write.plans import JobRows, StoredPlan
+
+SCENES = "scenes"
+_SCENE_ID = re.compile("[0-9a-f]{32}")
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """What became of a request."""
+
+    scene_id: str
+    plan: int | None  # number of the new plan; None if nothing was new, or nothing was written
+    new: int  # samples planned now
+    known: int  # samples of the request that older plans hold
+    jobs: int  # jobs of the new plan
+    extent: Extent  # as of `Expansion`
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a scene is, in samples."""
+
+    planned_samples: int
+    committed_samples: int  # complete ones
+    usable_samples: int  # of these, those whose view lacks no guides, where the scene is to have some
+    planned_passes: int  # of the planned samples, further passes: those that top-ups planned
+    committed_passes: int  # of these, the complete ones
+
+
+class SceneStore:
+    """One scene of a store."""
+
+    def __init__(self, storage: Storage, scene_id: str) -> None:
+        """Open; raises StoreError if there is no such scene."""
+        self.storage = storage
+        self.scene_id = scene_id
+        self.name = f"{SCENES}/{scene_id}"  # of its folder
+        self.spec = read_spec(storage, scene_id)
+        self.guides = GuideStore(storage, self.name, self.spec)
+        self._plans: list[StoredPlan] = []
+
+    @property
+    def folder(self) -> Path:
+        """The scene's folder, of a store on this machine's file system."""
+        return self.storage.local(self.name)
+
+    # ------------------------------------------------------------------------------------------------------------ plans
+
+    def plans(self) -> list[StoredPlan]:
+        """The plans that are there by now, in order."""
+        self._plans = plans.load_all(self.storage, self.name, self._plans)
+        return self._plans
+
+    def plan(self, request: Request | TopUp, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
+        """Plan what is new of a request; racing submitters try again, each against the other's plan.
+
+        Raises SpecError for a request or a number of rows that cannot be, and CorruptError if a plan is missing.
+        """
+        while True:
+            last = {name: max(markers.jobs(self.storage, name), default=-1) for name in (self.name, self.guides.name)}
+            found = self.plans()  # after the markers: each one's plan is there by now
+            rows_per_job = self._shard_rows(found, shard_rows)
+            first_job = found[-1].end_job if found else 0
+            for name, job in last.items():
+                if job >= first_job:
+                    raise CorruptError(
+                        f"{self.storage.where}/{markers.name_of(name, job)}: no plan has this job, and a new one "
+                        "would: `photonfarm store check` tells whether the last plan is missing"
+                    )
+            expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
+            if expansion.rows is None or dry_run:
+                return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
+            with store_errors("write a plan", self.storage.where):
+                built = self.storage.part()
+                try:
+                    plans.build(built, self.spec, request, expansion.rows, first_job=first_job, shard_rows=rows_per_job)
+                    if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
+                        jobs = len(expansion.rows.sample_pass) // rows_per_job
+                        new, known, extent = expansion.new, expansion.known, expansion.extent
+                        return PlanResult(self.scene_id, len(found), new, known, jobs, extent)
+                finally:
+                    shutil.rmtree(built, ignore_errors=True)
+
+    def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
+        if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
+            raise SpecError(f"shard_rows = {wanted}: 1 to {MAX_SHARD_ROWS} samples per job are allowed")
+        if not found:
+            return wanted or SHARD_ROWS
+        if wanted not in (None, found[0].shard_rows):
+            raise SpecError(
+                f"shard_rows = {wanted}: scene {self.scene_id} has {found[0].shard_rows} samples per job, fixed by its "
+                "first plan; leave the setting out"
+            )
+        return found[0].shard_rows
+
+    # ------------------------------------------------------------------------------------------------------------- jobs
+
+    def job_rows(self, job: int) -> JobRows:
+        """What a job must produce, with its inputs; raises IndexError for a job of no plan."""
+        if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
+            self.plans()
+        return plans.job_rows(self._plans, job)
+
+    def job_writer(self, job: int) -> JobWriter:
+        """What takes a job's outputs and commits them; raises IndexError for a job of no plan."""
+        rows = self.job_rows(job)
+        return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
+
+    def guide_writer(self, job: int) -> GuideWriter:
+        """What takes the guides of a job's new views and commits them; raises IndexError for a job of no plan."""
+        rows = self.job_rows(job)
+        return self.guides.writer(rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
+
+    def jobs(self) -> int:
+        """How many jobs are planned; they are numbered from 0."""
+        found = self.plans()
+        return found[-1].end_job if found else 0
+
+    def committed_jobs(self) -> set[int]:
+        """The jobs that have their marker."""
+        return markers.jobs(self.storage, self.name)
+
+    def missing_jobs(self) -> list[int]:
+        """The jobs that are planned and not committed, or lack the guides that the scene has, in order."""
+        committed = self.committed_jobs()
+        missing = {job for job in range(self.jobs()) if job not in committed}
+        return sorted(missing.union(self.guides.lacks(self._plans)))
+
+    def is_committed(self, job: int) -> bool:
+        """Whether a job has its marker."""
+        return self.storage.exists(markers.name_of(self.name, job))
+
+    def is_done(self, job: int) -> bool:
+        """Whether a job is committed, and lacks no guides."""
+        return self.is_committed(job) and not self.guides.lacks_job(self.job_rows(job))
+
+    def marker(self, job: int) -> dict[str, Any]:
+        """The marker of a committed job: its files and its figures."""
+        return markers.read(self.storage, self.name, job)
+
+    def progress(self) -> Progress:
+        """How far the scene is; costs one listing of the markers, and of those of guides."""
+        committed, guided = self.committed_jobs(), self.guides.committed_jobs()
+        found = self.plans()
+        complete = plans.complete_rows(found, committed)
+        usable = complete.copy()
+        if self.guides.settings() is not None and found:
+            view_row = np.concatenate([plan.rows.sample_view for plan in found])
+            usable[complete] = has_guides(found, guided)[view_row[complete]]
+        further = [plan for plan in found if isinstance(plan.request, TopUp)]
+        return Progress(
+            planned_samples=sum(plan.samples for plan in found),
+            committed_samples=int(np.count_nonzero(complete)),
+            usable_samples=int(np.count_nonzero(usable)),
+            planned_passes=sum(plan.samples for plan in further),
+            committed_passes=sum(int(np.count_nonzero(complete[p.first_row : p.end_row])) for p in further),
+        )
+
+    # ------------------------------------------------------------------------------------------------------------- base
+
+    def has_base(self) -> bool:
+        """Whether geometry and base cloud are complete."""
+        return self.storage.exists(f"{self.name}/base/zarr.json")
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """Geometry and base point cloud; raises StoreError while they are not there."""
+        return read_base(self.storage, self.name)
+
+    def write_base(self, geometry: Geometry, cloud: BasePointCloud) -> None:
+        """Store geometry and base point cloud; the first ones written stay."""
+        if self.has_base():
+            return
+        with store_errors("write the base", self.storage.where):
+            built = self.storage.part()
+            try:
+                _build_base(built, {"geometry": geometry, "cloud": cloud})
+                self.storage.adopt_folder(built, f"{self.name}/base")
+            finally:
+                shutil.rmtree(built, ignore_errors=True)
+
+
+def scene_ids(storage: Storage) -> list[str]:
+    """The scenes that are there, in order of their ids; what else lies among them is somebody else's."""
+    return sorted(name for name in storage.names(SCENES) if is_there(storage, name))
+
+
+def is_there(storage: Storage, scene_id: str) -> bool:
+    """Whether a scene is there: its spec, which is written first, or plans or markers that have lost it."""
+    if not _SCENE_ID.fullmatch(scene_id):
+        return False
+    name = f"{SCENES}/{scene_id}"
+    with store_errors("look for a scene", storage.where), contextlib.suppress(NotADirectoryError):  # somebody's file
+        return storage.exists(f"{name}/spec.json") or any(
+            storage.names(f"{name}/{part}") for part in (plans.PLANS, markers.COMMITTED)
+        )
+    return False
+
+
+def are_there(storage: Storage) -> bool:
+    """Whether a place that may be no store has folders of scenes; raises StoreError if it cannot be read."""
+    with store_errors("look for scenes", storage.where):
+        return SCENES in storage.names("") and any(map(_SCENE_ID.fullmatch, storage.names(SCENES)))
+
+
+def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
+    """The spec of a scene; raises StoreError if there is no such scene, CorruptError if its spec is lost or damaged."""
+    name = f"{SCENES}/{scene_id}/spec.json"
+    try:
+        spec = SceneSpec.model_validate_json(storage.read(name))
+    except FileNotFoundError as error:
+        if not is_there(storage, scene_id):
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}") from error
+        if storage.exists(name):  # a submission has begun the scene in the meantime
+            return read_spec(storage, scene_id)
+        raise CorruptError(
+            f"{storage.where}/{name}: is missing, and plans or markers of the scene are there; `photonfarm submit` of "
+            "the same spec writes it again"
+        ) from error
+    except OSError as error:
+        raise StoreError(f"{storage.where}/{name}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {'; '.join(sentences(error))}") from error
+    if spec.scene_id != scene_id:
+        raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
+    return spec
+
+
+def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:
+    import zarr
+
+    from photonfarm.shared.store.write.staging import group_in
+
+    with group_in(folder) as store:
+        root = zarr.open_group(store, mode="w-", zarr_format=3, attributes=declarations.stamp())
+        for name, record in records.items():
+            group = root.create_group(name, attributes=declarations.stamp())
+            for declared in declarations.BASE[name]:
+                schema.create_input(group, declared, getattr(record, declared.name))
+
+
+def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
+    """Geometry and base point cloud in a scene's folder; raises StoreError while they are not there."""
+    import zarr
+
+    folder = f"{scene}/base"
+    if not storage.exists(f"{folder}/zarr.json"):
+        raise StoreError(f"{storage.where}/{scene}: its base is not there yet; the first job of the scene writes it")
+    try:
+        root: Any = zarr.open_group(storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
+
+        def whole(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
+            names = [field.name for field in fields(record)]
+            return {name: schema.read_input(storage, f"{folder}/{part}/{name}", root[part][name]) for name in names}
+
+        geometry, cloud = Geometry(**whole("geometry", Geometry)), BasePointCloud(**whole("cloud", BasePointCloud))
+    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
+        raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {error}") from error
+    return geometry, cloud

@@ -1,0 +1,146 @@
+"""How far a store is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.store.write.guides import has_guides, used_views
+from photonfarm.shared.store.write.scene_store import SceneStore
+from photonfarm.shared.store.write.store import Store, check_format
+
+
+@dataclass(frozen=True, slots=True)
+class SceneStatus:
+    """Planned and done, of one scene."""
+
+    scene_id: str
+    name: str
+    samples_planned: int
+    samples_complete: int
+    jobs_planned: int
+    jobs_committed: int
+    size_bytes: int  # of the committed outputs, with guides
+    core_s: float  # processor time of the committed jobs, with that of guides
+    redrawn: int  # renders thrown away for a non-finite value
+    markers_unreadable: int  # of committed jobs whose bytes, time and redrawn renders are not counted
+    marker_error: str | None  # why the first of these cannot be read
+    markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
+    error: str | None = None  # why nothing is known of it; all numbers are 0 then
+    views_planned: int = 0
+    views_guided: int | None = None  # that have guides; None: the scene has none, nor has been asked for any
+    guide_jobs: int = 0  # whose guides are committed
+    guide_bytes: int = 0  # of their guides, out of `size_bytes`
+
+
+_READERS = 8
+"""Markers read at a time: a bucket answers after milliseconds, whoever asks."""
+
+_BLOCK = 256
+"""Markers that a reader takes at a time, and forgets once they are summed up."""
+
+
+def store_status(store: Store) -> list[SceneStatus]:
+    """The status of every scene; reads every marker, and holds few of them at a time.
+
+    A scene that cannot be read says why, by its `error`, and markers that cannot be are counted by themselves. Raises
+    StoreError if the store cannot be read.
+    """
+    known, failed = store.each(scene_status)
+    for scene_id, error in failed.items():
+        known[scene_id] = SceneStatus(
+            scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error)
+        )
+    return [known[scene_id] for scene_id in sorted(known)]
+
+
+def _name(store: Store, scene_id: str) -> str:
+    """A scene's name, if its spec can be read."""
+    try:
+        return store.scene(scene_id).spec.name
+    except StoreError:
+        return "unreadable"
+
+
+def scene_status(scene: SceneStore) -> SceneStatus:
+    """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
+    progress = scene.progress()
+    committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
+    guided = sorted(scene.guides.committed_jobs())
+    jobs, found = scene.jobs(), scene.plans()
+    samples, guides = _summed(scene.marker, committed), _summed(scene.guides.marker, guided)
+    errors = [each.error for each in (samples, guides) if each.error]
+    if any(not isinstance(error, CorruptError) for error in errors):
+        check_format(scene.storage)
+    views, with_guides = used_views(found), has_guides(found, set(guided))
+    return SceneStatus(
+        scene.scene_id,
+        scene.spec.name,
+        progress.planned_samples,
+        progress.committed_samples,
+        jobs,
+        len(committed),
+        samples.size_bytes + guides.size_bytes,
+        samples.core_s + guides.core_s,
+        samples.redrawn + guides.redrawn,
+        samples.unreadable + guides.unreadable,
+        str(errors[0]) if errors else None,
+        sum(job >= jobs for job in (*committed, *guided)),
+        views_planned=int(np.count_nonzero(views)),
+        views_guided=int(np.count_nonzero(views & with_guides)) if scene.guides.settings() or guided else None,
+        guide_jobs=len(guided),
+        guide_bytes=guides.size_bytes,
+    )
+
+
+@dataclass(slots=True)
+class _Sums:
+    """What the markers of some committed jobs tell."""
+
+    size_bytes: int = 0
+    core_s: float = 0.0
+    redrawn: int = 0
+    unreadable: int = 0  # markers
+    error: StoreError | None = None  # of the first of these
+
+    def add(self, other: _Sums) -> None:
+        """Take in what other markers tell."""
+        for name in ("size_bytes", "core_s", "redrawn", "unreadable"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.error = self.error or other.error
+
+
+Read = Callable[[int], dict[str, Any]]
+"""Gives the marker of a job."""
+
+
+def _summed(read: Read, committed: list[int]) -> _Sums:
+    """What the markers of many jobs tell, read several at a time."""
+    blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
+    sums = _Sums()
+    with ThreadPoolExecutor(_READERS) as readers:
+        for each in readers.map(partial(_sum, read), blocks):
+            sums.add(each)
+    return sums
+
+
+def _sum(read: Read, jobs: Iterable[int]) -> _Sums:
+    sums = _Sums()
+    for job in jobs:
+        try:
+            marker = read(job)
+        except StoreError as error:
+            if not isinstance(error.__cause__, FileNotFoundError):  # else a repair has moved it since it was listed
+                sums.unreadable += 1
+                sums.error = sums.error or error
+            continue
+        sums.size_bytes += sum(file["size"] for file in marker["files"].values())
+        sums.core_s += marker["figures"]["core_s"]
+        sums.redrawn += marker["figures"]["redrawn"]
+    return sums

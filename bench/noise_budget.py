@@ -8,8 +8,8 @@ A room is a built-in spec, or an experiment of experiments/ in its small size. C
 `photonfarm scene cost`, best on a quiet machine; each arm of `budget_arms.SHARES` gets as many configurations as the
 budget pays for, is trained on from each seed, on other configurations each time, and measured on the same held-out
 views. The constants of `photonfarm.shared.plan.allocation` are fitted to all arms of all rooms. What is rendered and
-trained stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the rooms' scene
-files. Exit code 0, whatever comes out.
+trained stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the
+rooms' scene files. Exit code 0, whatever comes out.
 """
 
 from __future__ import annotations
@@ -273,8 +273,8 @@ passes. Passes of a view are samples of their own. **MSE** is in the metric spac
 **linear MSE** in exposed linear radiance.
 {of_intervals(len(told.seeds))}
 
-**The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and b
-of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
+**The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
+b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
 with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms of a room have in
 common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 % intervals of a
 bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with replacement, the same

@@ -23,8 +23,8 @@ from photonfarm.shared.store.write.guides import NOISY
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
+from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.scene.guides import point_light, view_guides  # noqa: E402
 from photonfarm.renderer.scene.materials import Materials  # noqa: E402
 

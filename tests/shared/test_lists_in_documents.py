@@ -16,24 +16,27 @@ def test_the_page_of_the_check_lists_every_cause_with_its_sentence_and_what_help
     assert listed == [(cause.label, cause.sentence, cause.remedy.value) for cause in Cause]
 
 
-PACKAGES = {
-    "shared/photonfarm/shared": ("| module | holds |", 0),
-    "shared/photonfarm/shared/store": ("| `store/` | holds |", 0),
-    "shared/photonfarm/shared/queue": ("| `queue/` | holds |", 0),
-    "services/renderer/photonfarm/renderer": ("| module | holds |", 1),
-    "services/trainer/photonfarm/trainer": ("| module | holds |", 2),
+DISTRIBUTIONS = {
+    "## shared": "shared/photonfarm/shared",
+    "## services/renderer": "services/renderer/photonfarm/renderer",
+    "## services/trainer": "services/trainer/photonfarm/trainer",
 }
-"""Each package with the head of its table in ARCHITECTURE.md, and which of the tables with that head it is."""
+"""The headings of ARCHITECTURE.md that have tables of folders, and where these folders lie."""
+
+FOLDERS = [
+    pytest.param(heading, folder, id=str(folder.relative_to(ROOT)))
+    for heading, base in DISTRIBUTIONS.items()
+    for folder in sorted(path.parent for path in (ROOT / base).rglob("__init__.py"))
+    if folder != ROOT / "shared/photonfarm/shared"
+]
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_the_architecture_names_every_module_of_a_package_and_no_other(package: str) -> None:
-    head, number = PACKAGES[package]
-    table = (ROOT / "ARCHITECTURE.md").read_text().split(head)[number + 1].partition("\n\n")[0]
-    first, others = zip(*(line.split("|")[1:3] for line in table.splitlines()[2:]), strict=True)
-    named, mentioned = (set(re.findall(r"`([a-z_0-9]+)/?`", " ".join(cells))) for cells in (first, others))
-    folder = ROOT / package
-    there = {path.stem for path in folder.glob("*.py")} | {path.parent.name for path in folder.glob("*/__init__.py")}
-    there = there - {"__init__"} | ({"specs"} & {path.name for path in folder.iterdir()})
-    assert there - named - mentioned == set()
-    assert named - there == set()
+@pytest.mark.parametrize(("heading", "folder"), FOLDERS)
+def test_the_architecture_names_every_module_of_a_folder_and_no_other(heading: str, folder: Path) -> None:
+    base = ROOT / DISTRIBUTIONS[heading]
+    name = base.name if folder == base else str(folder.relative_to(base))
+    section = (ROOT / "ARCHITECTURE.md").read_text().split(f"\n{heading}\n")[1].split("\n## ")[0]
+    table = section.split(f"| `{name}` | holds |\n")[1].partition("\n\n")[0]
+    named = re.findall(r"`([a-z_0-9]+)`", " ".join(line.split("|")[1] for line in table.splitlines()[1:]))
+    modules = [path.stem for path in folder.glob("*.py") if not path.stem.startswith("__")]
+    assert sorted(named) == sorted([*modules, *(path.parent.name for path in folder.glob("*/__init__.py"))])

@@ -1,0 +1,182 @@
+"""A scene of a store, ready to be read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.data.sample import Sample
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.read.find import scene_named
+
+if TYPE_CHECKING:
+    from photonfarm.data.torch_dataset import SceneDataset
+
+HOLD_OUT = 0.125
+Split = Literal["train", "held-out", "all"]
+
+
+def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> Scene:
+    """A scene of a store, with the samples that are complete now.
+
+    `store` is a folder, or the URL of a bucket (`s3://bucket/prefix`). `scene` is a scene's name, its id, or the
+    beginning of its id. With `guides` each sample comes with what is known of its view, and is complete only with it;
+    None reads guides if the scene has some.
+
+    Raises StoreError if there is no such store, or no such scene in it (the message names the scenes that exist), and
+    SpecError if `guides` is True and the scene has none.
+    """
+    opened = Store(store)
+    found = opened.scene(scene_named(opened, scene))
+    if guides is None:
+        guides = found.guides.settings() is not None
+    return Scene(store, found.scene_id, guides=guides)
+
+
+class Scene(Sequence[Sample]):
+    """The complete samples of one scene, in the order of their rows; `refresh` takes in those that came since.
+
+    It pickles as its place in the store with its rows, so that processes that are spawned read the same samples.
+    """
+
+    def __init__(
+        self, store: str | Path, scene_id: str, *, guides: bool = False, rows: Sequence[int] | None = None
+    ) -> None:
+        """Use `open_scene`. With `rows` it consists of these samples alone, and does not change."""
+        self._store, self._id, self._guides = store, scene_id, guides
+        self._reader = SceneReader(store, scene_id)
+        if guides:
+            self._reader.follow_guides()
+        self._reader.refresh()
+        self._frozen = rows is not None
+        self._rows = self._reader.rows if rows is None else np.asarray(rows, np.int64)
+        self._base: tuple[Geometry, BasePointCloud] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _opened, (self._store, self._id, self._guides, self._rows.tolist() if self._frozen else None)
+
+    def __repr__(self) -> str:
+        return f"<scene {self.name} ({self.id}), {len(self)} samples{', a snapshot' if self._frozen else ''}>"
+
+    # ---------------------------------------------------------------------------------------------------- what it is
+
+    @property
+    def id(self) -> str:
+        """The scene's id, 32 hexadecimal digits: a hash of the spec."""
+        return self._id
+
+    @property
+    def name(self) -> str:
+        """The scene's name, as the spec has it."""
+        return self.spec.name
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec: its film, light transport, movable objects and lights."""
+        return self._reader.spec
+
+    @property
+    def has_guides(self) -> bool:
+        """Whether samples come with what is known of their views."""
+        return self._guides
+
+    @property
+    def geometry(self) -> Geometry:
+        """The scene's triangles at rest; StoreError while no job has been committed."""
+        return self._read_base()[0]
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """The row in the store of each sample, (N,), ascending."""
+        return self._rows
+
+    # ------------------------------------------------------------------------------------------------------- samples
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        """The sample at a place, from 0, or from −1 backwards; a list of samples for a slice.
+
+        Raises IndexError beyond the last sample, and CorruptError if stored bytes are not what was committed.
+        """
+        if isinstance(index, slice):
+            return [self._sample(int(row)) for row in self._rows[index]]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of scene {self.name}: it has {len(self)} complete samples")
+        return self._sample(int(self._rows[index]))
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self._sample(int(row)) for row in self._rows)
+
+    def _sample(self, row: int) -> Sample:
+        return Sample(self._reader.read(row), self._reader, self._id, self._read_base()[1])
+
+    def _read_base(self) -> tuple[Geometry, BasePointCloud]:
+        if self._base is None:
+            self._base = self._reader.base()
+        return self._base
+
+    # ------------------------------------------------------------------------------------------------ while it grows
+
+    def refresh(self) -> int:
+        """Take in the samples that became complete since; returns how many more there are, below 0 after a repair.
+
+        Raises ValueError for a snapshot, which does not change.
+        """
+        if self._frozen:
+            raise ValueError(f"{self!r} does not change; refresh the scene that it was taken of")
+        before = len(self._rows)
+        self._reader.refresh()
+        self._rows = self._reader.rows
+        return len(self._rows) - before
+
+    def snapshot(self) -> Scene:
+        """The samples that are complete now, as a scene that does not change."""
+        return self._of(self._rows)
+
+    def split(self, split: Split, *, hold_out: float = HOLD_OUT) -> Scene:
+        """A snapshot of the samples to train on, of those that are held out, or of all.
+
+        Whole configurations are held out (of a static scene, views), a share `hold_out` of them, by a hash of what they
+        are: exactly those that `photonfarm train` holds out. Raises ValueError for another split.
+        """
+        if split not in (splits := ("train", "held-out", "all")):
+            raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
+        if split == "all":
+            return self.snapshot()
+        held_out = np.array(are_held_out(self._units(), hold_out), np.bool_)
+        return self._of(self._rows[held_out if split == "held-out" else ~held_out])
+
+    def torch(
+        self, split: Split = "all", *, hold_out: float = HOLD_OUT, fields: Sequence[str] | None = None
+    ) -> SceneDataset:
+        """The samples of a split as a torch dataset of dictionaries; it pickles, so any DataLoader works.
+
+        `fields` are names of images and of `modification` and `view`; None takes all that there are. Raises ValueError
+        for another split, SpecError for another field, and ImportError without torch.
+        """
+        from photonfarm.data.torch_dataset import SceneDataset
+
+        return SceneDataset(self.split(split, hold_out=hold_out), fields)
+
+    def _units(self) -> list[Key]:
+        """The keys by which samples are held out."""
+        keys = self._reader.modification_keys if self.spec.groups else self._reader.view_keys
+        return keys(self._rows.tolist())
+
+    def _of(self, rows: NDArray[np.int64]) -> Self:
+        return type(self)(self._store, self._id, guides=self._guides, rows=rows.tolist())
+
+
+def _opened(store: str | Path, scene_id: str, guides: bool, rows: Sequence[int] | None) -> Scene:
+    """What a pickled scene becomes."""
+    return Scene(store, scene_id, guides=guides, rows=rows)

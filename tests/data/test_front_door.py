@@ -1,0 +1,157 @@
+"""`photonfarm.data`: a scene of a store in a folder or a bucket, from the first five lines to two spawned processes."""
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import bucket_samples
+import numpy as np
+import pytest
+import store_samples as samples
+import torch
+
+import photonfarm.data
+from photonfarm.data import Scene, open_scene
+from photonfarm.shared.core.errors import SpecError, StoreError
+from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.read.find import Query, find_samples
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
+    return request.getfixturevalue("url") if request.param == "bucket" else tmp_path / "store"
+
+
+def stored(place: str | Path, *, views: int = 1) -> SceneStore:
+    """A scene of 10 configurations, all committed."""
+    scene = bucket_samples.planned(place, modifications=10, views_per_modification=views)
+    samples.commit_all(scene)
+    scene.write_base(*samples.base())
+    return scene
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    stored(tmp_path / "store")
+    return open_scene(tmp_path / "store", "small")
+
+
+def test_public_names() -> None:
+    assert sorted(photonfarm.data.__all__) == ["PointCloud", "Sample", "Scene", "open_scene"]
+    assert {name for name in dir(Scene) if not name.startswith("_")} == {
+        "count", "geometry", "has_guides", "id", "index", "name", "refresh", "rows", "snapshot", "spec", "split",
+        "torch",
+    }  # fmt: skip
+    assert {name for name in dir(photonfarm.data.Sample) if not name.startswith("_")} == {
+        "albedo", "depth", "guides", "key", "modification", "normal", "pass_number", "photons", "point_cloud",
+        "radiance", "row", "seeds", "seen_photons", "view",
+    }  # fmt: skip
+
+
+def test_a_sample_is_what_was_committed(place: str | Path) -> None:
+    written = stored(place)
+    scene = open_scene(place, written.scene_id[:8])
+    assert (scene.name, scene.id, len(scene)) == ("small", written.scene_id, 10)
+    committed = samples.outputs(written, 3)
+    for row, radiance in committed.radiance.items():
+        np.testing.assert_array_equal(scene[row].radiance, radiance)
+        np.testing.assert_array_equal(scene[row].albedo, committed.buffers[row].albedo)
+        np.testing.assert_array_equal(scene[row].photons.power, committed.photons[row].power)
+    sample = scene[-1]
+    assert sample.row == 9
+    assert len(set(sample.seeds)) == 2
+    assert sample.point_cloud.position.shape == (3, 3)
+    moved = sample.modification.translation[0] * sample.modification.present[0]
+    np.testing.assert_allclose(sample.point_cloud.position[1:], np.eye(3)[1:] + moved, rtol=1e-6)
+
+
+def test_a_key_is_the_one_by_which_the_store_finds_the_sample(scene: Scene, tmp_path: Path) -> None:
+    sample = scene[4]
+    (found,) = find_samples(Store(tmp_path / "store"), [scene.id], Query(sample=sample.key)).samples
+    assert (found.row, found.key) == (4, sample.key.hex())
+    assert sample.seeds == (seed_of(sample.key, "half A"), seed_of(sample.key, "half B"))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_five_lines_with_a_loader_of_spawned_processes(place: str | Path, workers: int) -> None:
+    stored(place)
+    scene = open_scene(place, "small")
+    dataset = scene.torch(split="train")
+    context = "spawn" if workers else None
+    loader = torch.utils.data.DataLoader(dataset, batch_size=4, num_workers=workers, multiprocessing_context=context)
+    rows = []
+    for batch in loader:
+        assert batch["radiance"].shape[1:] == (2, 8, 8, 3)
+        assert batch["modification"].shape[1:] == (1, 4)
+        assert batch["view"].shape[1:] == (6,)
+        for row, radiance in zip(batch["row"].tolist(), batch["radiance"], strict=True):
+            np.testing.assert_array_equal(radiance, samples.values(row, (2, 8, 8, 3)))
+            rows.append(row)
+    assert rows == scene.split("train").rows.tolist()
+
+
+def test_what_is_held_out_is_what_training_holds_out(scene: Scene) -> None:
+    train, held_out = (scene.split(split, hold_out=0.4) for split in ("train", "held-out"))
+    assert sorted([*train.rows, *held_out.rows]) == scene.rows.tolist()
+    keys = [sample.modification.key(scene.id) for sample in held_out]
+    assert keys
+    assert all(are_held_out(keys, 0.4))
+    with pytest.raises(ValueError, match="train, held-out, all"):
+        scene.split("test")  # type: ignore[arg-type]
+
+
+def test_a_scene_grows_and_a_snapshot_does_not(tmp_path: Path) -> None:
+    written = bucket_samples.planned(tmp_path / "store", modifications=10)
+    written.write_base(*samples.base())
+    scene = open_scene(tmp_path / "store", "small")
+    assert len(scene) == 0
+    samples.commit(written, 0, samples.outputs(written, 0))
+    snapshot = scene.snapshot()
+    assert scene.refresh() == 2
+    assert (len(scene), len(snapshot)) == (2, 0)
+    later = pickle.loads(pickle.dumps(scene.snapshot()))
+    samples.commit(written, 1, samples.outputs(written, 1))
+    assert later.rows.tolist() == [0, 1]
+    with pytest.raises(ValueError, match="does not change"):
+        later.refresh()
+    assert scene.refresh() == 2
+    assert [sample.row for sample in scene[1:3]] == [1, 2]
+    with pytest.raises(IndexError):
+        scene[4]
+
+
+def test_guides_come_with_the_samples_of_a_scene_that_has_them(tmp_path: Path) -> None:
+    written = stored(tmp_path / "store")
+    with pytest.raises(SpecError):
+        open_scene(tmp_path / "store", "small", guides=True)
+    written.guides.want(GuideSpec())
+    for job in range(3):
+        samples.commit_guides(written, job)
+    scene = open_scene(tmp_path / "store", "small")
+    assert scene.has_guides
+    assert len(scene) == 6  # of the others, guides are to come
+    np.testing.assert_array_equal(scene[5].direct, scene[5].guides["direct"])
+    assert scene.torch()[5]["direct"].shape == (8, 8, 3)
+    assert len(open_scene(tmp_path / "store", "small", guides=False)) == 10
+
+
+def test_wrong_names_raise_with_those_that_exist(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=scene.id):
+        open_scene(tmp_path / "store", "large")
+    with pytest.raises(StoreError):
+        open_scene(tmp_path / "nowhere", "small")
+    with pytest.raises(AttributeError, match="albedo"):
+        _ = scene[0].albdo
+    with pytest.raises(SpecError, match="albedo"):
+        scene.torch(fields=["albdo"])
+    assert set(scene.torch(fields=["depth"])[0]) == {"row", "depth"}
+
+
+def test_reading_needs_neither_torch_nor_mitsuba(scene: Scene, tmp_path: Path) -> None:
+    code = "import sys; from photonfarm.data import open_scene; open_scene(sys.argv[1], 'small')[0].radiance; "
+    code += "sys.exit(any(name in sys.modules for name in ('torch', 'mitsuba')))"
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")]).returncode == 0

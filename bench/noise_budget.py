@@ -274,14 +274,14 @@ passes. Passes of a view are samples of their own. **MSE** is in the metric spac
 {of_intervals(len(told.seeds))}
 
 **The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
-b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is {found.chi2:.1f}
-with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms of a room have in
-common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 % intervals of a
-bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with replacement, the same
-for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it, pooled over its room. These
-deviates are drawn independently, though arms of one seed are not quite that: the configurations of those with few are
-among those of the others. Where a range reaches the end of the grid that was searched, "or more", "or less", the
-constant is bounded on one side only, and its best value says little.
+b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is
+{found.chi2:.1f} with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms
+of a room have in common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 %
+intervals of a bootstrap of {len(found.kappas)} replicates, each fitted anew: held-out configurations drawn with
+replacement, the same for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it,
+pooled over its room. These deviates are drawn independently, though arms of one seed are not quite that: the
+configurations of those with few are among those of the others. Where a range reaches the end of the grid that was
+searched, "or more", "or less", the constant is bounded on one side only, and its best value says little.
 
 {parts}
 

@@ -151,8 +151,9 @@ networks more photons of the same held-out configurations; a photon's power is t
 so that only the noise differs. The photon map is the image that the network's output is added to
 (`photonfarm.trainer.networks.photon_map`): albedo times what the wider window gathers. Nothing is trained: what a
 network would reach that had learned from so many photons is not measured, and can be less. Photons seen are medians
-over views, and so are those of equal power that would make as noisy a sum, (Σ p)² / Σ p². MSE is in the metric space, the references'
-noise taken out. Intervals are over configurations, of a static room over views, for these networks (one seed).
+over views, and so are those of equal power that would make as noisy a sum, (Σ p)² / Σ p². MSE is in the metric
+space, the references' noise taken out. Intervals are over configurations, of a static room over views, for these
+networks (one seed).
 
 {parts}
 

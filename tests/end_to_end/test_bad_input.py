@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import main
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.submission import request_of, submit
@@ -34,7 +34,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
             for name, value in {"PHOTONFARM_REDIS_URL": "redis://127.0.0.1:1/0", **environment}.items():
                 patch.setenv(name, value)
             with pytest.raises(SystemExit) as ended:  # an error that is not ours comes through
-                cli.main([*args])
+                main([*args])
         code = ended.value.code
         assert code is None or isinstance(code, int)
         return Ended([*args], code or 0, *capfd.readouterr())
@@ -179,7 +179,7 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
 
 
 def test_up_without_a_trainer_says_so_before_it_writes_anything(tmp_path: Path) -> None:
-    code = "from photonfarm.shared import cli, verbs; verbs._installed().pop('train'); cli.main(['up', 'room'])"
+    code = "from photonfarm.shared.cli import main, verbs; verbs._installed().pop('train'); main.main(['up', 'room'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert "`photonfarm train` is not installed here" in result.stderr

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.backpressure import TrainerPace
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
@@ -76,7 +76,7 @@ def test_the_status_counts_markers_that_cannot_be_read_names_one_and_shows_the_r
     for job in (0, 1):
         harm(scene.folder / f"committed/{job:012d}.json")
     words = ["status", "--store", str(root), "--redis", "redis://127.0.0.1:1/0", *(["--json"] if as_json else [])]
-    result = CliRunner().invoke(cli.umbrella, words)
+    result = CliRunner().invoke(umbrella, words)
     assert isinstance(result.exception, StoreError)
     for said in (str(result.exception), *([] if as_json else [result.stdout])):
         assert re.search(r"2 of 3 markers cannot be read, .*committed/000000000000\.json", said)
@@ -106,7 +106,7 @@ def test_the_status_tells_the_damaged_scene_and_goes_on(
 ) -> None:
     damaged, whole = scenes
     words = ["status", "--store", str(tmp_path / "store"), "--redis", "redis://127.0.0.1:1/0"]
-    result = CliRunner().invoke(cli.umbrella, [*words, *(["--json"] if as_json else [])])
+    result = CliRunner().invoke(umbrella, [*words, *(["--json"] if as_json else [])])
     assert isinstance(result.exception, StoreError)
     assert "1 of 2 scenes cannot be read" in str(result.exception)
     if as_json:

@@ -13,7 +13,7 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
@@ -257,7 +257,7 @@ def test_a_plan_is_refused_while_guides_are_there_of_a_job_that_no_plan_has(scen
 
 
 def run(store: Store, *arguments: str, verb: tuple[str, ...] = ("store", "upgrade", "--no-queue")) -> Any:
-    return CliRunner().invoke(cli.umbrella, [*verb, "--store", str(store.root), *arguments], prog_name="photonfarm")
+    return CliRunner().invoke(umbrella, [*verb, "--store", str(store.root), *arguments], prog_name="photonfarm")
 
 
 def told(store: Store, *arguments: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.records import Guides
 from photonfarm.shared.farm.upgrade import upgrade
 from photonfarm.shared.plan.request import Request
@@ -318,7 +318,7 @@ def test_a_repair_of_guides_killed_in_the_middle_is_completed_by_the_next(store:
 
 def test_the_command_tells_guides_from_samples(store: Store, scene: SceneStore) -> None:
     def run(*arguments: str) -> Any:
-        return CliRunner().invoke(cli.umbrella, ["store", "check", "--store", str(store.root), *arguments])
+        return CliRunner().invoke(umbrella, ["store", "check", "--store", str(store.root), *arguments])
 
     assert "3 jobs, 10 samples, guides of 3 jobs" in run().stdout
     flip(shard(scene, "specular", 2), 20)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import CorruptError, StoreError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -258,7 +258,7 @@ def test_a_missing_chunk_is_never_read_as_fill_values(store: Store, scene: Scene
 
 
 def run(*arguments: str) -> Any:
-    return CliRunner().invoke(cli.umbrella, ["store", "check", *arguments], prog_name="photonfarm")
+    return CliRunner().invoke(umbrella, ["store", "check", *arguments], prog_name="photonfarm")
 
 
 def test_the_command_tells_findings_by_cause_and_exits_with_their_code(store: Store, scene: SceneStore) -> None:

@@ -11,7 +11,7 @@ import store_samples as samples
 import zarr
 from click.testing import CliRunner
 
-from photonfarm.shared.cli import farm_verbs as cli
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.cli.show_store import commands
 from photonfarm.shared.core.errors import SpecError, StoreError
 from photonfarm.shared.plan.request import PlannedRows, Request
@@ -212,7 +212,7 @@ def test_half_a_million_samples_are_searched_at_once(store: Store, scene: SceneS
 def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: SceneStore) -> None:
     def run(*arguments: str) -> Any:
         words = ["store", "find", "--store", str(store.root), *arguments]
-        return CliRunner().invoke(cli.umbrella, words, prog_name="photonfarm")
+        return CliRunner().invoke(umbrella, words, prog_name="photonfarm")
 
     told = run("--row", "8")
     assert told.exit_code == 0

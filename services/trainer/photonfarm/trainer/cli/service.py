@@ -126,7 +126,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
 
     Raises SpecError without a spec, unless the store has one scene.
     """
-    from photonfarm.trainer.networks import ARCHITECTURES
+    from photonfarm.trainer.networks import kind_of
     from photonfarm.trainer.networks.summary import summary, table
 
     network = _settings(preset_name, changes).network
@@ -140,7 +140,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     points = min(network.points or scene.points, scene.points)
     head = (
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
-        f"width {network.width}" + (f", {points} points" if ARCHITECTURES[network.architecture].needs.points else "")
+        f"width {network.width}" + (f", {points} points" if kind_of(network.architecture).needs.points else "")
     )
     return f"{head}\n{table(summary(scene, network))}"
 
@@ -309,6 +309,8 @@ def _tell(record: dict[str, Any]) -> None:
     if record["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
         click.echo(f"goes on from step {record['step']} with {changed}", err=True)
+    if record["kind"] == "loss":
+        click.echo(f"loss {record['loss']} is unbiased: {record['verdict']}", err=True)
     if record["kind"] == "recovered":
         click.echo(f"step {record['step']}: {_recovered(record)}", err=True)
     if record["kind"] == "validation":

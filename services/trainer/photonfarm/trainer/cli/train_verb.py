@@ -56,8 +56,9 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 )
 @click.option(
     "--architecture",
-    type=click.Choice(get_args(Architecture)),
-    help="Kind of network; denoise_K is given one of K pixels in noisy colour.  [default: light_transport]",
+    metavar=f"[{'|'.join(get_args(Architecture))}|MODULE:CLASS]",
+    help="Kind of network; denoise_K is given one of K pixels in noisy colour; MODULE:CLASS is one of your own.  "
+    "[default: the preset's]",
 )
 @click.option(
     "--precision", type=click.Choice(get_args(Precision)), help="Of the U-Net's computations.  [default: float32]"
@@ -77,8 +78,9 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @click.option("--device", metavar="NAME", help="cpu, cuda, cuda:N, or auto: cuda where there is one.  [default: auto]")
 @click.option(
     "--loss",
-    metavar=f"[{'|'.join(get_args(Loss))}]",
-    help="Squared error; relative: to the prediction's brightness; paired: and to the other half's.  [default: linear]",
+    metavar=f"[{'|'.join(get_args(Loss))}|MODULE:FUNCTION]",
+    help="Squared error; relative: to the prediction's brightness; paired: and to the other half's; MODULE:FUNCTION: "
+    "your own, refused if it biases.  [default: the preset's]",
 )
 @click.option("--optimiser", metavar=f"[{'|'.join(get_args(Optimiser))}]", help="[default: adam]")
 @click.option("--learning-rate", type=click.FloatRange(0, min_open=True), help="At the beginning.  [default: 0.0005]")

@@ -12,7 +12,7 @@ from typing import Any, Self
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.trainer.data.dataset import Batch, SampleSource, read_into, rows_held_out
-from photonfarm.trainer.networks import ARCHITECTURES
+from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -38,7 +38,7 @@ class Feed:
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
-        self._needs = needs or ARCHITECTURES[settings.network.architecture].needs
+        self._needs = needs or kind_of(settings.network.architecture).needs
         if self._needs.guides:
             source.follow_guides()
         self.geometry, self.cloud = source.base()

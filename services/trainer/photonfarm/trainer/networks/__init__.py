@@ -1,13 +1,16 @@
-"""The networks by name, one per scene; each with what it needs to see."""
+"""The networks by name, each with what it needs to see; those of a user's own are named `MODULE:NAME`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
+from torch import nn
 
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.networks.cnn import Cnn
 from photonfarm.trainer.networks.denoiser import Denoiser
 from photonfarm.trainer.networks.feature_projection import FeatureProjection
@@ -16,18 +19,19 @@ from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.settings import Architecture, NetworkSettings
+from photonfarm.trainer.runs import own
+from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """An architecture: what makes its network, and what that reads."""
 
-    make: Callable[[NetworkSettings, SceneFrame], Network]
+    make: Callable[[NetworkSettings, SceneFrame], Any]
     needs: Needs
 
 
-ARCHITECTURES: dict[Architecture, Kind] = {
+ARCHITECTURES: dict[str, Kind] = {
     "cnn": Kind(Cnn, Needs(points=False)),
     "feature_projection": Kind(FeatureProjection, Needs()),
     "light_transport": Kind(LightTransport, Needs()),
@@ -44,11 +48,26 @@ ARCHITECTURES: dict[Architecture, Kind] = {
 }
 
 
+def kind_of(architecture: str) -> Kind:
+    """The architecture of a name. Raises SpecError for one of a user's own that cannot be had.
+
+    That is a subclass of `torch.nn.Module` which is made from `NetworkSettings` and `SceneFrame`, and whose `forward`
+    takes `Inputs` and returns the image (B, H, W, 3), linear radiance × exposure. What it reads beside camera and
+    buffers its attribute `needs` says, a `Needs`; without one it reads no more.
+    """
+    if architecture in ARCHITECTURES:
+        return ARCHITECTURES[architecture]
+    make = own.load("architecture", architecture)
+    if not (isinstance(make, type) and issubclass(make, nn.Module)):
+        raise SpecError(f"architecture = {architecture!r}: is {make!r}; a subclass of torch.nn.Module is required")
+    return Kind(make, getattr(make, "needs", Needs(points=False)))
+
+
 def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     """A freshly initialised network; the same weights for the same seed on one version of torch.
 
-    Raises SpecError where the scene lacks what the architecture needs.
+    Raises SpecError where the scene lacks what the architecture needs, and as `kind_of` does.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return ARCHITECTURES[settings.architecture].make(settings, frame)
+        return kind_of(settings.architecture).make(settings, frame)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.network import Network
@@ -28,7 +28,10 @@ MODULES = {
 }
 """The part that each module of a network is; whatever lies in none is projection, and each point's descriptor."""
 
-PARTS = ("point branch", "photon branch", "projection", "U-Net")
+OTHER = "other"
+"""Modules of a network of a user's own."""
+
+PARTS = ("point branch", "photon branch", "projection", "U-Net", OTHER)
 DESCRIPTOR = "descriptor"
 
 
@@ -55,8 +58,9 @@ def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
     gmacs = dict.fromkeys(PARTS, 0.0)
     for module, part in MODULES.items():
         gmacs[part] += counts.get(f"{root}.{module}", 0.0)
-    gmacs["projection"] = counts["Global"] - sum(gmacs.values())
+    rest = counts["Global"] - sum(gmacs.values())
     parameters = _parameters(network)
+    gmacs[OTHER if parameters[OTHER] else "projection"] = rest
     return [Part(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
 
 
@@ -72,7 +76,7 @@ def _parameters(network: Network) -> dict[str, int]:
     found = dict.fromkeys(PARTS, 0)
     for name, parameter in network.named_parameters():
         module = name.split(".")[0]
-        found["point branch" if module == DESCRIPTOR else MODULES[module]] += parameter.numel()
+        found["point branch" if module == DESCRIPTOR else MODULES.get(module, OTHER)] += parameter.numel()
     return found
 
 
@@ -92,4 +96,4 @@ def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
         return torch.zeros(1, *shape, dtype=dtype)
 
     points = min(settings.points or spec.points, spec.points)
-    return Inputs.empty(memory, points, spec, ARCHITECTURES[settings.architecture].needs)
+    return Inputs.empty(memory, points, spec, kind_of(settings.architecture).needs)

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.networks import ARCHITECTURES, build
+from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.network import Network
@@ -59,7 +59,7 @@ class TrainedRun:
     @property
     def needs(self) -> Needs:
         """What its network reads."""
-        return ARCHITECTURES[self.settings.network.architecture].needs
+        return kind_of(self.settings.network.architecture).needs
 
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
         """The network's images, made on a device. SpecError where that is not usable."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from photonfarm.trainer.runs import biased
+from photonfarm.trainer.runs.own import is_own
 
 Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
 Architecture = Literal[
@@ -30,6 +31,21 @@ UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they ar
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 
+
+def _one_of(kind: Any) -> AfterValidator:
+    """What allows the values of a literal, and `MODULE:NAME`."""
+
+    def check(name: str) -> str:
+        if name not in get_args(kind) and not is_own(name):
+            raise ValueError(f"is none of {', '.join(get_args(kind))}, nor MODULE:NAME of your own")
+        return name
+
+    return AfterValidator(check)
+
+
+ArchitectureName = Annotated[str, _one_of(Architecture)]
+LossName = Annotated[str, _one_of(Loss)]
+
 MOST_HELD_OUT = 512
 """Samples that a finished run is measured on, at most."""
 
@@ -41,7 +57,7 @@ class _Frozen(BaseModel):
 class NetworkSettings(_Frozen):
     """The network; changing any of these makes another network, and old checkpoints are refused."""
 
-    architecture: Architecture = "light_transport"
+    architecture: ArchitectureName = "light_transport"  # or MODULE:NAME, a class of your own
     width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
     points: Count | None = None  # first points of the base cloud to use; None: all of them
     descriptor: Annotated[int, Field(ge=0, le=512)] = 32  # learnable numbers per point
@@ -72,7 +88,8 @@ class TrainSettings(_Frozen):
     network: NetworkSettings = NetworkSettings()
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
 
-    loss: Loss = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased
+    loss: LossName = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased; or
+    # MODULE:NAME, a function of your own, which is refused if it is found to bias
     batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
     learning_rate: Positive = 5e-4  # [S 3.1]
     decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]

@@ -46,7 +46,7 @@ class EventFiles:
         step = record["step"]
         holds = record["kind"] in ("changes", "recovered", "end")  # what was shown of that step itself
         writer = self._from(step + holds)
-        figures = {tag: record[name] for name, tag in NAMES.items() if record.get(name) is not None}
+        figures = {tag: record[name] for name, tag in NAMES.items() if isinstance(record.get(name), int | float)}
         figures |= {f"waits/{name}": share for name, share in record.get("waits", {}).items()}
         for tag, value in figures.items():
             writer.add_scalar(tag, value, step)

@@ -16,7 +16,7 @@ from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.distributed import ALONE, Group
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.average import WeightAverage
-from photonfarm.trainer.training.losses import LOSSES
+from photonfarm.trainer.training.losses import loss_of
 from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
 
@@ -44,6 +44,7 @@ class Learner:
         self._settings, self._group = settings, group
         self._device = group.device(settings.device)
         self.network = build(settings.network, frame, settings.seed).to(self._device)
+        self._loss, self.verdict = loss_of(settings.loss)  # and whether it was found to be unbiased
         self.optimiser = build_optimiser(self.network.parameters(), settings)
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
         self.rate_factor = 1.0  # on top of the schedule; no part of the state below
@@ -68,7 +69,7 @@ class Learner:
         loss = torch.zeros((), device=self._device)
         if batch.rows:  # of a part, all may have been taken back
             batch = batch.to(self._device).for_training()
-            loss = LOSSES[self._settings.loss](self.network(batch.inputs), batch.target)
+            loss = self._loss(self.network(batch.inputs), batch.target)
             torch.autograd.backward(loss)
         value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):

@@ -157,6 +157,8 @@ class Session:
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)
+        if self._learner.verdict is not None:
+            self._log.write("loss", step=self._step, loss=self._settings.loss, verdict=str(self._learner.verdict))
         self._tell_count()
 
     def _start(self) -> checkpoint.Changes:

@@ -11,6 +11,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.runs import own
+from photonfarm.trainer.training.unbiasedness import Verdict, judged
+
 RELATIVE_EPSILON = 0.05
 """Squared exposed radiance: the display's middle grey, 0.5^2.2 ≈ 0.22. What is darker counts about as in the linear
 loss; with the white's 1 instead, the edges of lamps still outweighed what their light does to a room."""
@@ -59,3 +63,18 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "relative": relative_loss,
     "paired": paired_loss,
 }
+
+
+def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | None]:
+    """The loss of a name; of one of a user's own (`MODULE:NAME`) with what the test of its unbiasedness found.
+
+    That takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), and returns the mean over the batch, ().
+    Raises SpecError if it cannot be had, and if it biases.
+    """
+    if name in LOSSES:
+        return LOSSES[name], None
+    loss = own.load("loss", name)
+    verdict = judged(loss)
+    if not verdict.is_unbiased:
+        raise SpecError(f"loss = {name!r}: is refused, as it biases under noisy targets: {verdict}")
+    return loss, verdict

@@ -1,0 +1,40 @@
+"""Networks and losses of a user's own, named `MODULE:NAME` as entry points are."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from photonfarm.shared.core.errors import SpecError
+
+_PATTERN = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
+
+
+def is_own(name: str) -> bool:
+    """Whether a name has the form `MODULE:NAME`."""
+    return bool(_PATTERN.fullmatch(name))
+
+
+def load(key: str, name: str) -> Any:
+    """What `MODULE:NAME` stands for; the module is looked for where Python does, and in the current folder.
+
+    `key` is the setting that names it. Raises SpecError if there is no such module or it lacks the name; whatever else
+    the module raises goes on as it is.
+    """
+    module, _, attribute = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found = import_module(module)
+    except ModuleNotFoundError as error:
+        raise SpecError(
+            f"{key} = {name!r}: Python finds no module {error.name!r}; run in the folder that holds it, or put that "
+            "folder on PYTHONPATH"
+        ) from error
+    if not hasattr(found, attribute):
+        exist = ", ".join(each for each in vars(found) if not each.startswith("_")) or "nothing"
+        raise SpecError(f"{key} = {name!r}: {found.__file__} has no {attribute!r}; it has {exist}")
+    return getattr(found, attribute)

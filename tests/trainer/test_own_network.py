@@ -1,0 +1,129 @@
+"""A network and a loss from a user's own file take part in everything that ours take part in."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneStore
+from photonfarm.trainer.runs.run_folder import METRICS
+from photonfarm.trainer.training.losses import LOSSES, loss_of
+from photonfarm.trainer.training.unbiasedness import judged
+
+MODULE = '''
+import torch
+from torch import nn
+
+
+class PerPixel(nn.Module):
+    """Two layers on albedo, normal and depth of each pixel."""
+
+    def __init__(self, settings, frame):
+        super().__init__()
+        self.scale = frame.scale
+        self.layers = nn.Sequential(nn.Linear(7, settings.width), nn.ReLU(), nn.Linear(settings.width, 3))
+
+    def forward(self, inputs):
+        depth = inputs.depth[..., None] / self.scale
+        return inputs.albedo * self.layers(torch.cat([inputs.albedo, inputs.normal, depth], dim=-1))
+
+
+def squared(prediction, target):
+    return ((prediction[:, None] - target) ** 2).sum() / len(prediction)
+
+
+def absolute(prediction, target):
+    return (prediction[:, None] - target).abs().mean()
+
+
+number = 7
+'''
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The name of a module in the current folder."""
+    name = f"mine_{tmp_path.name.replace('-', '_')}"
+    (tmp_path / f"{name}.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    return name
+
+
+@pytest.fixture
+def store(scene: SceneStore, commit) -> Path:
+    scene.plan(Request(modifications=12, views_per_modification=1), shard_rows=6)
+    for job in range(scene.jobs()):
+        commit(scene, job)
+    return scene.folder.parent.parent
+
+
+def photonfarm(*arguments: object) -> Result:
+    return CliRunner().invoke(umbrella, [str(argument) for argument in arguments])
+
+
+def test_a_network_and_a_loss_of_ones_own_are_trained_evaluated_and_reported(
+    mine: str, store: Path, tmp_path: Path
+) -> None:
+    common = ["--store", store, "--set", "hold_out=0.4", "--steps", 4, "--batch", 2, "--set", "validate_every=2"]
+    ours = ["train", *common, "--run", "ours", "--architecture", "cnn", "--set", "width=2"]
+    own = ["train", *common, "--run", "own", "--architecture", f"{mine}:PerPixel", "--loss", f"{mine}:squared"]
+    for command in (ours, own):
+        assert (result := photonfarm(*command)).exit_code == 0, result.output
+    assert f"loss {mine}:squared is unbiased" in result.output
+    logged = [json.loads(line) for line in (tmp_path / "own" / METRICS).read_text().splitlines()]
+    assert [record["loss"] for record in logged if record["kind"] == "loss"] == [f"{mine}:squared"]
+
+    runs = ["--store", store, "--run", "ours", "--run", "own"]
+    assert (result := photonfarm("evaluate", *runs)).exit_code == 0, result.output
+    assert f"{mine}:PerPixel" in result.output
+    assert (result := photonfarm("report", *runs, "--out", "report")).exit_code == 0, result.output
+    report = json.loads((tmp_path / "report/report.json").read_text())
+    assert f"{mine}:PerPixel" in json.dumps(report)
+    spec = photonfarm("train", "--store", store, "--architecture", f"{mine}:PerPixel", "--summary")
+    assert "other" in spec.output
+
+
+def test_every_loss_of_ours_is_found_unbiased_and_a_biased_one_is_refused(mine: str) -> None:
+    verdicts = {name: judged(loss) for name, loss in LOSSES.items()}
+    assert all(verdict.is_unbiased for verdict in verdicts.values()), verdicts
+    assert verdicts["linear"].elsewhere < 5
+    assert verdicts["paired"].elsewhere > 10, "its weights are of the noise: its minimum alone is the clean image"
+    loss, verdict = loss_of(f"{mine}:squared")
+    assert verdict is not None
+    assert verdict.is_unbiased
+    assert loss(torch.ones(1, 1, 1, 3), torch.zeros(1, 2, 1, 1, 3)) == 6
+    with pytest.raises(SpecError, match="biases under noisy targets"):
+        loss_of(f"{mine}:absolute")
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        pytest.param(lambda f, t: (f[:, None] - t).abs().mean(), id="l1"),
+        pytest.param(lambda f, t: ((f[:, None] - t).clamp(-1, 1) ** 2).mean(), id="clipped"),
+        pytest.param(lambda f, t: (torch.log1p(f[:, None]) - torch.log1p(t)).square().mean(), id="log"),
+        pytest.param(lambda f, t: ((f[:, None] - t) ** 2 / (t**2 + 0.05)).mean(), id="weighted by the target"),
+        pytest.param(lambda f, t: ((f[:, None] - t) ** 2 / (f[:, None] ** 2 + 0.05)).mean(), id="undetached weight"),
+        pytest.param(lambda f, t: (f.std() - t.mean(dim=1).std()) ** 2, id="contrast"),
+    ],
+)
+def test_losses_that_bias_are_found_out(loss) -> None:
+    assert not judged(loss).is_unbiased
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks"),
+    [("{}:Nothing", "PerPixel"), ("{}:number", "torch.nn.Module"), ("no_such_module:Net", "no_such_module")],
+)
+def test_what_is_no_network_is_refused(mine: str, store: Path, name: str, lacks: str) -> None:
+    with pytest.raises(SpecError, match=lacks):
+        CliRunner().invoke(
+            umbrella,
+            ["train", "--store", str(store), "--architecture", name.format(mine), "--summary"],
+            catch_exceptions=False,
+        )

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 import results
 import room_study
 from explained import Change, Explained
-from moved_lights import same_surface
 from network_errors import F64, Errors
 from photonfarm.renderer.jobs.path_buffers import frames_of
 from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
@@ -58,7 +57,8 @@ SEED = 1
 """Of the lamps' other places. Experiments are planned with 0, so that no sample shows these places."""
 
 KNOWN = "light known alone"
-SAME_ALBEDO = 1e-3  # so near is that of the same surface
+SAME_DEPTH = 1e-3  # relative: so near, and of the same normal, is the same surface
+SAME_ALBEDO = 1e-3  # likewise
 
 
 # -------------------------------------------------------------------------------------------------------------- lamps
@@ -89,8 +89,11 @@ def relit(modification: Modification, other: Modification, shines: NDArray[np.bo
 
 def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
     """The pixels that show one surface in both, (H, W), also at their edges, which albedo tells: no lamp that moved."""
-    albedo: NDArray[np.bool_] = np.abs(a.albedo - b.albedo).max(axis=-1) < SAME_ALBEDO
-    return same_surface(a, b) & albedo
+    depth = np.abs(a.depth - b.depth) <= SAME_DEPTH * np.maximum(a.depth, b.depth)
+    normal = np.abs(a.normal - b.normal).max(axis=-1) < SAME_DEPTH
+    albedo = np.abs(a.albedo - b.albedo).max(axis=-1) < SAME_ALBEDO
+    same: NDArray[np.bool_] = depth & normal & albedo & (a.depth > 0)
+    return same
 
 
 # -------------------------------------------------------------------------------------------------------------- views

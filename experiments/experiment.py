@@ -16,6 +16,8 @@ HERE = Path(__file__).parent
 SIZES = "sizes.toml"
 
 SizeName = Literal["small", "paper"]
+Part = Literal["fixed", "movable", "daylight", "vanishing", "static", "ablation"]
+"""Where an experiment stands in the tables."""
 
 
 class References(Frozen):
@@ -55,7 +57,9 @@ class Experiment(Frozen):
 
     name: Name
     title: str
+    part: Part
     about: str  # what was made movable, and why
+    sampling: str  # why it is rendered with these connections and light paths
     scene: str  # the spec, beside the file
     changes: Mapping[str, Any] = Field(default_factory=dict)  # of the spec, for every size
     runs: tuple[Run, ...] = ()  # beside one of each architecture

@@ -25,7 +25,7 @@ from typing import Any, TypeVar, get_args
 import numpy as np
 
 import equal_time
-from experiment import HERE, Experiment, SizeName, names
+from experiment import HERE, Experiment, Part, SizeName, names
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.compare.markdown import markdown_table
@@ -41,15 +41,15 @@ import results  # noqa: E402
 
 T = TypeVar("T")
 
-KINDS: Mapping[str, tuple[str, Table]] = {
-    "movable": ("Table 2: movable objects and lights", MOVABLE_LIGHTS),
-    "night": ("The same at night: movable lights are all the light", MOVABLE_LIGHTS),
-    "vanishing": ("The same with lamps that vanish", MOVABLE_LIGHTS),
+PARTS: Mapping[Part, tuple[str, Table]] = {
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
-    "static-ablation": ("The supplement's static ablation", {}),
+    "movable": ("Table 2: movable objects and lights; the lights that move are all the light", MOVABLE_LIGHTS),
+    "daylight": ("The rooms of Table 2 by day: windows and sky add light that does not move", MOVABLE_LIGHTS),
+    "vanishing": ("A room of Table 2 with lamps that vanish", MOVABLE_LIGHTS),
     "static": ("Static rooms", {}),
+    "ablation": ("The supplement's static ablation", {}),
 }
-"""The page's parts by how the names of their experiments begin; of those that fit, the first."""
+"""The page's parts: title, and the paper's figures."""
 
 ORDER = ("cnn", "feature_projection", "light_transport", "light_transport_photons")
 OURS = (
@@ -237,8 +237,8 @@ def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
 def page(found: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
     parts = [f"# The paper's tables over our rooms, `{size}`", introduction(found, size), READING]
-    for kind, (title, published) in KINDS.items():
-        if rooms := [room for room in found if kind_of(room.name) == kind]:
+    for part, (title, published) in PARTS.items():
+        if rooms := [room for room in found if room.experiment.part == part]:
             named = ", ".join(room.name for room in rooms)
             parts.append(f"## {title}\n\nMeans over: {named}.{lacking(rooms)}\n\n{paper_table(rooms, published)}")
             parts.append(f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}")
@@ -253,11 +253,6 @@ def page(found: Sequence[Room], size: SizeName) -> str:
         f"{said(found, lambda room: str(room.document['commit']))}."
     )
     return "\n\n".join(parts)
-
-
-def kind_of(name: str) -> str:
-    """Which part of the page an experiment is in."""
-    return next(kind for kind in KINDS if name.startswith(kind))
 
 
 def page_of(size: SizeName) -> str:

@@ -13,13 +13,12 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.cli import service
 from photonfarm.trainer.data.dataset import Batch, fill
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.predict.evaluation import network_predictor
 from photonfarm.trainer.runs import biased
-from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, settings_of
 from photonfarm.trainer.training.loop import train
 from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
@@ -60,14 +59,17 @@ def firefly(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 )
 def test_what_biases_under_noisy_targets_is_refused_with_the_reason(changes: dict[str, object], found: str) -> None:
     with pytest.raises(SpecError, match=found):
-        service._settings("small", changes)
+        settings_of("small", changes)
 
 
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"loss": "squared"}, r"loss = 'squared': Input should be 'linear', 'relative' or 'paired'$"),
-        ({"loss": 3}, r"loss = 3: Input should be 'linear', 'relative' or 'paired'$"),
+        (
+            {"loss": "squared"},
+            r"loss = 'squared': Input should be 'linear', 'relative' or 'paired', or MODULE:NAME of your own$",
+        ),
+        ({"loss": 3}, r"loss = 3: Input should be 'linear', 'relative' or 'paired', or MODULE:NAME of your own$"),
         ({"optimiser": "sgd"}, r"optimiser = 'sgd': Input should be 'adam' or 'rmsprop'$"),
         ({"gradient": 1}, r"gradient: unknown key"),
         ({"demodulation": 0.0}, r"demodulation = 0\.0: Input should be greater than 0$"),
@@ -76,13 +78,13 @@ def test_what_biases_under_noisy_targets_is_refused_with_the_reason(changes: dic
 )
 def test_other_values_get_the_ordinary_message(changes: dict[str, object], found: str) -> None:
     with pytest.raises(SpecError, match=found) as error:
-        service._settings("small", changes)
+        settings_of("small", changes)
     assert "bias" not in str(error.value)
 
 
 def test_every_fault_is_named_at_once() -> None:
     with pytest.raises(SpecError, match=r"max_grad_norm = 1: .*; loss = 'l1': "):
-        service._settings("small", {"loss": "l1", "max_grad_norm": 1})
+        settings_of("small", {"loss": "l1", "max_grad_norm": 1})
 
 
 def test_the_figures_of_the_messages_are_those_that_the_benchmark_measures(firefly: ModuleType) -> None:

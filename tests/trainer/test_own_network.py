@@ -10,7 +10,8 @@ from click.testing import CliRunner, Result
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.trainer import train
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.training.losses import LOSSES, loss_of
 from photonfarm.trainer.training.unbiasedness import judged
@@ -127,3 +128,14 @@ def test_what_is_no_network_is_refused(mine: str, store: Path, name: str, lacks:
             ["train", "--store", str(store), "--architecture", name.format(mine), "--summary"],
             catch_exceptions=False,
         )
+
+
+def test_training_in_one_call_goes_on_where_the_command_line_left_off(mine: str, store: Path, tmp_path: Path) -> None:
+    settings = {"hold_out": 0.4, "batch": 2, "architecture": f"{mine}:PerPixel", "width": 4, "validate_every": 2}
+    pairs = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
+    assert photonfarm("train", "--store", store, "--run", "run", *pairs, "--steps", 2).exit_code == 0
+    run = train(store, Store(store).scenes()[0].spec.name, "run", max_steps=4, **settings)
+    assert run.settings.max_steps == 4
+    assert run.settings.network.architecture == f"{mine}:PerPixel"
+    with pytest.raises(SpecError, match="hold_outs"):
+        train(store, run.scene_id, "other", hold_outs=0.4)

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.cli import service
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, small
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, settings_of, small
 from photonfarm.trainer.training.losses import paired_loss
 
 
@@ -57,7 +57,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainSettings]:
     found: list[TrainSettings] = []
 
     def run(spec, store, run, preset_name, changes, redis_url) -> None:
-        found.append(service._settings(preset_name, changes))
+        found.append(settings_of(preset_name, changes))
 
     monkeypatch.setattr(service, "run", run)
     return found

@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from pydantic import ValidationError
 from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.core.estimate import stated
 from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.scene.spec import load_spec, sentences
+from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
 from photonfarm.trainer.runs import wait_times as waits
 from photonfarm.trainer.runs.run_folder import held
-from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings, preset
+from photonfarm.trainer.runs.settings import TrainSettings, settings_of
 
 if TYPE_CHECKING:
     from photonfarm.trainer.runs.distributed import Group
@@ -55,7 +54,7 @@ def run(
     from photonfarm.trainer.training.assist import assist
     from photonfarm.trainer.training.loop import stop_on_signals
 
-    settings = _settings(preset_name, changes)
+    settings = settings_of(preset_name, changes)
     with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
         group = ours or ALONE
         device = group.device(settings.device)
@@ -129,7 +128,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     from photonfarm.trainer.networks import kind_of
     from photonfarm.trainer.networks.summary import summary, table
 
-    network = _settings(preset_name, changes).network
+    network = settings_of(preset_name, changes).network
     if spec:
         scene = load_spec(spec)
     else:
@@ -158,7 +157,7 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
 
     if (size := processes()) > 1:
         raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
-    settings = _settings(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
+    settings = settings_of(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
     scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
     if scene_id is None or not StoreSource(store, scene_id).ready():
         wanted = f" {spec}" if spec else ""
@@ -176,18 +175,6 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
         if stop.is_set():
             tell(f"stopped after {len(cells)} cells; the same command goes on")
         return table(cells)
-
-
-def _settings(name: str, changes: dict[str, Any]) -> TrainSettings:
-    """A preset with changes; keys of the network may stand among them, under their own names."""
-    network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
-    others = {key: value for key, value in changes.items() if key not in network}
-    if "network" in others:
-        raise SpecError("the settings of the training: network: its keys are set each by its own name, as in width=32")
-    try:
-        return preset(name, network=network, **others)
-    except ValidationError as error:
-        raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error
 
 
 def _begun_on(folder: Path) -> str | None:

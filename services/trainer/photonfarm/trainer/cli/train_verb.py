@@ -10,12 +10,21 @@ from typing import Any, get_args
 import click
 
 from photonfarm.shared.cli.options import redis_option, store_option
+from photonfarm.trainer.runs.own import is_own
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
 
 run_option = click.option(
     "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
     show_default=True, help="Folder of the training run: checkpoints, metrics.",
 )  # fmt: skip
+
+
+class ChoiceOrOwn(click.Choice[str]):
+    """One of some names, or `MODULE:NAME`."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The name as written; fails for one that is neither."""
+        return value if is_own(value) else super().convert(value, param, ctx)
 
 
 class Pairs(click.Option):
@@ -56,7 +65,7 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 )
 @click.option(
     "--architecture",
-    metavar=f"[{'|'.join(get_args(Architecture))}|MODULE:CLASS]",
+    type=ChoiceOrOwn(get_args(Architecture)),
     help="Kind of network; denoise_K is given one of K pixels in noisy colour; MODULE:CLASS is one of your own.  "
     "[default: the preset's]",
 )

@@ -9,8 +9,11 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.own import is_own
 
@@ -32,15 +35,17 @@ Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 
 
-def _one_of(kind: Any) -> AfterValidator:
+def _one_of(kind: Any) -> BeforeValidator:
     """What allows the values of a literal, and `MODULE:NAME`."""
 
-    def check(name: str) -> str:
-        if name not in get_args(kind) and not is_own(name):
-            raise ValueError(f"is none of {', '.join(get_args(kind))}, nor MODULE:NAME of your own")
+    def check(name: object) -> object:
+        if name not in get_args(kind) and not (isinstance(name, str) and is_own(name)):
+            *first, last = map(repr, get_args(kind))
+            rule = f"Input should be {', '.join(first)} or {last}, or MODULE:NAME of your own"
+            raise PydanticCustomError("literal_error", "{rule}", {"rule": rule})
         return name
 
-    return AfterValidator(check)
+    return BeforeValidator(check)
 
 
 ArchitectureName = Annotated[str, _one_of(Architecture)]
@@ -200,3 +205,17 @@ def preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), *
     """The settings of a preset with changes, those of its network in `network`. Raises ValidationError."""
     settings = PRESETS[name](**changes)
     return TrainSettings.model_validate({**dict(settings), "network": {**dict(settings.network), **network}})
+
+
+def settings_of(name: str, changes: Mapping[str, Any]) -> TrainSettings:
+    """A preset with changes by key; keys of the network stand among the others. Raises SpecError for each fault."""
+    network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
+    others = {key: value for key, value in changes.items() if key not in network}
+    if "network" in others:
+        raise SpecError("the settings of the training: network: its keys are set each by its own name, as in width=32")
+    if name not in PRESETS:
+        raise SpecError(f"the settings of the training: preset = {name!r}: is none of {', '.join(PRESETS)}")
+    try:
+        return preset(name, network=network, **others)
+    except ValidationError as error:
+        raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error

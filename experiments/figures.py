@@ -1,0 +1,150 @@
+#!/usr/bin/env python3
+"""Puts pictures of the experiments' reports together, as the supplement's Figures 3 to 8 show them.
+
+    python experiments/figures.py [--rooms NAME ...] [--work build/experiments/small] [--out docs/results/figures]
+
+Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves
+NAME.png, what was trained on, prediction, reference and difference [S Figs. 3, 4]; of others NAME-time-METRIC.svg, error
+over the time of a frame [S Figs. 5, 6]; NAME-predictions.png, predictions of several networks above their errors [S Fig. 7];
+NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from experiment import HERE, Experiment
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.pictures import Picture
+from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
+from photonfarm.trainer.predict.animation import read_png, write_png
+from photonfarm.trainer.report.pictures import OVERVIEW, coloured
+
+ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room-2",
+         "fixed-veach-ajar"]  # fmt: skip
+METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
+COMPARED = ("denoise_1", "denoise_16", "oidn 1/1", "cnn", "feature_projection", "light_transport",
+            "light_transport_photons", "guided_transport", "guided_transport_photons")  # fmt: skip
+BEFORE, AFTER = "light_transport_photons", "guided_transport"
+VIEWS = 3
+SIZE = 192  # px of a tile
+REFERENCE = "reference"
+
+
+class Report:
+    """The pictures of a report: a tile (H, W, 3) for each view that it shows and each predictor."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises IncompleteError where there is no report."""
+        self.folder = folder
+        if not (folder / "report.json").is_file():
+            raise IncompleteError(f"{folder}: holds no report; `make experiments-small` makes it")
+        document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
+        sheet = read_png(folder / COMPARISON)
+        width = (sheet.shape[1] + GAP) // len(names) - GAP
+        step = width + LINE + GAP
+        self.views = sheet.shape[0] // step
+        top = sheet.shape[0] + GAP - self.views * step
+        self.tiles = {
+            name: [_tile(sheet, top + view * step + LINE, column * (width + GAP), width) for view in range(self.views)]
+            for column, name in enumerate(names)
+        }
+        worst = {}
+        for case in document["worst_cases"]:
+            worst.setdefault(case["row"], []).append(case["kind"])
+        self.worst = [", ".join(kinds) for kinds in worst.values()]
+        """What each of the last views is the worst of; the views before these are the first that are held out."""
+
+
+def _tile(sheet: Picture, y: int, x: int, size: int) -> Picture:
+    tile = Image.fromarray(sheet[y : y + size, x : x + size]).resize((SIZE, SIZE), Image.Resampling.NEAREST)
+    return np.asarray(tile)
+
+
+def error(tile: Picture, reference: Picture) -> Picture:
+    """|prediction − reference| as shown, the mean of the channels, as colours."""
+    apart: NDArray[np.float32] = np.abs(tile.astype(np.float32) - reference).mean(axis=-1) / np.float32(255)
+    return coloured(apart)
+
+
+def predictions(report: Report) -> Picture:
+    """A column for the reference and one for each network, with the error below each image."""
+    names = [name for name in COMPARED if name in report.tiles]
+    first = min(VIEWS, report.views - len(report.worst))
+    reference = report.tiles[REFERENCE]
+    blank = np.full((SIZE, SIZE, 3), 255, np.uint8)
+    rows = []
+    for view in range(first):
+        shown = [report.tiles[name][view] for name in names]
+        rows.append([reference[view], *shown])
+        rows.append([blank, *(error(tile, reference[view]) for tile in shown)])
+    return sheet_of([REFERENCE, *names], rows, [""] * len(rows))
+
+
+def worst_cases(report: Report) -> Picture:
+    """The worst views: reference, the published networks' best and ours, each with its error."""
+    first = report.views - len(report.worst)
+    rows = []
+    for view in range(first, report.views):
+        reference, before, after = (report.tiles[name][view] for name in (REFERENCE, BEFORE, AFTER))
+        rows.append([reference, before, error(before, reference), after, error(after, reference)])
+    return sheet_of([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, report.worst)
+
+
+def sheet_of(heads: list[str], rows: list[list[Picture]], captions: list[str]) -> Picture:
+    """Tiles in rows, a head above each column and a caption above each row that has one."""
+    font = ImageFont.load_default(13)
+    step = [SIZE + GAP + (LINE if caption else 0) for caption in captions]
+    sheet = Image.new("RGB", (len(heads) * (SIZE + GAP) - GAP, LINE + sum(step)), "white")
+    draw = ImageDraw.Draw(sheet)
+    for column, head in enumerate(heads):
+        draw.text((column * (SIZE + GAP), 0), head, fill="black", font=font)
+    y = LINE
+    for row, caption, height in zip(rows, captions, step, strict=True):
+        draw.text((0, y), caption and f"worst of {caption}", fill="black", font=font)
+        for column, tile in enumerate(row):
+            sheet.paste(Image.fromarray(tile), (column * (SIZE + GAP), y + height - SIZE - GAP))
+        y += height
+    return np.asarray(sheet)
+
+
+def make(name: str, report: Report, out: Path) -> None:
+    """The figures of one room."""
+    if Experiment.load(name, "small").part == "static":
+        shutil.copy(report.folder / OVERVIEW, out / f"{name}.png")
+        return
+    for metric in METRICS:
+        shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")
+    write_png(predictions(report), out / f"{name}-predictions.png")
+    write_png(worst_cases(report), out / f"{name}-worst.png")
+
+
+def main() -> int:
+    """Make the figures of all rooms; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
+    parser.add_argument("--work", type=Path, default=HERE.parent / "build/experiments/small")
+    parser.add_argument("--out", type=Path, default=HERE.parent / "docs/results/figures")
+    told = parser.parse_args()
+    told.out.mkdir(parents=True, exist_ok=True)
+    code = 0
+    for name in told.rooms:
+        try:
+            make(name, Report(told.work / name / "report"), told.out)
+        except IncompleteError as error_:
+            print(f"error: {error_}", file=sys.stderr)
+            code = IncompleteError.exit_code
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -4,8 +4,8 @@
     python experiments/figures.py [--rooms NAME ...] [--work build/experiments/small] [--out docs/results/figures]
 
 Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: what was trained on,
-prediction, reference and difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time of
-a frame [S Figs. 5, 6]; NAME-predictions.png, predictions of several networks above their errors [S Fig. 7]; and
+prediction, reference and difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
+of a frame [S Figs. 5, 6]; NAME-predictions.png, predictions of several networks above their errors [S Fig. 7]; and
 NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not run.
 """
 

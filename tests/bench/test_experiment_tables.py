@@ -91,9 +91,9 @@ def cells(page: str, first: str) -> list[str]:
 
 
 def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
-    page = tables.room_table([room("movable-living-room-2")])
-    told = dict(zip(cells(page, "experiment"), cells(page, "movable-living-room-2"), strict=True))
-    assert told["title"] == "Movable objects and lights: The White Room"
+    page = tables.room_table([room("night-living-room-2")])
+    told = dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
+    assert told["title"] == "At night: The White Room"
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
     assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
     assert (told["connections"], told["light ratio"]) == ("4", "0.25")
@@ -102,9 +102,9 @@ def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> Non
 
 
 def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
-    rooms = [room("movable-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
+    rooms = [room("night-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
     assert tables.lacking(rooms) == (
-        " Rows that a room lacks are means over the others: denoise_4 without movable-living-room."
+        " Rows that a room lacks are means over the others: denoise_4 without night-living-room."
     )
     page = tables.paper_table(rooms, tables.MOVABLE_LIGHTS)
     assert cells(page, "denoise_4")[1] == "500.0"
@@ -115,7 +115,7 @@ def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
     own = (*NETWORKS, "light_transport_without_descriptor")
     found = [room("static-ablation", report(own, steps=1200, film=128)), room("static-kitchen")]
     page = tables.page(found, "small")
-    ablation, static = page.split("## The supplement's static ablation")[1].split("## Static rooms")
+    static, ablation = page.split("## Static rooms")[1].split("## The supplement's static ablation")
     assert "| light_transport_without_descriptor |" in ablation
     assert "Means over: static-ablation.\n" in ablation
     assert "Means over: static-kitchen.\n" in static
@@ -160,7 +160,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
         }  # fmt: skip
     bare["evaluation"]["rows"][1]["frame_seconds"] = None
     bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
-    found = room("movable-living-room", bare)
+    found = room("night-living-room", bare)
     page = tables.page([found], "small")
     assert cells(page, "cnn")[1:] == [
         "100.0", "20.0 (19.0 … 23.0)", "n/a", "0.78", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827",
@@ -173,7 +173,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
 
 
 def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree() -> None:
-    found = room("movable-living-room")
+    found = room("night-living-room")
     found.document["further_seeds"] = {"cnn": [[0.041, 0.043, 0.035, 0.041]], "light_transport": [[0.02] * 4]}
     gap = found.gap("cnn", "light_transport")
     assert gap is not None
@@ -190,14 +190,14 @@ def test_gaps_of_views_that_share_a_configuration_are_refused() -> None:
     for of_row in shared["evaluation"]["rows"]:
         of_row["metric_space"]["mse"]["estimate"]["count"] = 2
     with pytest.raises(SpecError, match=r"its 4 views are of 2 configurations; .* set views = 1"):
-        room("movable-living-room", shared).gap("cnn", "feature_projection")
+        room("night-living-room", shared).gap("cnn", "feature_projection")
 
 
 def test_an_earlier_version_s_report_is_refused_with_what_makes_it_anew(tmp_path: Path) -> None:
     file = tmp_path / "report.json"
     file.write_text(json.dumps({key: value for key, value in report().items() if key != "machine"}))
-    with pytest.raises(IncompleteError, match=r"experiments/run\.py movable-living-room` makes it anew"):
-        Room.read(Experiment.load("movable-living-room", "small"), file, "1234567")
+    with pytest.raises(IncompleteError, match=r"experiments/run\.py night-living-room` makes it anew"):
+        Room.read(Experiment.load("night-living-room", "small"), file, "1234567")
 
 
 def test_tables_are_written_with_the_command_and_each_report_s_machine(
@@ -206,13 +206,13 @@ def test_tables_are_written_with_the_command_and_each_report_s_machine(
     arguments = ["--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
     assert tables.main() == IncompleteError.exit_code
-    leave(tmp_path / "work" / "small" / "movable-living-room", "small", report())
+    leave(tmp_path / "work" / "small" / "night-living-room", "small", report())
     assert tables.main() == 0
     document = json.loads((tmp_path / "out" / "tables.json").read_text())
     assert document["command"] == "python experiments/tables.py --size small"
-    assert document["rooms"]["movable-living-room"]["machine"] == MACHINE
-    assert document["rooms"]["movable-living-room"]["further_seeds"]["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
-    assert document["rooms"]["movable-living-room"]["runs"]["cnn"]["trained_on"] == 769
+    assert document["rooms"]["night-living-room"]["machine"] == MACHINE
+    assert document["rooms"]["night-living-room"]["further_seeds"]["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
+    assert document["rooms"]["night-living-room"]["runs"]["cnn"]["trained_on"] == 769
     assert str(tmp_path) not in (tmp_path / "out" / "tables.md").read_text()
 
 
@@ -228,10 +228,10 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
 
     first = made("here", "fixed-living-room")
     page = (tmp_path / "out" / "tables.md").read_text()
-    second = made("elsewhere", "movable-living-room")
-    assert list(second) == ["fixed-living-room", "movable-living-room"]
+    second = made("elsewhere", "night-living-room")
+    assert list(second) == ["fixed-living-room", "night-living-room"]
     assert second["fixed-living-room"] == first["fixed-living-room"]
-    part = page[page.index("## Table 1") : page.index("## What agrees")]
+    part = page[page.index("## Table 1") : page.index("## Error against")]
     assert part in (tmp_path / "out" / "tables.md").read_text()
     assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
     assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size

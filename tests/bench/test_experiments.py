@@ -69,6 +69,7 @@ def test_an_unknown_experiment_is_refused_with_those_that_there_are() -> None:
 
 TINY = """
 title = "A tiny room"
+part = "movable"
 about = "For the test."
 scene = "room.toml"
 

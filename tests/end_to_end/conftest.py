@@ -38,7 +38,7 @@ def small_room_in() -> Callable[[Path], Path]:
     """Writes the ready spec `room`, at 16² and with a small cloud: its kernels, at a fraction of its time."""
     import photonfarm.shared
 
-    text = (Path(photonfarm.shared.__file__).parent / "specs/room.toml").read_text()
+    text = (Path(photonfarm.shared.__file__).parent / "scene/specs/room.toml").read_text()
     text = re.sub(r"(?m)^(width|height) = .*$", r"\1 = 16", re.sub(r"(?m)^points = .*$", "points = 512", text))
 
     def write(folder: Path) -> Path:

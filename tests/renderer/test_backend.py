@@ -8,7 +8,7 @@ import pytest
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core.errors import BackendError
 
-LOAD = "from photonfarm.renderer import backend; print(backend.load(1).variant())"
+LOAD = "from photonfarm.renderer.scene import backend; print(backend.load(1).variant())"
 
 
 def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -16,8 +16,8 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions
-from photonfarm.renderer.bdpt.loops import traced_once
 from photonfarm.renderer.bdpt.randomness import SHIFTS
+from photonfarm.renderer.bdpt.recording import traced_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
 _NEAR_VERTICES = 2

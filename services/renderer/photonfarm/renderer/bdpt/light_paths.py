@@ -25,8 +25,8 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
-from photonfarm.renderer.bdpt.loops import traced_once
 from photonfarm.renderer.bdpt.randomness import Sampler
+from photonfarm.renderer.bdpt.recording import traced_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
 

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.emission import Lights, read_lights, sample_emission
 from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
-from photonfarm.renderer.bdpt.loops import traced_once
-from photonfarm.renderer.bdpt.recording import Recorder
+from photonfarm.renderer.bdpt.recording import Recorder, traced_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]

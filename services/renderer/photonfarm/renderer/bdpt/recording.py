@@ -64,3 +64,12 @@ def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function, recorded. Two variants at most: Dr.Jit records once more where it took data for a constant."""
     frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
     return frozen
+
+
+def traced_once(**arguments: Any) -> tuple[Any, ...]:
+    """``dr.while_loop`` in symbolic mode, without the second tracing by which Dr.Jit looks for loop-invariant state.
+
+    Tracing is most of the time of a small image, and these loops have next to no invariant state to find.
+    """
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        return dr.while_loop(mode="symbolic", **arguments)

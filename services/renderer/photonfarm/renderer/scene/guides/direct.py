@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
-from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted

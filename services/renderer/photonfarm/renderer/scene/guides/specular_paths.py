@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt.emission import Lights
-from photonfarm.renderer.bdpt.loops import traced_once
+from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.guides.direct import Seen, lit, turned
 from photonfarm.renderer.scene.guides.settings import Settings

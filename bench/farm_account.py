@@ -19,6 +19,7 @@ from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import JobWriter, SceneStore, Store
 
 WRITER = "writer of job"  # how a JobWriter's thread is named
@@ -119,8 +120,8 @@ def keep_account(pipe: Any, store: Path, url: str) -> None:
 
 def planned(store: Path, url: str, count: int, options: argparse.Namespace) -> SceneStore:
     """A new store with a number of whole jobs, which are queued: every sample has a configuration of its own."""
-    request = {"modifications": count * options.rows, "views": 1, "passes": 1, "seed": 0}
-    submission = submit(options.spec, store, url, shard_rows=options.rows, **request)
+    request = Request(modifications=count * options.rows)
+    submission = submit(options.spec, store, url, request, shard_rows=options.rows)
     return Store(store).scene(submission.scene_id)
 
 

@@ -73,9 +73,10 @@ Steps = Iterable[tuple[str, Callable[[], Any]]]
 
 def submit(options: argparse.Namespace) -> Steps:
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.plan.request import Request
 
-    request = {"modifications": options.samples // options.views, "views": options.views, "passes": 1, "seed": 0}
-    yield "submit", lambda: submission.submit(options.spec, options.folder / "store", options.redis, **request)
+    request = Request(modifications=options.samples // options.views, views_per_modification=options.views)
+    yield "submit", lambda: submission.submit(options.spec, options.folder / "store", options.redis, request)
 
 
 def reconcile(options: argparse.Namespace) -> Steps:

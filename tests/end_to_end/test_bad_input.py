@@ -14,7 +14,8 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.farm.hold_out_check import check_hold_out
-from photonfarm.shared.farm.submission import request_of, submit
+from photonfarm.shared.farm.submission import submit
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import rows_held_out
@@ -146,7 +147,7 @@ def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_fin
 def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp_path: Path) -> None:
     """With 64 configurations planned before, some of them held out, one more may be of either side."""
     assert here("submit", "room", "--modifications", "64", "--no-queue").returncode == 0
-    wanted = request_of(modifications=1, views=1, passes=1, seed=1)
+    wanted = Request(seed=1)
     check_hold_out(load_spec("room"), tmp_path / "store", 0.125, wanted)
     with pytest.raises(SpecError, match="none is held out"):
         check_hold_out(load_spec("room"), tmp_path / "none", 0.125, wanted)
@@ -155,9 +156,9 @@ def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp
 @pytest.mark.parametrize("spec", ["room", "cornell"])
 def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp_path: Path, spec: str) -> None:
     """Configurations of `room`, views of the static `cornell`; three of them, so that one side is empty often."""
-    request = {"modifications": 3, "views": 1, "passes": 2, "seed": 0}
+    request = Request(modifications=3, passes=2)
     root = tmp_path / "store"
-    scene = Store(root, create=True).scene(submit(spec, root, None, **request).scene_id)
+    scene = Store(root, create=True).scene(submit(spec, root, None, request).scene_id)
     renderer = ShardRenderer(Store(root), worker="test", load=analytic.AnalyticScene.load)
     for job in scene.missing_jobs():
         renderer.render(scene.scene_id, job)
@@ -169,11 +170,11 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
         sides = set(rows_held_out(source, rows.tolist(), share))
         for store in (root, tmp_path / "none"):
             if len(sides) == 2:
-                check_hold_out(load_spec(spec), store, share, request_of(**request))
+                check_hold_out(load_spec(spec), store, share, request)
             else:
                 rule = "all are held out" if sides == {True} else "none is held out"
                 with pytest.raises(SpecError, match=rule):
-                    check_hold_out(load_spec(spec), store, share, request_of(**request))
+                    check_hold_out(load_spec(spec), store, share, request)
         found.add(frozenset(sides))
     assert len(found) == 3, "each way of splitting was met"
 

@@ -18,7 +18,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.farm import dry_run
 from photonfarm.shared.farm.dry_run import DryRun, measured_costs, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
-from photonfarm.shared.plan.request import Extent
+from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.format.schema import bytes_of_rows
@@ -54,9 +54,11 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Verb:
 
 
 def rehearsed(folder: Path, store: Path, told: list[str] | None = None, **options: Any) -> DryRun:
-    request = {"modifications": 6, "views": 2, "passes": 1, "seed": 0, "measure": True, **options}
-    spec = request.pop("spec", None) or spec_file(folder)
-    return rehearse(str(spec), store, tell=(told if told is not None else []).append, **request)
+    spec, measure = options.pop("spec", None) or spec_file(folder), options.pop("measure", True)
+    shard_rows = options.pop("shard_rows", None)
+    request = Request.of(**{"modifications": 6, "views_per_modification": 2, **options})
+    log = (told if told is not None else []).append
+    return rehearse(str(spec), store, request, measure=measure, tell=log, shard_rows=shard_rows)
 
 
 def run(spec: Path, store: Path, *more: str) -> Result:
@@ -96,9 +98,9 @@ def test_a_request_for_no_store_and_for_an_empty_one_is_counted_alike_and_makes_
     [
         ({}, 0, Extent(0, 0, 0)),
         ({"passes": 2}, 12, Extent(6, 0, 0)),
-        ({"views": 3}, 6, Extent(6, 0, 6)),
+        ({"views_per_modification": 3}, 6, Extent(6, 0, 6)),
         ({"modifications": 7}, 2, Extent(1, 1, 2)),
-        ({"modifications": 7, "views": 3}, 9, Extent(7, 1, 9)),
+        ({"modifications": 7, "views_per_modification": 3}, 9, Extent(7, 1, 9)),
     ],
 )
 def test_of_a_grown_request_only_what_is_new_counts(
@@ -156,7 +158,9 @@ def test_what_is_best_already_is_left_as_it_is(tmp_path: Path, verb: Verb) -> No
     better = rehearsed(tmp_path, tmp_path / "none", modifications=100).suggestion
     assert better is not None
     spec = spec_file(tmp_path, transport={"half_spp": better.half_spp})
-    found = rehearsed(tmp_path, tmp_path / "none", spec=spec, modifications=better.modifications, views=better.views)
+    found = rehearsed(
+        tmp_path, tmp_path / "none", spec=spec, modifications=better.modifications, views_per_modification=better.views
+    )
     assert found.suggestion is None
     assert 0 <= found.reduction < 0.05
 

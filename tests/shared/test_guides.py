@@ -359,7 +359,7 @@ def test_without_redis_guides_are_asked_for_and_the_error_says_so(store: Store, 
 
 def test_submitting_an_older_scene_again_asks_for_guides_too(store: Store, scene: SceneStore, tmp_path: Path) -> None:
     (tmp_path / "small.json").write_text(samples.small_spec(guides={"light_samples": 4}).model_dump_json())
-    result = submit(str(tmp_path / "small.json"), store.root, None, modifications=5, views=2, passes=1, seed=0)
+    result = submit(str(tmp_path / "small.json"), store.root, None, REQUEST)
     assert (result.planned, result.planned_before) == (0, 10)
     assert scene.guides.settings() == GuideSpec(light_samples=4)
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from photonfarm.shared.cli.options import json_option, redis_option, request_options, store_option
+
+if TYPE_CHECKING:
+    from photonfarm.shared.plan.request import Request
 
 
 @click.group()
@@ -51,7 +54,8 @@ def submit(
     dry_run: bool,
     no_measure: bool,
     as_json: bool,
-    **request: Any,
+    request: Request,
+    shard_rows: int | None,
 ) -> None:
     """Plan samples of SPEC and queue them; what is planned already is not planned again."""
     from photonfarm.shared.cli import show
@@ -61,10 +65,10 @@ def submit(
         from photonfarm.shared.farm.dry_run import rehearse
 
         tell = partial(click.echo, err=True)
-        show.dry_run(rehearse(spec, store, measure=not no_measure, tell=tell, **request), as_json)
+        show.dry_run(rehearse(spec, store, request, measure=not no_measure, tell=tell, shard_rows=shard_rows), as_json)
     else:
         url = None if no_queue else redis_url
-        show.submission(submission.submit(spec, store, url, retry=retry, **request), as_json)
+        show.submission(submission.submit(spec, store, url, request, retry=retry, shard_rows=shard_rows), as_json)
 
 
 @click.command("top-up")
@@ -145,7 +149,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
 @click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
               help="Samples per pixel of each reference.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
-def up(spec: str, store: str | Path, **options: Any) -> None:
+def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
 
     Ctrl-C stops it within seconds; the same command goes on from there.
@@ -153,7 +157,7 @@ def up(spec: str, store: str | Path, **options: Any) -> None:
     from photonfarm.shared.farm.up import run_farm
 
     try:
-        run_farm(spec, store, **options)
+        run_farm(spec, store, request, **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,8 +78,16 @@ def json_option(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
 
 
-def request_options(command: Command) -> Command:
-    """The options that make a request."""
+def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that make a request, which the command gets as `request`, and `shard_rows`."""
+
+    @wraps(command)
+    def with_request(*, modifications: int, views: int, passes: int, seed: int, **options: Any) -> Any:
+        from photonfarm.shared.plan.request import Request
+
+        asked = {"modifications": modifications, "views_per_modification": views, "passes": passes, "seed": seed}
+        return command(request=Request.of(**asked), **options)
+
     options = (
         click.option("--modifications", type=click.IntRange(1), default=128, show_default=True,
                      help="Random configurations; a static scene has one, of which modifications × views are planned."),
@@ -88,6 +97,7 @@ def request_options(command: Command) -> Command:
         click.option("--shard-rows", type=click.IntRange(1, 4096), default=None,
                      help="Samples per job, fixed for a scene by its first plan.  [default: 32]"),
     )  # fmt: skip
+    found: Callable[..., Any] = with_request
     for option in reversed(options):
-        command = option(command)
-    return command
+        found = option(found)
+    return found

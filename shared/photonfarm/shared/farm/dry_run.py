@@ -10,7 +10,7 @@ from pathlib import Path
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.processes import usable_cores
-from photonfarm.shared.farm.submission import Submission, request_of
+from photonfarm.shared.farm.submission import Submission
 from photonfarm.shared.plan.allocation import Allocation, Terms
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
@@ -52,22 +52,22 @@ class DryRun(Submission):
 def rehearse(
     spec: str,
     store: str | Path,
+    request: Request,
     *,
     measure: bool,
     tell: Callable[[str], None],
     shard_rows: int | None = None,
-    **request: int,
 ) -> DryRun:
     """What `submission.submit` would plan; with `measure`, also what it costs, and whether that is well spent.
 
     `tell` is told why nothing is known of the cost. Raises SpecError and StoreError as `submit` does.
     """
-    loaded, wanted = load_spec(spec), request_of(**request)
-    found = _counted(loaded, wanted, store, shard_rows)
+    loaded = load_spec(spec)
+    found = _counted(loaded, request, store, shard_rows)
     costs = measured_costs(spec) if measure and found.planned else None
     if isinstance(costs, str):
         tell(f"cost and time are not known: {costs}")
-    return with_costs(found, loaded, wanted, costs) if isinstance(costs, SampleCosts) else found
+    return with_costs(found, loaded, request, costs) if isinstance(costs, SampleCosts) else found
 
 
 def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:

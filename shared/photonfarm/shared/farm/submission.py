@@ -39,20 +39,20 @@ def submit(
     spec: str,
     store: str | Path,
     redis_url: str | None,
+    request: Request,
     *,
     retry: bool = False,
     shard_rows: int | None = None,
-    **request: int,
 ) -> Submission:
     """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
 
     Jobs that have failed are tried again; those that were set aside as well with `retry`.
     Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
     """
-    loaded, wanted = load_spec(spec), request_of(**request)
+    loaded = load_spec(spec)
     opened = Store(store, create=True)
     opened.add(loaded).guides.want(loaded.guides)
-    planned = opened.plan(loaded, wanted, shard_rows=shard_rows)
+    planned = opened.plan(loaded, request, shard_rows=shard_rows)
     queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
     scenes = _folder_for_workers(loaded, spec)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=scenes)
@@ -126,8 +126,3 @@ def _folder_for_workers(loaded: SceneSpec, spec: str) -> str | None:
         except SpecError:
             return str(find_spec(spec).absolute().parent)
     return None
-
-
-def request_of(*, modifications: int, views: int, passes: int, seed: int) -> Request:
-    """A request by the names of the options; raises SpecError."""
-    return Request.of(modifications=modifications, views_per_modification=views, passes=passes, seed=seed)

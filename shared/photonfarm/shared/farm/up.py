@@ -23,7 +23,8 @@ from photonfarm.shared.core.estimate import stated
 from photonfarm.shared.core.processes import tied
 from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.submission import request_of, submit, top_up
+from photonfarm.shared.farm.submission import submit, top_up
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import spp_per_pass
 from photonfarm.shared.scene.spec import SCENES_VARIABLE, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store
@@ -41,6 +42,7 @@ Count = tuple[int, int]
 def run_farm(
     spec: str,
     store: str | Path,
+    request: Request,
     *,
     workers: int,
     run: Path,
@@ -50,7 +52,6 @@ def run_farm(
     reference_views: int = 0,
     reference_spp: int = 256,
     shard_rows: int | None = None,
-    **request: int,
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
@@ -64,14 +65,14 @@ def run_farm(
     training = ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
     if train_steps:
         _check_arguments(training)
-        check_hold_out(load_spec(spec), store, hold_out, request_of(**request))
+        check_hold_out(load_spec(spec), store, hold_out, request)
     console = Console(stderr=True, highlight=False)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(spec, store, redis.url, retry=True, shard_rows=shard_rows, **request)
+        planned = submit(spec, store, redis.url, request, retry=True, shard_rows=shard_rows)
         console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references := train_steps > 0 and reference_views > 0:
             where = (f"held-out={hold_out}", f"views=first:{reference_views}")

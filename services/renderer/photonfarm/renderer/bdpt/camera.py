@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from photonfarm.renderer.bdpt.randomness import Sampler
 
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 
@@ -15,15 +16,15 @@ SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 class SensorSample:
     """The lens seen from a surface point."""
 
-    d: Any  # Vector3f: unit direction to the lens
-    position: Any  # Point2f: where the film is hit, in pixels of the crop window
-    weight: Any  # Spectrum: importance/r², normalised over the crop window
-    area_density_over_cos: Any  # Float: p_cam/r², by which primary rays would find the surface, without its cosine
-    start: Any  # Point3f: where primary rays through this film position begin (the near plane)
-    valid: Any  # Bool
+    d: mi.Vector3f  # unit direction to the lens
+    position: mi.Point2f  # where the film is hit, in pixels of the crop window
+    weight: mi.Spectrum  # importance/r², normalised over the crop window
+    area_density_over_cos: mi.Float  # p_cam/r², by which primary rays would find the surface, without its cosine
+    start: mi.Point3f  # where primary rays through this film position begin (the near plane)
+    valid: mi.Bool
 
 
-def check_sensor(sensor: Any, *, light_tracing: bool) -> None:
+def check_sensor(sensor: mi.Sensor, *, light_tracing: bool) -> None:
     """Raise ValueError unless the film is an hdrfilm with a box filter and light can hit the sensor."""
     film = sensor.film()
     if not film.rfilter().is_box_filter():
@@ -52,13 +53,13 @@ def check_sensor(sensor: Any, *, light_tracing: bool) -> None:
 class EyeStart:
     """Primary rays."""
 
-    ray: Any  # Ray3f
-    weight: Any  # Spectrum: the sensor's
-    density: Any  # Float: of the direction, in solid angle over the crop window; 0 where light cannot hit the sensor
-    before_ray: Any  # Float: distance from the pinhole (or the point of the aperture) to the ray's origin
+    ray: mi.Ray3f
+    weight: mi.Spectrum  # the sensor's
+    density: mi.Float  # of the direction, in solid angle over the crop window; 0 where light cannot hit the sensor
+    before_ray: mi.Float  # distance from the pinhole (or the point of the aperture) to the ray's origin
 
 
-def primary_rays(sensor: Any, rng: Any, pixel: Any, *, joined: bool) -> EyeStart:
+def primary_rays(sensor: mi.Sensor, rng: Sampler, pixel: mi.UInt32, *, joined: bool) -> EyeStart:
     """Rays through uniform points of the given pixels (UInt32, row by row in the crop window).
 
     Densities are found where light is ``joined`` to the lens. The box filter counts a sample for the pixel it was drawn
@@ -79,7 +80,9 @@ def primary_rays(sensor: Any, rng: Any, pixel: Any, *, joined: bool) -> EyeStart
     return EyeStart(ray, weight, importance[0] * dr.square(ds.dist), dr.maximum(ds.dist - ahead, 0))
 
 
-def sample_sensor(sensor: Any, si: Any, aperture: Any, active: Any) -> SensorSample:
+def sample_sensor(
+    sensor: mi.Sensor, si: mi.SurfaceInteraction3f, aperture: mi.Point2f, active: mi.Bool
+) -> SensorSample:
     """Join a surface point to the lens. Visibility is left to the caller: test the segment from ``si`` to ``start``.
 
     The segment ends where primary rays begin, so objects before the near plane do not cast shadows and points outside

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,14 +12,14 @@ import mitsuba as mi
 class Splat:
     """Adds images of light paths on the lens to a stack of images."""
 
-    image: Any  # Spectrum, K·H·W: sums, image after image
-    scale: Any  # Float, 1: eye paths per light path over samples per pixel
-    offset: Any  # UInt32: first pixel of the image that a lane's light path belongs to
+    image: mi.Spectrum  # [K·H·W]: sums, image after image
+    scale: mi.Float  # [1]: eye paths per light path over samples per pixel
+    offset: mi.UInt32  # first pixel of the image that a lane's light path belongs to
     width: int  # of the crop window, pixels
     height: int
 
-    def add(self, position: Any, value: Any, active: Any) -> None:
-        """Add ``value`` (Spectrum) at ``position`` (Point2f, pixels of the crop window); what falls outside is lost."""
+    def add(self, position: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
+        """Add ``value`` at ``position``, in pixels of the crop window; what falls outside is lost."""
         inside = active & dr.all((position >= 0) & (position < mi.ScalarVector2f(self.width, self.height)))
         pixel = mi.UInt32(position.y) * self.width + mi.UInt32(position.x)
         dr.scatter_add(self.image, value * self.scale, self.offset + pixel, inside)
@@ -30,8 +29,8 @@ class Splat:
 class Images:
     """K images of one view."""
 
-    radiance: Any  # Spectrum, K·H·W: mean over the samples of a pixel, with the light paths' share
-    hit: Any  # Float, K·H·W: share of primary rays that hit a surface
+    radiance: mi.Spectrum  # [K·H·W]: mean over the samples of a pixel, with the light paths' share
+    hit: mi.Float  # [K·H·W]: share of primary rays that hit a surface
 
     @classmethod
     def black(cls, pixels: int) -> Images:
@@ -49,11 +48,11 @@ class Images:
             dr.scatter_add(self.hit, part.hit, pixel)
         dr.eval(self.radiance, self.hit)
 
-    def tensor(self, width: int, height: int) -> Any:
-        """TensorXf [K, H, W, 3]."""
+    def tensor(self, width: int, height: int) -> mi.TensorXf:
+        """The radiance [K, H, W, 3]."""
         return mi.TensorXf(dr.ravel(self.radiance), (dr.width(self.hit) // (width * height), height, width, 3))
 
-    def put(self, film: Any) -> None:
+    def put(self, film: mi.Film) -> None:
         """Put the one image into a film, each pixel with weight 1."""
         width, height = film.crop_size()
         channels = [*self.radiance]

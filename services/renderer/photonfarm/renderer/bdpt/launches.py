@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -58,16 +57,16 @@ class Lanes:
     height: int
     samples: int  # of one pixel
     light_paths: int  # for one image
-    keys: Any  # UInt32, one for each image: see randomness.image_keys
-    shifts: Any  # UInt32: see randomness.shifts; None without connections
-    counts: Any  # UInt32, (pixels, samples, light paths): the integers above once more
-    first_sample: Any  # UInt32, 1
-    first_light_path: Any  # UInt32, 1
-    eye_scale: Any  # Float, 1: 1 over all samples per pixel
-    splat_scale: Any  # Float, 1: eye paths per light path over all samples per pixel
+    keys: mi.UInt32  # one for each image: see randomness.image_keys
+    shifts: mi.UInt32 | None  # see randomness.shifts; None without connections
+    counts: list[mi.UInt32]  # (pixels, samples, light paths), [1] each: the integers above once more
+    first_sample: mi.UInt32  # [1]
+    first_light_path: mi.UInt32  # [1]
+    eye_scale: mi.Float  # [1]: 1 over all samples per pixel
+    splat_scale: mi.Float  # [1]: eye paths per light path over all samples per pixel
 
     @classmethod
-    def of(cls, launch: Launch, size: tuple[int, int], spp: int, keys: Any, shifts: Any) -> Lanes:
+    def of(cls, launch: Launch, size: tuple[int, int], spp: int, keys: mi.UInt32, shifts: mi.UInt32 | None) -> Lanes:
         """The lanes of a launch of images of ``size`` (W, H) that get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
@@ -90,16 +89,16 @@ class Lanes:
         """Of one image."""
         return self.width * self.height
 
-    def eye(self) -> tuple[Any, Any, Any]:
-        """(image, sample, pixel) of each lane of the eye paths, UInt32."""
+    def eye(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+        """(image, sample, pixel) of each lane of the eye paths."""
         lane = dr.arange(mi.UInt32, self.images * self.samples * self.pixels)
         pixels, samples, _ = self.counts
         layer = lane // pixels
         image = layer // samples if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
         return image, layer - image * samples, lane - layer * pixels
 
-    def light(self) -> tuple[Any, Any]:
-        """(image, number within it) of each lane of the light paths, UInt32."""
+    def light(self) -> tuple[mi.UInt32, mi.UInt32]:
+        """(image, number within it) of each lane of the light paths."""
         lane = dr.arange(mi.UInt32, self.images * self.light_paths)
         image = lane // self.counts[2] if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
         return image, lane - image * self.counts[2]

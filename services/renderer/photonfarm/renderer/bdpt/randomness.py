@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -31,56 +31,66 @@ SHIFTS = 64
 """Depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
 
 
-def image_keys(seeds: Sequence[int]) -> Any:
-    """The seeds as device data, UInt32 [K]."""
+def image_keys(seeds: Sequence[int]) -> mi.UInt32:
+    """The seeds [K] as device data."""
     keys = mi.UInt32(list(seeds))
     dr.make_opaque(keys)  # a single one would be a literal
     return keys
 
 
-def stream(key: Any, purpose: int, number: Any = 0) -> Any:
-    """Sequence (UInt32) of a purpose, of an image or a pixel: the Tiny Encryption Algorithm (Zafar et al. 2010)."""
+def stream(key: mi.UInt32, purpose: int, number: mi.UInt32 | int = 0) -> mi.UInt32:
+    """Sequence of a purpose, of an image or a pixel: the Tiny Encryption Algorithm (Zafar et al. 2010)."""
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
+
+
+class RandomNumbers(Protocol):
+    """What the choice of a light asks of a source of random numbers."""
+
+    def next_1d(self) -> mi.Float:
+        """A number in [0, 1)."""
+
+    def next_2d(self) -> mi.Point2f:
+        """A point in [0, 1)²."""
 
 
 @dataclass(slots=True)
 class Sampler:
     """A point of a sequence, read one pair of dimensions after the other. Loop state."""
 
-    sequence: Any  # UInt32: which sequence
-    index: Any  # UInt32: which point, its bits reversed
-    dimension: Any  # UInt32: pairs read so far
+    sequence: mi.UInt32  # which sequence
+    index: mi.UInt32  # which point, its bits reversed
+    dimension: mi.UInt32  # pairs read so far
 
-    def next_1d(self) -> Any:
-        """A number in [0, 1) (Float)."""
+    def next_1d(self) -> mi.Float:
+        """A number in [0, 1)."""
         seed = self._next_seed()
         return _unit(_scramble(dr.brev(_scramble(self.index, seed)), _mix(seed)))
 
-    def next_independent(self) -> Any:
-        """A number in [0, 1) (Float) that is not stratified, for what gains nothing by it."""
+    def next_independent(self) -> mi.Float:
+        """A number in [0, 1) that is not stratified, for what gains nothing by it."""
         return mi.Float(_mix(self._next_seed() ^ self.index) >> 8) * _ULP
 
-    def next_2d(self) -> Any:
-        """A point in [0, 1)² (Point2f)."""
+    def next_2d(self) -> mi.Point2f:
+        """A point in [0, 1)²."""
         seed = self._next_seed()
         x = _scramble(self.index, seed)  # the bits of a shuffled index, reversed: Sobol's first coordinate
         index = dr.brev(x)
         first = _mix(seed)
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
 
-    def _next_seed(self) -> Any:
+    def _next_seed(self) -> mi.UInt32:
         self.dimension += 1
         return _mix(self.sequence ^ (self.dimension * 0x9E3779B9))
 
 
-def sampler(sequence: Any, index: Any) -> Sampler:
-    """The points ``index`` (UInt32) of the sequences ``sequence`` (UInt32)."""
+def sampler(sequence: mi.UInt32, index: mi.UInt32) -> Sampler:
+    """The points ``index`` of the sequences ``sequence``."""
     return Sampler(mi.UInt32(sequence), dr.brev(index), mi.UInt32(0))
 
 
-def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> Any:
-    """By how much eye paths' numbers are shifted to those of the light paths they are joined to: UInt32 [K·64·n_C].
+def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
+    """By how much eye paths' numbers are shifted to those of the light paths they are joined to [K·64·n_C].
 
     Uniform below the number of light paths, for each image of a launch, depth and connection.
     """
@@ -93,8 +103,8 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> Any:
     return mi.UInt32(np.concatenate(table).tolist())  # a list: Dr.Jit compiles again for each alignment of numpy's
 
 
-def along_curve(lane: Any, n: Any, rng: Sampler) -> Any:
-    """A stratified point in [0, 1)² (Point2f) for each of ``n`` lanes, neighbours in space for neighbours in number.
+def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
+    """A stratified point in [0, 1)² for each of ``n`` lanes, neighbours in space for neighbours in number.
 
     Lane k gets a uniform point of the k-th piece of Morton's curve, cut into n equal pieces (He and Owen, *Extensible
     grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together. The
@@ -106,14 +116,14 @@ def along_curve(lane: Any, n: Any, rng: Sampler) -> Any:
     return dr.minimum((cell + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
 
 
-def _every_other_bit(x: Any) -> Any:
+def _every_other_bit(x: mi.UInt32) -> mi.UInt32:
     """The bits of even number, moved together: 16 bits."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits
     return x
 
 
-def _mix(x: Any) -> Any:
+def _mix(x: mi.UInt32) -> mi.UInt32:
     """A hash of 32 bits (Wellons, *lowbias32*, 2018)."""
     x = mi.UInt32(x)
     x ^= x >> 16
@@ -123,7 +133,7 @@ def _mix(x: Any) -> Any:
     return x ^ (x >> 15)
 
 
-def _scramble(x: Any, seed: Any) -> Any:
+def _scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """A scramble of Owen's kind for numbers whose bits are reversed: bits flip by a hash of the bits below them."""
     x = x + seed
     x ^= x * 0x6C50B47C
@@ -132,7 +142,7 @@ def _scramble(x: Any, seed: Any) -> Any:
     return x ^ (x * 0x8D22F6E6)
 
 
-def _sobol_1(index: Any) -> Any:
+def _sobol_1(index: mi.UInt32) -> mi.UInt32:
     """Sobol's second coordinate, its bits reversed: Pascal's triangle modulo 2 times the bits of the index."""
     x = index
     for shift, bits in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
@@ -140,5 +150,5 @@ def _sobol_1(index: Any) -> Any:
     return x
 
 
-def _unit(reversed_bits: Any) -> Any:
+def _unit(reversed_bits: mi.UInt32) -> mi.Float:
     return mi.Float(dr.brev(reversed_bits) >> 8) * _ULP

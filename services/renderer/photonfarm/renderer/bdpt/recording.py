@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVarTuple
 
 import drjit as dr
+import mitsuba as mi
+
+State = TypeVarTuple("State")
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +32,7 @@ class Recorder:
         self._function = function
         self._recorded: dict[Hashable, _Recording] = {}
 
-    def __call__(self, kind: Hashable, scene: Any, sensor: Any, *arguments: Any) -> Any:
+    def __call__(self, kind: Hashable, scene: mi.Scene, sensor: mi.Sensor | None, *arguments: Any) -> Any:
         """The function's result. `kind` holds every number that the kernels are made for.
 
         What cannot be recorded is called as it is: for good if a second attempt fails too (lenses); Mitsuba makes some
@@ -55,8 +58,8 @@ class Recorder:
 @dataclass(slots=True)
 class _Recording:
     call: Callable[..., Any]
-    scene: Any
-    sensor: Any
+    scene: mi.Scene
+    sensor: mi.Sensor | None
     failures: int = 0
 
 
@@ -66,10 +69,19 @@ def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
     return frozen
 
 
-def traced_once(**arguments: Any) -> tuple[Any, ...]:
+def traced_once(
+    *,
+    state: tuple[*State],
+    cond: Callable[[*State], mi.Bool],
+    body: Callable[[*State], tuple[*State]],
+    labels: Sequence[str],
+    label: str,
+) -> tuple[*State]:
     """``dr.while_loop`` in symbolic mode, without the second tracing by which Dr.Jit looks for loop-invariant state.
 
-    Tracing is most of the time of a small image, and these loops have next to no invariant state to find.
+    Tracing is most of the time of a small image, and these loops have next to no invariant state to find. Dr.Jit
+    evaluates the annotations of dataclasses in ``state``: what they name must be there at run time.
     """
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-        return dr.while_loop(mode="symbolic", **arguments)
+        final: tuple[*State] = dr.while_loop(state, cond, body, labels=labels, label=label, mode="symbolic")
+    return final

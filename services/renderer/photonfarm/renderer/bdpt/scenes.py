@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+import mitsuba as mi
 
 UNBOUNDED = 0xFFFFFFFF
 
 
-def check_scene(scene: Any, *, light_paths: bool) -> None:
+def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
     """Raise ValueError for media, for lights that shine along their normal only, and for lit instances.
 
     The last only where there are ``light_paths``.

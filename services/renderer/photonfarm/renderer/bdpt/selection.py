@@ -10,7 +10,7 @@ Lighting Calculations*, 1996, who choose by an unshadowed estimate at each point
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -23,34 +23,37 @@ _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
 _MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: no wall lies between two cells by its design
 
+LightIndex: TypeAlias = "mi.Int32 | mi.UInt32"
+"""Numbers of lights; ``dr.binary_search`` finds signed ones."""
+
 
 @dataclass(slots=True)
 class Selection:
     """Probabilities of N lights in C = CELLS³ cells."""
 
     count: int  # N
-    lower: Any  # Point3f, 1: corner of the grid
-    cells_per_length: Any  # Vector3f, 1
-    cdf: Any  # Float, C·N: running sums, cell after cell
-    pmf: Any  # Float, C·N
-    slot: Any  # UInt32, by Dr.Jit's registry id of the emitter: its number among the N
-    overall: Any  # Float, N: mean of pmf over the cells
+    lower: mi.Point3f  # [1]: corner of the grid
+    cells_per_length: mi.Vector3f  # [1]
+    cdf: mi.Float  # [C·N]: running sums, cell after cell
+    pmf: mi.Float  # [C·N]
+    slot: mi.UInt32  # by Dr.Jit's registry id of the emitter: its number among the N
+    overall: mi.Float  # [N]: mean of pmf over the cells
 
-    def choose(self, p: Any, u: Any) -> tuple[Any, Any]:
-        """(number of a light: UInt32, its probability: Float) at points ``p``, by inversion of the running sum at u."""
+    def choose(self, p: mi.Point3f, u: mi.Float) -> tuple[mi.Int32, mi.Float]:
+        """(number of a light, its probability) at points ``p``, by inversion of the running sum at u."""
         first = self._cell(p) * self.count
         target = u * dr.gather(mi.Float, self.cdf, first + (self.count - 1))
         last = self.count - 1
         light = dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self.cdf, first + i) <= target)
         return light, dr.gather(mi.Float, self.pmf, first + light)
 
-    def probability(self, p: Any, emitter: Any) -> Any:
+    def probability(self, p: mi.Point3f, emitter: mi.EmitterPtr) -> mi.Float:
         """Probability of choosing ``emitter`` at points ``p``; 0 for the null pointer."""
         number = dr.reinterpret_array(mi.UInt32, emitter)
         slot = dr.gather(mi.UInt32, self.slot, number)
         return dr.gather(mi.Float, self.pmf, self._cell(p) * self.count + slot, number != 0)
 
-    def _cell(self, p: Any) -> Any:
+    def _cell(self, p: mi.Point3f) -> mi.UInt32:
         """The cell that points lie in or are next to; any one for points that are not finite.
 
         NaN converts to what the processor likes: with AVX2 to what lies far outside the table.
@@ -60,8 +63,8 @@ class Selection:
         return dr.minimum((z * CELLS + y) * CELLS + x, CELLS**3 - 1)
 
 
-def read_selection(pointers: Any, ids: list[int], base: Any, box: Any) -> Selection:
-    """The table for N ≥ 2 lights (EmitterPtr) with registry ids ``ids`` and sampling weights ``base`` (Float, N).
+def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box: mi.ScalarBoundingBox3f) -> Selection:
+    """The table for N ≥ 2 lights ``pointers`` with registry ids ``ids`` and sampling weights ``base`` [N].
 
     ``box`` is the scene's bounding box. Lights with weight 0 are never chosen.
     """
@@ -99,6 +102,6 @@ def read_selection(pointers: Any, ids: list[int], base: Any, box: Any) -> Select
     return Selection(n, lower, dr.rcp(size), cdf, pmf, slot, overall)
 
 
-def _over_cell(value: Any, n: int) -> Any:
+def _over_cell(value: mi.Float, n: int) -> mi.Float:
     """Sum over each cell's n entries, at every entry."""
     return dr.repeat(dr.block_sum(value, n), n)

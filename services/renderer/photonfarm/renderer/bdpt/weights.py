@@ -13,20 +13,23 @@ roulette is in none of the densities: it thins samples of a technique and compen
 technique's density is.
 
 Letters: p solid-angle densities, cos = |n_geometric · d|, "in" the edge by which a vertex was reached, "rev" against
-the walk. All functions take and return ``mi.Float`` (or plain floats: the tests sum the weights of one path by hand).
+the walk. All functions take and return ``mi.Float``, or plain floats: the tests sum the weights of one path by hand.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
+import mitsuba as mi
+
+Number: TypeAlias = "mi.Float | float"
 
 LARGEST = 1e30
 """Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
 
 
-def light_start(nee_density: Any, emission: Any) -> Any:
+def light_start(nee_density: Number, emission: Number) -> Number:
     """dVCM of a light path's first ray: p_NEE(y₀)/e (Georgiev 2012, eq. 31), completed on arrival.
 
     ``nee_density``: in area at y₀; for a light at infinity, whose "position" is a direction, in solid angle over the r²
@@ -35,7 +38,7 @@ def light_start(nee_density: Any, emission: Any) -> Any:
     return dr.minimum(nee_density / emission, LARGEST)
 
 
-def eye_start(light_ratio: Any, p_camera: Any) -> Any:
+def eye_start(light_ratio: Number, p_camera: Number) -> Number:
     """dVCM of a primary ray: n_T/p_cam (eq. 31), completed on arrival; 0 where the sensor cannot be hit.
 
     ``p_camera``: density of the ray's direction in solid angle, normalised over the crop window.
@@ -43,7 +46,7 @@ def eye_start(light_ratio: Any, p_camera: Any) -> Any:
     return dr.select(p_camera > 0, dr.minimum(light_ratio / p_camera, LARGEST), 0)
 
 
-def arrive(dvcm: Any, dvc: Any, r2: Any, cos_in: Any) -> tuple[Any, Any]:
+def arrive(dvcm: Number, dvc: Number, r2: Number, cos_in: Number) -> tuple[Number, Number]:
     """(dVCM, dVC) on reaching a later vertex, between eqs. 31–33 and 34–36.
 
     The solid-angle densities become area densities.
@@ -51,7 +54,9 @@ def arrive(dvcm: Any, dvc: Any, r2: Any, cos_in: Any) -> tuple[Any, Any]:
     return dr.minimum(dvcm * r2 / cos_in, LARGEST), dr.minimum(dvc / cos_in, LARGEST)
 
 
-def scatter(dvcm: Any, dvc: Any, count_before: Any, cos_out: Any, p_forward: Any, p_reverse: Any) -> tuple[Any, Any]:
+def scatter(
+    dvcm: Number, dvc: Number, count_before: Number, cos_out: Number, p_forward: Number, p_reverse: Number
+) -> tuple[Number, Number]:
     """(dVCM, dVC) after a non-delta bounce: 1/p_fwd and cos_out/p_fwd·(n·dVCM + p_rev·dVC) (eqs. 34, 35).
 
     ``count_before`` is the count of the technique that joins this sub-path, ended one vertex earlier, to the rest.
@@ -62,12 +67,12 @@ def scatter(dvcm: Any, dvc: Any, count_before: Any, cos_out: Any, p_forward: Any
     )
 
 
-def scatter_delta(dvc: Any, cos_out: Any) -> tuple[Any, Any]:
+def scatter_delta(dvc: Number, cos_out: Number) -> tuple[Number, Number]:
     """(dVCM, dVC) after a delta bounce: nothing joins at either side of it, and p_fwd = p_rev cancel (eqs. 53, 54)."""
     return dr.zeros(type(dvc)) if dr.is_array_v(dvc) else 0.0, cos_out * dvc
 
 
-def hit_emitter(nee_direction_density: Any, emission: Any, dvcm: Any, dvc: Any) -> Any:
+def hit_emitter(nee_direction_density: Number, emission: Number, dvcm: Number, dvc: Number) -> Number:
     """Weight of s=0: 1/(1 + p_ω·dVCM + e·dVC) (eqs. 37, 43), dVCM from *before* and dVC from *after* the arrival.
 
     Written with p_ω instead of the area density, so that r²/cos cancels and the environment needs no case of its own.
@@ -75,7 +80,9 @@ def hit_emitter(nee_direction_density: Any, emission: Any, dvcm: Any, dvc: Any) 
     return 1 / (1 + nee_direction_density * dvcm + emission * dvc)
 
 
-def next_event(p_bsdf_over_p_nee: Any, ratio: Any, count_before: Any, p_reverse: Any, dvcm: Any, dvc: Any) -> Any:
+def next_event(
+    p_bsdf_over_p_nee: Number, ratio: Number, count_before: Number, p_reverse: Number, dvcm: Number, dvc: Number
+) -> Number:
     """Weight of s=1: 1/(1 + wL + wC), wC = ratio·(n·dVCM + p_rev·dVC) (eqs. 37, 44, 45).
 
     ``ratio``: e·cos_x/(p_NEE·cos₀), the density with which a light path from the same point would arrive at x, over
@@ -85,13 +92,13 @@ def next_event(p_bsdf_over_p_nee: Any, ratio: Any, count_before: Any, p_reverse:
 
 
 def light_tracing(
-    sensor_area_density: Any, light_ratio: Any, count_before: Any, p_reverse: Any, dvcm: Any, dvc: Any
-) -> Any:
+    sensor_area_density: Number, light_ratio: Number, count_before: Number, p_reverse: Number, dvcm: Number, dvc: Number
+) -> Number:
     """Weight of t=1: 1/(1 + wL), wL = p_cam,A/n_T·(n·dVCM + p_rev·dVC) (eqs. 37, 46)."""
     return 1 / (1 + sensor_area_density / light_ratio * (count_before * dvcm + p_reverse * dvc))
 
 
-def connection_over_r2(count: Any, r2: Any, light_sum: Any, eye_sum: Any) -> Any:
+def connection_over_r2(count: Number, r2: Number, light_sum: Number, eye_sum: Number) -> Number:
     """Weight of a connection divided by r²: n/(n·r² + wL·r² + wC·r²) (eqs. 37, 40, 41); no 0/0, no spike as r → 0.
 
     ``light_sum`` = p_x→y·cos_y·(n·dVCM + p_rev·dVC) of the light vertex, ``eye_sum`` the same with x and y exchanged.

@@ -25,8 +25,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.randomness import along_curve
-from photonfarm.renderer.bdpt.selection import Selection, read_selection
+from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
+from photonfarm.renderer.bdpt.selection import LightIndex, Selection, read_selection
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
 """How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""
@@ -53,18 +53,18 @@ class Lights:
     Tables "by id" are indexed by Dr.Jit's registry id of the emitter.
     """
 
-    pointers: Any  # EmitterPtr, N
+    pointers: mi.EmitterPtr  # [N]
     count: int  # N
-    kinds: tuple[int, ...]  # kind of each light, N; fixed while the scene's topology is
-    kind: Any  # UInt32, N: the same as data
+    kinds: tuple[int, ...]  # [N]: kind of each light; fixed while the scene's topology is
+    kind: mi.UInt32  # [N]: the same as data
     selection: Selection | None  # probabilities for next event estimation; None for a single light
-    alive: Any  # Float, by id: whether a single light shines, 1 or 0
-    emit_cdf: Any  # Float, N: running sum of the probabilities for light paths, not normalised
-    emission: Any  # Float, by id: ê of the table above, 0 where light paths never start
-    axis: Any  # Vector3f, N: axis of a spot light's cone
-    cos_cutoff: Any  # Float, N: −1 for lights that shine everywhere
-    centre: Any  # Point3f, 1: centre of the scene's sphere
-    radius: Any  # Float, 1: its radius
+    alive: mi.Float  # by id: whether a single light shines, 1 or 0
+    emit_cdf: mi.Float  # [N]: running sum of the probabilities for light paths, not normalised
+    emission: mi.Float  # by id: ê of the table above, 0 where light paths never start
+    axis: mi.Vector3f  # [N]: axis of a spot light's cone
+    cos_cutoff: mi.Float  # [N]: −1 for lights that shine everywhere
+    centre: mi.Point3f  # [1]: centre of the scene's sphere
+    radius: mi.Float  # [1]: its radius
 
     def only(self, kind: int) -> bool:
         """Whether every light that can be selected is of this kind; decided on the host: the rest costs nothing."""
@@ -74,21 +74,21 @@ class Lights:
         """Whether there is a light of this kind: decided on the host."""
         return kind in self.kinds
 
-    def is_kind(self, index: Any, kind: int) -> Any:
-        """Mask (mi.Bool) of the lanes whose light ``index`` is of this kind."""
+    def is_kind(self, index: LightIndex, kind: int) -> mi.Bool:
+        """Mask of the lanes whose light ``index`` is of this kind."""
         if not self.has(kind):
             return mi.Bool(False)
         if self.only(kind):
             return mi.Bool(True)
         return dr.gather(mi.UInt32, self.kind, index) == kind
 
-    def nee_probability(self, emitter: Any, p: Any) -> Any:
+    def nee_probability(self, emitter: mi.EmitterPtr, p: mi.Point3f) -> mi.Float:
         """Probability of choosing ``emitter`` for next event estimation at points ``p`` (0 for the null pointer)."""
         if self.selection is None:
             return dr.gather(mi.Float, self.alive, dr.reinterpret_array(mi.UInt32, emitter))
         return self.selection.probability(p, emitter)
 
-    def emission_factor(self, emitter: Any) -> Any:
+    def emission_factor(self, emitter: mi.EmitterPtr) -> mi.Float:
         """ê of the given emitters (0 for the null pointer)."""
         return dr.gather(mi.Float, self.emission, dr.reinterpret_array(mi.UInt32, emitter))
 
@@ -96,7 +96,7 @@ class Lights:
 # ------------------------------------------------ Reading a scene ------------------------------------------------
 
 
-def read_lights(scene: Any) -> Lights:
+def read_lights(scene: mi.Scene) -> Lights:
     """The scene's lights as they are now: some small arrays and one small kernel, no host synchronisation."""
     emitters = list(scene.emitters())
     n = len(emitters)
@@ -132,15 +132,15 @@ def read_lights(scene: Any) -> Lights:
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
         pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
-    )  # fmt: skip
+    )
 
 
-def _registry_id(emitter: Any) -> int:
+def _registry_id(emitter: mi.Emitter) -> int:
     """Dr.Jit's number of an emitter: a literal, so reading it waits for nothing."""
     return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
 
 
-def _kind(emitter: Any, shape: Any) -> int:
+def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
     kind = _KIND_BY_CLASS.get(emitter.class_name(), EYE_ONLY)
     if kind != AREA:
         return kind
@@ -152,8 +152,8 @@ def _kind(emitter: Any, shape: Any) -> int:
     return AREA
 
 
-def is_flat(mesh: Any) -> Any:
-    """Whether a mesh light's vertex normals are its faces' (Bool, 1), as data.
+def is_flat(mesh: mi.Mesh) -> mi.Bool:
+    """Whether a mesh light's vertex normals are its faces' [1], as data.
 
     Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such
     lights are left to hits, with selection probability 0.
@@ -170,8 +170,8 @@ def is_flat(mesh: Any) -> Any:
     return dr.max(dr.fmax(1 - dr.minimum(dr.minimum(aligned[0], aligned[1]), aligned[2]), 0)) < _FLAT
 
 
-def _weight(emitter: Any, parameters: Any) -> Any:
-    """Weight of selection (Float, 1): the emitter's ``sampling_weight`` while it shines, else 0."""
+def _weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
+    """Weight of selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
     shines = mi.Bool(True)
     keys = list(parameters.keys())
     brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
@@ -184,7 +184,8 @@ def _weight(emitter: Any, parameters: Any) -> Any:
     return dr.select(shines, dr.opaque(mi.Float, emitter.sampling_weight()), 0)
 
 
-def _is_positive(value: Any) -> Any:
+def _is_positive(value: Any) -> mi.Bool:
+    """Whether a parameter of any type is a number above 0, or holds one [1]."""
     if isinstance(value, bool | str):
         return mi.Bool(False)
     if isinstance(value, int | float):
@@ -198,7 +199,7 @@ def _is_positive(value: Any) -> Any:
     return dr.max(highest) > 0 if dr.width(highest) > 1 else highest > 0
 
 
-def _column(n: int, entries: list[Any]) -> Any:
+def _column(n: int, entries: list[mi.Float | float]) -> mi.Float:
     column = dr.zeros(mi.Float, n)
     places = mi.UInt32(list(range(n)))
     for i, entry in enumerate(entries):
@@ -206,14 +207,14 @@ def _column(n: int, entries: list[Any]) -> Any:
     return column
 
 
-def _normalise(weight: Any, n: int) -> tuple[Any, Any]:
-    """(running sum, probabilities) of weights (Float, N). All zero gives zero probabilities."""
+def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
+    """(running sum, probabilities) of weights, each [N]. All zero gives zero probabilities."""
     cdf = dr.cumsum(weight) if n > 1 else weight
     total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
     return cdf, dr.select(total > 0, weight / total, 0)
 
 
-def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
+def _cones(parameters: list[mi.SceneParameters], emitters: list[mi.Emitter]) -> tuple[mi.Vector3f, mi.Float]:
     """Axis and cosine of the cut-off angle of each light; a whole sphere for all but spot lights."""
     n = len(emitters)
     if not any(emitter.class_name() == "SpotLight" for emitter in emitters):
@@ -226,17 +227,14 @@ def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
     return mi.Vector3f(*(_column(n, [axis[k] for axis in axes]) for k in range(3))), _column(n, cosines)
 
 
-def _box(scene: Any) -> Any:
+def _box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
     """The scene's bounding box, or that of a unit sphere where there is no shape."""
     box = scene.bbox()
     return box if box.valid() and scene.shapes() else mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])
 
 
-def _scene_sphere(scene: Any) -> tuple[Any, Any]:
-    """Centre and radius of a sphere around everything, as data.
-
-    Moving an object past the old box recompiles nothing.
-    """
+def _scene_sphere(scene: mi.Scene) -> tuple[mi.Point3f, mi.Float]:
+    """Centre and radius of a sphere around everything, as data: an object that moves past it recompiles nothing."""
     sphere = _box(scene).bounding_sphere()
     radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
     return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
@@ -249,18 +247,18 @@ def _scene_sphere(scene: Any) -> tuple[Any, Any]:
 class DirectSample:
     """A light seen from a surface point."""
 
-    d: Any  # Vector3f: unit direction to the light
-    p: Any  # Point3f: the sampled point of a light with a position
-    at_infinity: Any  # Bool
-    radiance_over_density: Any  # Spectrum: Le/p_NEE
-    density: Any  # Float: p_NEE in solid angle with the selection; the selection alone for delta lights
-    delta: Any  # Bool: no ray can hit this light
-    ratio_over_cos: Any  # Float: e/(p_NEE·cos₀) as in weights.next_event, without cos_x
-    valid: Any  # Bool
+    d: mi.Vector3f  # unit direction to the light
+    p: mi.Point3f  # the sampled point of a light with a position
+    at_infinity: mi.Bool
+    radiance_over_density: mi.Spectrum  # Le/p_NEE
+    density: mi.Float  # p_NEE in solid angle with the selection; the selection alone for delta lights
+    delta: mi.Bool  # no ray can hit this light
+    ratio_over_cos: mi.Float  # e/(p_NEE·cos₀) as in weights.next_event, without cos_x
+    valid: mi.Bool
 
 
-def _choose_start(lights: Lights, rng: Any) -> Any:
-    """Lights (UInt32) for light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
+def _choose_start(lights: Lights, rng: Sampler) -> LightIndex:
+    """Numbers of lights for light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
     if lights.count == 1:
         return dr.zeros(mi.UInt32, dr.width(rng.index))
     cdf, last = lights.emit_cdf, lights.count - 1
@@ -268,7 +266,7 @@ def _choose_start(lights: Lights, rng: Any) -> Any:
     return dr.binary_search(0, last, lambda i: dr.gather(mi.Float, cdf, i) <= target)
 
 
-def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSample:
+def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumbers, active: mi.Bool) -> DirectSample:
     """Choose a light and a point of it, as seen from ``si``."""
     if lights.selection is None:
         index = dr.zeros(mi.UInt32, dr.width(si))
@@ -299,8 +297,9 @@ def sample_direct(lights: Lights, si: Any, rng: Any, active: Any) -> DirectSampl
 
 
 def hit_densities(
-    scene: Any, lights: Lights, emitter: Any, si: Any, origin: Any, vertex: Any, active: Any
-) -> tuple[Any, Any]:
+    scene: mi.Scene, lights: Lights, emitter: mi.EmitterPtr, si: mi.SurfaceInteraction3f,
+    origin: mi.Point3f, vertex: mi.Point3f, active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:  # fmt: skip
     """(p_NEE in solid angle, e) of this hit of a ray from ``origin``, which was spawned at ``vertex``.
 
     The light would have been chosen at the vertex itself: the ray's origin may lie in another cell.
@@ -320,20 +319,20 @@ def hit_densities(
 class Emission:
     """The start of light paths: a ray and what the weights at the first hit need to know of y₀."""
 
-    ray: Any  # Ray3f
-    throughput: Any  # Spectrum: Le·cos₀/e
-    emitter: Any  # EmitterPtr
-    factor: Any  # Float: ê
-    p_direction: Any  # Float: p_ω of a light at infinity
-    sample: Any  # DirectionSample3f: p, n, uv of y₀ on an area light
-    is_area: Any  # Bool
-    at_infinity: Any  # Bool: INFINITE or DIRECTION
-    delta: Any  # Bool: POSITION or DIRECTION
-    valid: Any  # Bool
+    ray: mi.Ray3f
+    throughput: mi.Spectrum  # Le·cos₀/e
+    emitter: mi.EmitterPtr
+    factor: mi.Float  # ê
+    p_direction: mi.Float  # p_ω of a light at infinity
+    sample: mi.DirectionSample3f  # p, n, uv of y₀ on an area light
+    is_area: mi.Bool
+    at_infinity: mi.Bool  # INFINITE or DIRECTION
+    delta: mi.Bool  # POSITION or DIRECTION
+    valid: mi.Bool
 
 
-def sample_emission(lights: Lights, rng: Any, path: Any, paths: Any) -> Emission:
-    """Start light paths, number ``path`` (UInt32) of ``paths``: neighbours in number set out in like directions."""
+def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UInt32) -> Emission:
+    """Start light paths, number ``path`` of ``paths``: neighbours in number set out in like directions."""
     n = dr.width(rng.index)
     index = _choose_start(lights, rng)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
@@ -362,7 +361,7 @@ def sample_emission(lights: Lights, rng: Any, path: Any, paths: Any) -> Emission
     return out
 
 
-def _start_on_area(out: Emission, u_position: Any, u_direction: Any, mask: Any) -> None:
+def _start_on_area(out: Emission, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool) -> None:
     ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
     si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
@@ -371,7 +370,9 @@ def _start_on_area(out: Emission, u_position: Any, u_direction: Any, mask: Any) 
     out.sample = mi.DirectionSample3f(ps)
 
 
-def _start_at_infinity(out: Emission, lights: Lights, u_position: Any, u_direction: Any, mask: Any) -> None:
+def _start_at_infinity(
+    out: Emission, lights: Lights, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool
+) -> None:
     reference = dr.zeros(mi.Interaction3f)
     reference.p = lights.centre
     ds, weight = out.emitter.sample_direction(reference, u_direction, mask)
@@ -383,7 +384,7 @@ def _start_at_infinity(out: Emission, lights: Lights, u_position: Any, u_directi
     out.p_direction[mask] = ds.pdf
 
 
-def _start_at_point(out: Emission, lights: Lights, index: Any, u: Any, mask: Any) -> None:
+def _start_at_point(out: Emission, lights: Lights, index: LightIndex, u: mi.Point2f, mask: mi.Bool) -> None:
     axis, cos_cutoff = dr.gather(mi.Vector3f, lights.axis, index), dr.gather(mi.Float, lights.cos_cutoff, index)
     cos_theta = 1 - u.x * (1 - cos_cutoff)
     sin_theta = dr.safe_sqrt(1 - dr.square(cos_theta))
@@ -392,9 +393,8 @@ def _start_at_point(out: Emission, lights: Lights, index: Any, u: Any, mask: Any
     reference = dr.zeros(mi.Interaction3f)
     reference.p = lights.centre
     position = out.emitter.sample_direction(reference, mi.Point2f(0.5), mask)[0].p
-    reference.p = dr.fma(
-        d, lights.radius, position
-    )  # the light's intensity along d is what this point receives, times r²
+    # The light's intensity along d is what this point receives, times r²
+    reference.p = dr.fma(d, lights.radius, position)
     ds, weight = out.emitter.sample_direction(reference, mi.Point2f(0.5), mask)
     out.throughput[mask] = weight * dr.square(ds.dist)
     out.ray = dr.select(mask, mi.Ray3f(position, d), out.ray)

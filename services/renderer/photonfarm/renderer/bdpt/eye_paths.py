@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +15,7 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions
-from photonfarm.renderer.bdpt.randomness import SHIFTS
+from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
@@ -27,18 +26,18 @@ _NEAR_VERTICES = 2
 class EyeState:
     """Loop variables of an eye path."""
 
-    active: Any  # Bool: this path goes on
-    rng: Any  # Sampler
-    ray: Any  # Ray3f: to this vertex, or out of the scene
-    arrival: Any  # PreliminaryIntersection3f: where it arrives
-    before: Any  # Point3f: the vertex before, where next event estimation would have chosen its light
-    before_ray: Any  # Float: distance from the pinhole to the ray's origin at the first vertex, later 0
-    throughput: Any  # Spectrum
-    radiance: Any  # Spectrum: the estimate so far
-    eta: Any  # Float: product of relative refractive indices, for Russian roulette
-    dvcm: Any  # Float: see weights.py, as they left the vertex before
-    dvc: Any  # Float
-    depth: Any  # UInt32: edges up to this vertex
+    active: mi.Bool  # this path goes on
+    rng: Sampler
+    ray: mi.Ray3f  # to this vertex, or out of the scene
+    arrival: mi.PreliminaryIntersection3f  # where it arrives
+    before: mi.Point3f  # the vertex before, where next event estimation would have chosen its light
+    before_ray: mi.Float  # distance from the pinhole to the ray's origin at the first vertex, later 0
+    throughput: mi.Spectrum
+    radiance: mi.Spectrum  # the estimate so far
+    eta: mi.Float  # product of relative refractive indices, for Russian roulette
+    dvcm: mi.Float  # see weights.py, as they left the vertex before
+    dvc: mi.Float
+    depth: mi.UInt32  # edges up to this vertex
 
 
 @dataclass(slots=True)
@@ -46,23 +45,23 @@ class Connectable:
     """Light vertices, and which of them this pass's eye paths are joined to."""
 
     vertices: LightVertices
-    seen: Any  # UInt32: number each was drawn from
-    paths: Any  # UInt32, 1: how many there are for each image
-    image: Any  # UInt32: image of the launch that a lane belongs to
-    first: Any  # UInt32: the light path of its image that a lane is joined to, but for the shift
-    shifts: Any  # UInt32: see randomness.shifts
+    seen: mi.UInt32  # number each was drawn from
+    paths: mi.UInt32  # [1]: how many there are for each image
+    image: mi.UInt32  # image of the launch that a lane belongs to
+    first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
+    shifts: mi.UInt32  # see randomness.shifts
 
 
 def trace_eye_paths(
-    scene: Any,
+    scene: mi.Scene,
     lights: Lights | None,
     options: PathOptions,
     *,
-    rng: Any,
+    rng: Sampler,
     start: EyeStart,
     connectable: Connectable | None,
-) -> tuple[Any, Any]:
-    """(radiance: Spectrum, whether the first ray hit anything: Bool) of the eye paths that begin with ``start``."""
+) -> tuple[mi.Spectrum, mi.Bool]:
+    """(radiance, whether the first ray hit anything) of the eye paths that begin with ``start``."""
     n = dr.width(start.ray)
     active = dr.full(mi.Bool, options.max_depth > 0, n)
     # Neighbouring lanes are neighbouring pixels, so that Embree may trace them as a bundle
@@ -93,7 +92,7 @@ def trace_eye_paths(
 
 
 def _bounce(
-    s: EyeState, *, scene: Any, lights: Lights | None, options: PathOptions, connectable: Connectable | None
+    s: EyeState, *, scene: mi.Scene, lights: Lights | None, options: PathOptions, connectable: Connectable | None
 ) -> tuple[EyeState]:
     """One vertex of an eye path: light it shines by itself, light from a light, light from light paths, scatter."""
     ctx = mi.BSDFContext()
@@ -163,7 +162,9 @@ def _bounce(
     return (state,)
 
 
-def reverse_pdf(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> Any:
+def reverse_pdf(
+    ctx: mi.BSDFContext, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+) -> mi.Float:
     """Density of sampling ``si.wi`` from ``wo``."""
     exchanged = mi.SurfaceInteraction3f(si)
     wi = mi.Vector3f(si.wi)
@@ -171,7 +172,16 @@ def reverse_pdf(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> Any:
     return bsdf.pdf(ctx, exchanged, wi, active)
 
 
-def _scatter(s: EyeState, ctx: Any, si: Any, bsdf: Any, bs: Any, bs_weight: Any, count: Any) -> None:
+def _scatter(
+    s: EyeState,
+    ctx: mi.BSDFContext,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    bs: mi.BSDFSample3f,
+    bs_weight: mi.Spectrum,
+    count: mi.Float,
+) -> None:
+    """Go on along the sampled direction ``bs``, whose ``bs_weight`` is the BSDF's value over its density."""
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     d = si.to_world(bs.wo)
     cos_out = dr.abs(dr.dot(si.n, d))
@@ -204,18 +214,18 @@ def _roulette(s: EyeState, options: PathOptions) -> None:
 class OwnVertex:
     """The eye vertex that is being joined."""
 
-    si: Any  # SurfaceInteraction3f
-    bsdf: Any  # BSDFPtr
-    throughput: Any  # Spectrum
-    count: Any  # Float: count of the technique that joins the vertex before
-    dvcm: Any  # Float
-    dvc: Any  # Float
-    depth: Any  # UInt32
-    active: Any  # Bool
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    throughput: mi.Spectrum
+    count: mi.Float  # count of the technique that joins the vertex before
+    dvcm: mi.Float
+    dvc: mi.Float
+    depth: mi.UInt32
+    active: mi.Bool
 
 
-def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex) -> Any:
-    """Mean over connections to kept vertices of other light paths, as radiance (Spectrum).
+def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable, own: OwnVertex) -> mi.Spectrum:
+    """Mean over connections to kept vertices of other light paths, as radiance.
 
     The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
     """
@@ -231,7 +241,9 @@ def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own:
     return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
 
 
-def _connect(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex, path: Any) -> Any:
+def _connect(
+    scene: mi.Scene, options: PathOptions, connectable: Connectable, own: OwnVertex, path: mi.UInt32
+) -> mi.Spectrum:
     """One connection (Georgiev 2012, §4.3): both vertices' BSDFs, G without its cosines, visibility and weight."""
     ctx = mi.BSDFContext()
     drawn_from = dr.gather(mi.UInt32, connectable.seen, path, own.active)
@@ -271,8 +283,8 @@ def _connect(scene: Any, options: PathOptions, connectable: Connectable, own: Ow
     return dr.select(active, value, 0)
 
 
-def _surface(vertex: LightVertices, active: Any) -> Any:
-    """The surface at a kept vertex (SurfaceInteraction3f), found again from its intersection record."""
+def _surface(vertex: LightVertices, active: mi.Bool) -> mi.SurfaceInteraction3f:
+    """The surface at a kept vertex, found again from its intersection record."""
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.t, pi.prim_uv, pi.prim_index = vertex.t, vertex.prim_uv, vertex.prim_index
     pi.shape = dr.reinterpret_array(mi.ShapePtr, vertex.shape)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,7 +35,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     Raises ValueError for a value outside these ranges, and on rendering for what it cannot render without bias.
     """
 
-    def __init__(self, props: Any) -> None:
+    def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.max_depth = depth_limit(int(props.get("max_depth", -1)))
         self.rr_depth = int(props.get("rr_depth", 5))
@@ -75,14 +74,14 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     def render(
         self,
-        scene: Any,
-        sensor: Any = 0,
-        seed: Any = 0,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: mi.UInt32 | int = 0,
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
-    ) -> Any:
-        """The image (TensorXf [H, W, C], linear radiance).
+    ) -> mi.TensorXf:
+        """The image [H, W, C], linear radiance.
 
         Raises ValueError for scenes, sensors and films it cannot render.
         """
@@ -100,8 +99,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 dr.eval(image)
             return image
 
-    def render_seeds(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Any:
-        """Independent images of one view (TensorXf [K, H, W, 3]), one for each seed; small ones in one launch.
+    def render_seeds(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> mi.TensorXf:
+        """Independent images of one view [K, H, W, 3], one for each seed; small ones in one launch.
 
         Each is the image that ``render`` gives for its seed: bit by bit on one thread where an image's samples and its
         light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
@@ -110,7 +109,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
-    def _render(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Images:
+    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> Images:
         sensor.sampler().seed(0, 1)  # what another integrator left there would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
@@ -130,7 +129,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 images.add(part, launch.first_image * pixels)
             return images
 
-    def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+    def _trace(
+        self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
+    ) -> Images:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
@@ -150,7 +151,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
     """Trace the light paths and the eye paths of a launch. Where it is recorded, Python runs once for each kind."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
@@ -184,8 +185,8 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
     return images
 
 
-def spread(lane: Any, light_ratio: Any) -> Any:
-    """The light path (UInt32) that an image's eye path of a number is joined to, but for the shift.
+def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
+    """The light path that an image's eye path of a number is joined to, but for the shift.
 
     That number, but where there are more light paths than eye paths: there the eye paths take ones from all over, since
     neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.

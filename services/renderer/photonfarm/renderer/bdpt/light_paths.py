@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -38,8 +37,8 @@ class PathOptions:
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
     connections: int  # n_C: see eye_paths.connect_all
-    count: Any  # Float: technique count of connections in the weights (see integrator.connection_count)
-    light_ratio: Any  # Float: n_T, light paths per eye path
+    count: mi.Float  # technique count of connections in the weights (see integrator.connection_count)
+    light_ratio: mi.Float  # n_T, light paths per eye path
     connects: bool  # whether any connection is made
     traces_light: bool  # whether any light path is joined to the lens
 
@@ -56,32 +55,32 @@ class LightVertices:
     What the surface is there is found again from its intersection record.
     """
 
-    origin: Any  # Point3f: the ray that reached it
-    direction: Any  # Vector3f
-    t: Any  # Float
-    prim_uv: Any  # Point2f
-    prim_index: Any  # UInt32
-    shape: Any  # UInt32: registry id
-    instance: Any  # UInt32
-    throughput: Any  # Spectrum
-    dvcm: Any  # Float
-    dvc: Any  # Float
-    depth: Any  # UInt32: edges from the light
+    origin: mi.Point3f  # the ray that reached it
+    direction: mi.Vector3f
+    t: mi.Float
+    prim_uv: mi.Point2f
+    prim_index: mi.UInt32
+    shape: mi.UInt32  # registry id
+    instance: mi.UInt32
+    throughput: mi.Spectrum
+    dvcm: mi.Float
+    dvc: mi.Float
+    depth: mi.UInt32  # edges from the light
 
 
 @dataclass(slots=True)
 class LightState:
     """Loop variables of a light path."""
 
-    active: Any  # Bool: this path goes on
-    rng: Any  # Sampler
-    ray: Any  # Ray3f: to this vertex
-    hit: Any  # PreliminaryIntersection3f: where it arrives
-    throughput: Any  # Spectrum
-    dvcm: Any  # Float: see weights.py, as they left the vertex before
-    dvc: Any  # Float
-    depth: Any  # UInt32: edges up to this vertex
-    seen: Any  # UInt32: vertices a connection could reach so far
+    active: mi.Bool  # this path goes on
+    rng: Sampler
+    ray: mi.Ray3f  # to this vertex
+    hit: mi.PreliminaryIntersection3f  # where it arrives
+    throughput: mi.Spectrum
+    dvcm: mi.Float  # see weights.py, as they left the vertex before
+    dvc: mi.Float
+    depth: mi.UInt32  # edges up to this vertex
+    seen: mi.UInt32  # vertices a connection could reach so far
 
 
 def empty_vertices(n: int) -> LightVertices:
@@ -96,13 +95,21 @@ def empty_vertices(n: int) -> LightVertices:
 
 
 def trace_light_paths(
-    scene: Any, sensor: Any, lights: Lights, options: PathOptions, *, rng: Sampler, path: Any, paths: Any, splat: Splat
-) -> tuple[LightVertices | None, Any]:
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    lights: Lights,
+    options: PathOptions,
+    *,
+    rng: Sampler,
+    path: mi.UInt32,
+    paths: mi.UInt32,
+    splat: Splat,
+) -> tuple[LightVertices | None, mi.UInt32]:
     """Trace a light path for each of n points of ``rng`` and add their images on the lens by ``splat``.
 
-    ``path`` is a path's number among the ``paths`` (UInt32, 1) of its image in this launch.
+    ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch.
 
-    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) where no connections are wanted.
+    Returns (kept vertices, number each was drawn from [n]), or (None, ·) where no connections are wanted.
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
@@ -122,7 +129,7 @@ def trace_light_paths(
     return vertices, state.seen
 
 
-def first_state(scene: Any, lights: Lights, start: Emission, rng: Any) -> LightState:
+def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler) -> LightState:
     """Loop variables at the first hit."""
     active = mi.Bool(start.valid)
     hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
@@ -134,8 +141,8 @@ def first_state(scene: Any, lights: Lights, start: Emission, rng: Any) -> LightS
 def vertex_bounce(
     s: LightState,
     *,
-    scene: Any,
-    sensor: Any,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
     options: PathOptions,
     start: Emission,
     splat: Splat,
@@ -190,7 +197,7 @@ def vertex_bounce(
     return (state,)
 
 
-def _from_lens(start: Any, si: Any) -> Any:
+def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
     """The ray from the near plane to just before a surface.
 
     The other way round, `spawn_ray_to` would leave out the last part, and what stands just behind the near plane would
@@ -202,7 +209,7 @@ def _from_lens(start: Any, si: Any) -> Any:
     return mi.Ray3f(start, way / distance, distance, si.time, si.wavelengths)
 
 
-def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
+def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in: mi.Float, count: mi.Float) -> None:
     """Sample the next direction. Delta lobes: importance-mode weight times Veach's factor (Veach 1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
@@ -235,7 +242,9 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     s.throughput *= dr.rcp(kept)
 
 
-def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+def _exchanged(
+    ctx: mi.BSDFContext, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Float]:
     """(BSDF·|cos_s(wi)|, pdf) of radiance in along ``wo`` and out along ``si.wi``: directions exchanged.
 
     The pdf is the density of sampling ``si.wi`` from ``wo``: the reverse density of a light path's bounce.
@@ -246,7 +255,9 @@ def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any,
     return bsdf.eval_pdf(ctx, exchanged, wi, active)
 
 
-def start_weights(start: Emission, lights: Lights, p: Any, r2: Any, mask: Any) -> tuple[Any, Any]:
+def start_weights(
+    start: Emission, lights: Lights, p: mi.Point3f, r2: mi.Float, mask: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
     """(dVCM, dVC) of light paths' first rays, which arrive at ``p`` over the squared distance ``r2``; see weights.py.
 
     Lanes outside ``mask`` may hold anything. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ an area light's cos₀ cancels.
@@ -267,7 +278,8 @@ def start_weights(start: Emission, lights: Lights, p: Any, r2: Any, mask: Any) -
     return dvcm, dr.select(start.delta, 0, dvc)
 
 
-def _record(s: LightState, dvcm: Any, dvc: Any) -> LightVertices:
+def _record(s: LightState, dvcm: mi.Float, dvc: mi.Float) -> LightVertices:
+    """The vertex to be kept of a light path."""
     return LightVertices(
         s.ray.o,
         s.ray.d,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +18,8 @@ from photonfarm.renderer.bdpt.recording import Recorder, traced_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
+Columns: TypeAlias = "tuple[mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum]"
+"""Positions, directions, normals and powers of all slots, on the device."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +38,7 @@ class Photons:
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
-def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
+def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
@@ -63,9 +65,9 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Re
 
 
 def trace(
-    scene: Any, _: Any, lights: Lights, keys: Any, count: Any, zero: Any, paths: int, depth: int
-) -> tuple[tuple[Any, ...], Any]:
-    """Positions, directions, normals and powers of all slots, and their bounces; ``count`` is ``paths``, opaque."""
+    scene: mi.Scene, _: None, lights: Lights, keys: mi.UInt32, count: mi.UInt32, zero: mi.Float, paths: int, depth: int
+) -> tuple[Columns, mi.Int32]:
+    """The columns of all slots, and their bounces; ``count`` is ``paths``, and ``zero`` is 0, as data."""
     slots = paths * depth
     sequence = randomness.stream(keys, randomness.PHOTONS)
     path = dr.arange(mi.UInt32, paths)
@@ -90,7 +92,9 @@ def trace(
     return out, bounce
 
 
-def _hit(s: LightState, *, scene: Any, options: PathOptions, out: Any, bounce: Any, paths: Any) -> tuple[LightState]:
+def _hit(
+    s: LightState, *, scene: mi.Scene, options: PathOptions, out: Columns, bounce: mi.Int32, paths: mi.UInt32
+) -> tuple[LightState]:
     """One vertex of a light path: write it down, scatter."""
     si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))

@@ -14,7 +14,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
-from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions
+from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions, exchanged
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
@@ -134,7 +134,7 @@ def _bounce(
         shadow = si.spawn_ray_to(light.p)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), shadow)
         joined &= ~scene.ray_test(shadow, joined)
-        p_reverse = reverse_pdf(ctx, bsdf, si, wo, joined)
+        p_reverse = bsdf.pdf(ctx, *exchanged(si, wo), joined)
         w = weights.next_event(
             dr.select(light.delta, 0, p_forward / light.density),
             light.ratio_over_cos * dr.abs(dr.dot(si.n, light.d)),
@@ -162,16 +162,6 @@ def _bounce(
     return (state,)
 
 
-def reverse_pdf(
-    ctx: mi.BSDFContext, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
-) -> mi.Float:
-    """Density of sampling ``si.wi`` from ``wo``."""
-    exchanged = mi.SurfaceInteraction3f(si)
-    wi = mi.Vector3f(si.wi)
-    exchanged.wi = wo
-    return bsdf.pdf(ctx, exchanged, wi, active)
-
-
 def _scatter(
     s: EyeState,
     ctx: mi.BSDFContext,
@@ -189,7 +179,7 @@ def _scatter(
     s.eta = s.eta * bs.eta
     s.active &= (bs.pdf > 0) & (dr.max(s.throughput) > 0)
 
-    p_reverse = reverse_pdf(ctx, bsdf, si, bs.wo, s.active & ~delta)
+    p_reverse = bsdf.pdf(ctx, *exchanged(si, bs.wo), s.active & ~delta)
     vcm, vc = weights.scatter(s.dvcm, s.dvc, count, cos_out, bs.pdf, p_reverse)
     delta_vcm, delta_vc = weights.scatter_delta(s.dvc, cos_out)
     s.dvcm, s.dvc = dr.select(delta, delta_vcm, vcm), dr.select(delta, delta_vc, vc)
@@ -264,13 +254,10 @@ def _connect(
     # The eye vertex forward and backward; the light vertex with its directions exchanged, and forward
     f, p = own.bsdf.eval_pdf(ctx, si, wo, active)
     active &= dr.max(f) > 0
-    p_reverse = reverse_pdf(ctx, own.bsdf, si, wo, active)
+    p_reverse = own.bsdf.pdf(ctx, *exchanged(si, wo), active)
     bsdf_other = other.bsdf()
     p_other = bsdf_other.pdf(ctx, other, wo_other, active)
-    exchanged = mi.SurfaceInteraction3f(other)
-    wi_other = mi.Vector3f(other.wi)
-    exchanged.wi = wo_other
-    f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, exchanged, wi_other, active)
+    f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, *exchanged(other, wo_other), active)
 
     first_other = vertex.depth == 1
     count_other = mi.Float(dr.select(first_other, 1, options.count))

@@ -168,7 +168,7 @@ def vertex_bounce(
     if options.traces_light:
         aperture = s.rng.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         seen = sample_sensor(sensor, si, aperture, active & smooth & ~first)
-        value, p_reverse = _exchanged(ctx, bsdf, si, si.to_local(seen.d), seen.valid)
+        value, p_reverse = bsdf.eval_pdf(ctx, *exchanged(si, si.to_local(seen.d)), seen.valid)
         cos_out = dr.abs(dr.dot(si.n, seen.d))
         w = weights.light_tracing(
             seen.area_density_over_cos * cos_out, options.light_ratio, count, p_reverse, dvcm, dvc
@@ -217,7 +217,7 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     d = si.to_world(bs.wo)
     cos_out = dr.abs(dr.dot(si.n, d))
-    value, p_reverse = _exchanged(mi.BSDFContext(), bsdf, si, bs.wo, s.active & ~delta)
+    value, p_reverse = bsdf.eval_pdf(mi.BSDFContext(), *exchanged(si, bs.wo), s.active & ~delta)
 
     shading = dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.abs(mi.Frame3f.cos_theta(bs.wo))
     factor = dr.select(delta, delta_weight * shading, value / bs.pdf) * (cos_out / cos_in)
@@ -242,17 +242,16 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     s.throughput *= dr.rcp(kept)
 
 
-def _exchanged(
-    ctx: mi.BSDFContext, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
-) -> tuple[mi.Spectrum, mi.Float]:
-    """(BSDF·|cos_s(wi)|, pdf) of radiance in along ``wo`` and out along ``si.wi``: directions exchanged.
+def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+    """What a BSDF takes to be evaluated with its directions exchanged: ``si`` with ``wo`` for ``si.wi``, and ``si.wi``.
 
-    The pdf is the density of sampling ``si.wi`` from ``wo``: the reverse density of a light path's bounce.
+    Of these, ``bsdf.eval`` gives BSDF·|cos_s(wi)| of radiance that comes in along ``si.wi`` and leaves along ``wo``,
+    and ``bsdf.pdf`` the reverse density of a bounce from ``si.wi`` to ``wo``: that of sampling ``si.wi`` from ``wo``.
     """
-    exchanged = mi.SurfaceInteraction3f(si)
+    turned = mi.SurfaceInteraction3f(si)
     wi = mi.Vector3f(si.wi)
-    exchanged.wi = wo
-    return bsdf.eval_pdf(ctx, exchanged, wi, active)
+    turned.wi = wo
+    return turned, wi
 
 
 def start_weights(

@@ -6,12 +6,12 @@ and XML alike::
     import mitsuba as mi
     mi.set_variant("llvm_ad_rgb")
     import photonfarm.renderer.bdpt
-    image = mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "connections": 1, "light_ratio": 1.0}), seed=7,
-    spp=16)
+    integrator = mi.load_dict({"type": "bdpt", "connections": 1, "light_ratio": 1.0})
+    image = mi.render(scene, integrator=integrator, seed=7, spp=16)
 
 Raises RuntimeError if no variant is set, ValueError for scalar, spectral and polarised ones. ``mi.render`` wraps
-errors raised while rendering (a ValueError that says what is refused) in a RuntimeError; ``integrator.render(scene,
-…)`` raises them as they are.
+errors raised while rendering (a ValueError that says what is refused) in a RuntimeError;
+``integrator.render(scene, …)`` raises them as they are.
 """
 
 from photonfarm.renderer.bdpt.variant import require_variant

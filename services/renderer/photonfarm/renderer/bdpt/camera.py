@@ -30,40 +30,37 @@ def check_sensor(sensor: mi.Sensor, *, light_tracing: bool) -> None:
     if not film.rfilter().is_box_filter():
         raise ValueError(
             f"bdpt: the film's reconstruction filter is {film.rfilter().class_name()!r}; only the box filter is "
-            f"allowed, because "
-            "any other divides by a random sum of weights, to which light splats do not belong: the image would "
-            "be biased "
-            "(most of all at its border); write <rfilter type='box'/> in the film"
+            "allowed, because any other divides by a random sum of weights, to which light splats do not belong: "
+            "the image would be biased (most of all at its border); write <rfilter type='box'/> in the film"
         )
     if film.class_name() != "HDRFilm":
         raise ValueError(
             f"bdpt: the film is {film.class_name()!r}; only 'hdrfilm' is allowed, because samples and light "
-            f"splats are summed "
-            "in one unnormalised RGB block; use an hdrfilm"
+            "splats are summed in one unnormalised RGB block; use an hdrfilm"
         )
     if light_tracing and sensor.class_name() not in SENSORS:
         raise ValueError(
             f"bdpt: the sensor is {sensor.class_name()!r}; light paths can be joined to 'perspective' and "
-            f"'thinlens' only, because "
-            "other sensors in Mitsuba have no sample_direction; use one of these, or light_ratio=0 and connections=0"
+            "'thinlens' only, because other sensors in Mitsuba have no sample_direction; use one of these, or "
+            "light_ratio=0 and connections=0"
         )
 
 
 @dataclass(slots=True)
 class EyeStart:
-    """Primary rays."""
+    """Where eye paths begin: the primary rays, their weights and their densities."""
 
     ray: mi.Ray3f
-    weight: mi.Spectrum  # the sensor's
+    weight: mi.Spectrum  # that the sensor gives it
     density: mi.Float  # of the direction, in solid angle over the crop window; 0 where light cannot hit the sensor
     before_ray: mi.Float  # distance from the pinhole (or the point of the aperture) to the ray's origin
 
 
 def primary_rays(sensor: mi.Sensor, rng: Sampler, pixel: mi.UInt32, *, joined: bool) -> EyeStart:
-    """Rays through uniform points of the given pixels (UInt32, row by row in the crop window).
+    """Rays through uniform points of the given pixels, which are numbered row by row in the crop window.
 
-    Densities are found where light is ``joined`` to the lens. The box filter counts a sample for the pixel it was drawn
-    in.
+    Their densities are found only where light is ``joined`` to the lens. As the filter is a box, a sample counts for
+    the pixel that it was drawn in.
     """
     size = mi.ScalarVector2u(sensor.film().crop_size())
     row = pixel // size[0]

@@ -48,10 +48,7 @@ _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's norma
 
 @dataclass(slots=True)
 class Lights:
-    """The lights of one scene at one moment. N lights.
-
-    Tables "by id" are indexed by Dr.Jit's registry id of the emitter.
-    """
+    """The N lights of a scene at one moment. Tables "by id" are indexed by Dr.Jit's registry id of the emitter."""
 
     pointers: mi.EmitterPtr  # [N]
     count: int  # N
@@ -67,7 +64,7 @@ class Lights:
     radius: mi.Float  # [1]: its radius
 
     def only(self, kind: int) -> bool:
-        """Whether every light that can be selected is of this kind; decided on the host: the rest costs nothing."""
+        """Whether all lights that can be selected are of this kind: decided on the host, so others cost nothing."""
         return all(k in (kind, HIT_ONLY) for k in self.kinds)
 
     def has(self, kind: int) -> bool:
@@ -141,6 +138,7 @@ def _registry_id(emitter: mi.Emitter) -> int:
 
 
 def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
+    """How a light is treated; ``shape`` is the one it covers, if any."""
     kind = _KIND_BY_CLASS.get(emitter.class_name(), EYE_ONLY)
     if kind != AREA:
         return kind
@@ -153,7 +151,7 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
 
 
 def is_flat(mesh: mi.Mesh) -> mi.Bool:
-    """Whether a mesh light's vertex normals are its faces' [1], as data.
+    """Whether a mesh light's vertex normals are its faces' normals, as data [1].
 
     Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such
     lights are left to hits, with selection probability 0.
@@ -171,7 +169,7 @@ def is_flat(mesh: mi.Mesh) -> mi.Bool:
 
 
 def _weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
-    """Weight of selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
+    """The weight of a light's selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
     shines = mi.Bool(True)
     keys = list(parameters.keys())
     brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
@@ -185,7 +183,7 @@ def _weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
 
 
 def _is_positive(value: Any) -> mi.Bool:
-    """Whether a parameter of any type is a number above 0, or holds one [1]."""
+    """Whether a parameter, of whatever type, is or holds a number above 0, as data [1]."""
     if isinstance(value, bool | str):
         return mi.Bool(False)
     if isinstance(value, int | float):
@@ -200,6 +198,7 @@ def _is_positive(value: Any) -> mi.Bool:
 
 
 def _column(n: int, entries: list[mi.Float | float]) -> mi.Float:
+    """The n entries [1] as one array [n]."""
     column = dr.zeros(mi.Float, n)
     places = mi.UInt32(list(range(n)))
     for i, entry in enumerate(entries):
@@ -208,14 +207,14 @@ def _column(n: int, entries: list[mi.Float | float]) -> mi.Float:
 
 
 def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
-    """(running sum, probabilities) of weights, each [N]. All zero gives zero probabilities."""
+    """(running sum [N], probabilities [N]) of weights [N]. Weights that are all 0 have probabilities of 0."""
     cdf = dr.cumsum(weight) if n > 1 else weight
     total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
     return cdf, dr.select(total > 0, weight / total, 0)
 
 
 def _cones(parameters: list[mi.SceneParameters], emitters: list[mi.Emitter]) -> tuple[mi.Vector3f, mi.Float]:
-    """Axis and cosine of the cut-off angle of each light; a whole sphere for all but spot lights."""
+    """(axes [N], cosines of the cut-off angles [N]) of the lights' cones: whole spheres for all but spot lights."""
     n = len(emitters)
     if not any(emitter.class_name() == "SpotLight" for emitter in emitters):
         return mi.Vector3f(*(dr.opaque(mi.Float, x, n) for x in (0, 0, 1))), dr.opaque(mi.Float, -1, n)
@@ -234,7 +233,7 @@ def _box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
 
 
 def _scene_sphere(scene: mi.Scene) -> tuple[mi.Point3f, mi.Float]:
-    """Centre and radius of a sphere around everything, as data: an object that moves past it recompiles nothing."""
+    """(centre, radius) of a sphere around everything, as data: an object that moves past it recompiles nothing."""
     sphere = _box(scene).bounding_sphere()
     radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
     return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
@@ -258,7 +257,7 @@ class DirectSample:
 
 
 def _choose_start(lights: Lights, rng: Sampler) -> LightIndex:
-    """Numbers of lights for light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
+    """The lights that begin light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
     if lights.count == 1:
         return dr.zeros(mi.UInt32, dr.width(rng.index))
     cdf, last = lights.emit_cdf, lights.count - 1
@@ -300,9 +299,9 @@ def hit_densities(
     scene: mi.Scene, lights: Lights, emitter: mi.EmitterPtr, si: mi.SurfaceInteraction3f,
     origin: mi.Point3f, vertex: mi.Point3f, active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:  # fmt: skip
-    """(p_NEE in solid angle, e) of this hit of a ray from ``origin``, which was spawned at ``vertex``.
+    """(p_NEE in solid angle, e) of the light hit at ``si`` by a ray from ``origin``, which was spawned at ``vertex``.
 
-    The light would have been chosen at the vertex itself: the ray's origin may lie in another cell.
+    Next event estimation would have chosen the light at the vertex itself: the ray's origin may lie in another cell.
     """
     reference = dr.zeros(mi.Interaction3f)
     reference.p = origin
@@ -332,7 +331,7 @@ class Emission:
 
 
 def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UInt32) -> Emission:
-    """Start light paths, number ``path`` of ``paths``: neighbours in number set out in like directions."""
+    """Start the light paths of number ``path`` among ``paths`` [1]: neighbours in number set out in like directions."""
     n = dr.width(rng.index)
     index = _choose_start(lights, rng)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)

@@ -1,6 +1,7 @@
-"""Eye sub-paths: from the lens into the scene.
+"""Eye sub-paths walk from the lens into the scene.
 
-They hit lights (s=0), estimate direct light at each vertex (s=1) and connect to light paths.
+They hit lights (s=0), sample a light at each vertex (s=1, next event estimation), and connect their vertices to those
+of light paths (s ≥ 2).
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def trace_eye_paths(
 def _bounce(
     s: EyeState, *, scene: mi.Scene, lights: Lights | None, options: PathOptions, connectable: Connectable | None
 ) -> tuple[EyeState]:
-    """One vertex of an eye path: light it shines by itself, light from a light, light from light paths, scatter."""
+    """One vertex of an eye path: take what it emits, join it to a light and to light paths, scatter."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
@@ -187,10 +188,7 @@ def _scatter(
 
 
 def _roulette(s: EyeState, options: PathOptions) -> None:
-    """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges.
-
-    Paths are kept by their throughput without refraction's scaling.
-    """
+    """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges, by throughput not scaled by refraction."""
     kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
     roulette = s.depth > options.rr_depth
     s.active &= ~roulette | (s.rng.next_independent() < kept)
@@ -202,7 +200,7 @@ def _roulette(s: EyeState, options: PathOptions) -> None:
 
 @dataclass(slots=True)
 class OwnVertex:
-    """The eye vertex that is being joined."""
+    """The eye vertex that is joined to light paths."""
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
@@ -215,9 +213,10 @@ class OwnVertex:
 
 
 def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable, own: OwnVertex) -> mi.Spectrum:
-    """Mean over connections to kept vertices of other light paths, as radiance.
+    """Radiance at an eye vertex from light paths: the mean over connections to kept vertices of several of them.
 
-    The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
+    The first two eye vertices make n_C connections, later ones half as many: these carry less of the image's noise
+    for the same time.
     """
     later = (options.connections + 1) // 2
     near = own.depth <= _NEAR_VERTICES

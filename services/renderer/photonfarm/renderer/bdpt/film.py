@@ -1,4 +1,4 @@
-"""Where estimates go: sums over the pixels of several images in device memory, and Mitsuba's film at the end."""
+"""Estimates are summed over the pixels of several images in device memory, and put into Mitsuba's film at the end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 
 @dataclass(slots=True)
 class Splat:
-    """Adds images of light paths on the lens to a stack of images."""
+    """A stack of images, to which what light paths send to the lens is added."""
 
     image: mi.Spectrum  # [K·H·W]: sums, image after image
     scale: mi.Float  # [1]: eye paths per light path over samples per pixel
@@ -34,11 +34,11 @@ class Images:
 
     @classmethod
     def black(cls, pixels: int) -> Images:
-        """Black images with so many pixels in all."""
+        """Black images of ``pixels`` pixels in all."""
         return cls(dr.zeros(mi.Spectrum, pixels), dr.zeros(mi.Float, pixels))
 
     def add(self, part: Images, first_pixel: int) -> None:
-        """Add a part of the samples, to the pixels from ``first_pixel`` on."""
+        """Add a part of the samples to the pixels from ``first_pixel`` on."""
         if dr.width(part.hit) == dr.width(self.hit):
             self.radiance += part.radiance
             self.hit += part.hit
@@ -49,11 +49,11 @@ class Images:
         dr.eval(self.radiance, self.hit)
 
     def tensor(self, width: int, height: int) -> mi.TensorXf:
-        """The radiance [K, H, W, 3]."""
+        """The radiance of the images [K, H, W, 3]."""
         return mi.TensorXf(dr.ravel(self.radiance), (dr.width(self.hit) // (width * height), height, width, 3))
 
     def put(self, film: mi.Film) -> None:
-        """Put the one image into a film, each pixel with weight 1."""
+        """Put the image, of which there must be one, into a film, each pixel with weight 1."""
         width, height = film.crop_size()
         channels = [*self.radiance]
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):

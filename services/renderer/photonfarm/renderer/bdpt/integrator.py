@@ -19,10 +19,10 @@ from photonfarm.renderer.bdpt.scenes import UNBOUNDED, check_scene, depth_limit
 
 
 class BidirectionalPathTracer(mi.SamplingIntegrator):
-    """Bidirectional path tracer; expected image equal to that of Mitsuba's ``path`` for every choice of its parameters.
+    """Bidirectional path tracer whose expected image is that of Mitsuba's ``path``, whatever its parameters are.
 
-    - ``max_depth`` (int, default -1): longest path in edges, -1 unbounded; 1 shows lights only, 2 direct light. As in
-      ``path``.
+    - ``max_depth`` (int, default -1): longest path in edges, -1 unbounded; 1 shows lights only, 2 direct light, as
+      in ``path``.
     - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; light paths that have
       lost more than two thirds of their throughput meet it before.
     - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
@@ -32,7 +32,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
 
-    Raises ValueError for a value outside these ranges, and on rendering for what it cannot render without bias.
+    Raises ValueError for a value outside these ranges, and when it renders for what it cannot render without bias.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -56,8 +56,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         if self.connections and not self.light_ratio:
             raise ValueError(
                 f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
-                f"connect to; "
-                "use connections=0 or a light_ratio above 0"
+                "connect to; use connections=0 or a light_ratio above 0"
             )
         if self.hide_emitters:
             raise ValueError(
@@ -65,7 +64,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             )
 
     def to_string(self) -> str:
-        """Mitsuba's description of an object."""
+        """The integrator and its parameters in Mitsuba's notation."""
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
         return (
             f"BidirectionalPathTracer[max_depth={depth}, rr_depth={self.rr_depth}, connections={self.connections}, "
@@ -81,9 +80,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        """The image [H, W, C], linear radiance.
+        """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
-        Raises ValueError for scenes, sensors and films it cannot render.
+        ``sensor`` is a sensor or the number of one; ``spp`` of 0 stands for the samples per pixel of its sampler.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
@@ -152,7 +151,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 
 def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
-    """Trace the light paths and the eye paths of a launch. Where it is recorded, Python runs once for each kind."""
+    """Trace the light paths and the eye paths of a launch. Recorded, Python runs it once for each kind of launch."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
     if lights is not None and options.traces_light:
@@ -186,10 +185,11 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
 
 
 def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
-    """The light path that an image's eye path of a number is joined to, but for the shift.
+    """The number of the light path that the eye path ``lane`` of an image is joined to, but for the shift.
 
-    That number, but where there are more light paths than eye paths: there the eye paths take ones from all over, since
-    neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.
+    It is the eye path's own number, except where there are more light paths than eye paths: there the eye paths take
+    light paths from all over, since neighbours among these start alike. Any choice is right, as the shift is uniform
+    over all light paths.
     """
     return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
@@ -199,7 +199,7 @@ def connection_count(connections: int, max_depth: int) -> float:
 
     A connection picks one of a path's vertices at random, so each (s, t) gets n_C/length of them on average. Any
     constant keeps the estimate unbiased (the counts only shape the weights); 3 is about the length in the closed rooms
-    we measured.
+    that were measured.
     """
     return connections / min(3, max(1, max_depth - 2))
 

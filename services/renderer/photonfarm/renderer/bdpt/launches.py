@@ -14,7 +14,7 @@ LAUNCH_PATHS = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Some images, and some samples of every pixel of each."""
+    """Which images are traced together, and which samples of each of their pixels."""
 
     images: int
     first_image: int
@@ -25,7 +25,7 @@ class Launch:
 
 
 def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator[Launch]:
-    """Several images together where they are small, each by itself in several launches where they are not."""
+    """The launches of some images: several small images share one, a large one is split into several."""
     paths = int(pixels * max(1.0, light_ratio))  # for a sample of each pixel
     together = max(1, min(images, LAUNCH_PATHS // (paths * spp)))
     samples = max(1, min(spp, LAUNCH_PATHS // paths))
@@ -40,13 +40,13 @@ def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator
 
 
 def _light_paths(eye_paths: int, light_ratio: float) -> int:
-    """Light paths that belong to the first eye paths of an image: at least one for any of them."""
+    """The number of light paths for the first ``eye_paths`` of an image: at least one if there is any."""
     return max(int(eye_paths > 0), round(eye_paths * light_ratio)) if light_ratio else 0
 
 
 @dataclass(slots=True)
 class Lanes:
-    """A launch as its kernels see it: what shapes them as integers, what may differ between launches as data.
+    """A launch as its kernels see it: the numbers that shape them as integers, those that may differ as data.
 
     Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, and the
     samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
@@ -67,7 +67,7 @@ class Lanes:
 
     @classmethod
     def of(cls, launch: Launch, size: tuple[int, int], spp: int, keys: mi.UInt32, shifts: mi.UInt32 | None) -> Lanes:
-        """The lanes of a launch of images of ``size`` (W, H) that get ``spp`` samples per pixel in all."""
+        """The lanes of a launch whose images have the size ``size`` (W, H) and get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
         return cls(
@@ -81,16 +81,16 @@ class Lanes:
 
     @property
     def kind(self) -> tuple[int, ...]:
-        """The numbers that kernels are made for."""
+        """The numbers that the kernels are made for."""
         return self.images, self.width, self.height, self.samples, self.light_paths
 
     @property
     def pixels(self) -> int:
-        """Of one image."""
+        """The number of pixels of one image."""
         return self.width * self.height
 
     def eye(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
-        """(image, sample, pixel) of each lane of the eye paths."""
+        """(image, sample, pixel) of each eye path's lane."""
         lane = dr.arange(mi.UInt32, self.images * self.samples * self.pixels)
         pixels, samples, _ = self.counts
         layer = lane // pixels
@@ -98,7 +98,7 @@ class Lanes:
         return image, layer - image * samples, lane - layer * pixels
 
     def light(self) -> tuple[mi.UInt32, mi.UInt32]:
-        """(image, number within it) of each lane of the light paths."""
+        """(image, number within the image) of each light path's lane."""
         lane = dr.arange(mi.UInt32, self.images * self.light_paths)
         image = lane // self.counts[2] if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
         return image, lane - image * self.counts[2]

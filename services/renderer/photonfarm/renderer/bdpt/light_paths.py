@@ -1,7 +1,8 @@
-"""Light sub-paths: from a light into the scene, each vertex but the first joined to the lens (t=1), one of each kept.
+"""Light sub-paths walk from a light into the scene; their vertices are joined to the lens, and one of each is kept.
 
-The first vertex is not joined: direct light is next event estimation's, whose noise is less than that of splats, and
-which is complete for it (lights that it cannot sample start no light paths either).
+The first surface vertex is not joined to the lens (t=1) as the later ones are: direct light is left to next event
+estimation, whose noise is less than that of splats, and which is complete for it (lights that it cannot sample start
+no light paths either).
 
 The vertex kept for connections is drawn uniformly among those a connection can reach, by reservoir sampling (Vitter,
 *Random Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each path
@@ -32,7 +33,7 @@ _MAX_THROUGHPUT_KEPT = 0.95
 
 @dataclass(frozen=True, slots=True)
 class PathOptions:
-    """What both kinds of sub-path need to know; numbers which may change between renders are in device memory."""
+    """What both kinds of sub-path need to know; numbers that may change between renders are in device memory."""
 
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
@@ -44,16 +45,13 @@ class PathOptions:
 
     @property
     def kind(self) -> tuple[int, ...]:
-        """The numbers that kernels are made for."""
+        """The numbers that the kernels are made for."""
         return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light
 
 
 @dataclass(slots=True)
 class LightVertices:
-    """One kept vertex for each of N light paths.
-
-    What the surface is there is found again from its intersection record.
-    """
+    """One kept vertex for each of N light paths; its surface is found again from its intersection record."""
 
     origin: mi.Point3f  # the ray that reached it
     direction: mi.Vector3f
@@ -130,7 +128,7 @@ def trace_light_paths(
 
 
 def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler) -> LightState:
-    """Loop variables at the first hit."""
+    """The loop variables at the first hit, with the light paths that hit anything active."""
     active = mi.Bool(start.valid)
     hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     active &= hit.is_valid()
@@ -148,7 +146,7 @@ def vertex_bounce(
     splat: Splat,
     vertices: LightVertices | None,
 ) -> tuple[LightState]:
-    """One vertex of a light path: arrive, join to the lens, keep it perhaps, scatter."""
+    """One vertex of a light path: join it to the lens, keep it perhaps, scatter."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
@@ -198,10 +196,10 @@ def vertex_bounce(
 
 
 def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
-    """The ray from the near plane to just before a surface.
+    """The ray from ``start`` on the near plane to just before a surface.
 
-    The other way round, `spawn_ray_to` would leave out the last part, and what stands just behind the near plane would
-    hide nothing, though it hides all from primary rays.
+    The other way round, ``spawn_ray_to`` would leave out the last part, and what stands just behind the near plane
+    would hide nothing, though it hides all from primary rays.
     """
     end = si.spawn_ray_to(start).o
     way = end - start
@@ -210,7 +208,7 @@ def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
 
 
 def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in: mi.Float, count: mi.Float) -> None:
-    """Sample the next direction. Delta lobes: importance-mode weight times Veach's factor (Veach 1997, eq. 5.20)."""
+    """Sample the next direction; delta lobes by their importance-mode weight times Veach's factor (1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
     bs, delta_weight = bsdf.sample(importance, si, s.rng.next_1d(), s.rng.next_2d(), s.active)
@@ -232,9 +230,10 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
 
 
 def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
-    """Russian roulette by the throughput relative to the start: after ``rr_depth`` edges as in Mitsuba's ``path``.
+    """Russian roulette by the throughput relative to that at the start.
 
-    Before, only of paths that have lost more than two thirds of it: they cost as much as others and carry less.
+    After ``rr_depth`` edges it is as in Mitsuba's ``path``. Before, it is played only with paths that have lost more
+    than two thirds of their throughput: they cost as much as others and carry less.
     """
     left = dr.max(s.throughput) / dr.max(start.throughput)
     kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))

@@ -1,4 +1,4 @@
-"""Photons: the surface hits of light sub-paths, handed out as arrays; the same walk as the renderer's light paths."""
+"""Photons are the surface hits of light sub-paths as arrays, from the same walk as the renderer's light paths."""
 
 from __future__ import annotations
 
@@ -24,17 +24,12 @@ Columns: TypeAlias = "tuple[mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum]"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photons:
-    """P = paths · depth slots; slot d·paths + i is hit d + 1 of path i.
-
-    Empty slots have bounce −1 and zeros elsewhere.
-    """
+    """Photons in P = paths · depth slots: slot d·paths + i holds hit d + 1 of path i, or bounce −1 and zeros."""
 
     position: Floats  # [P, 3], scene units
     direction: Floats  # [P, 3], unit: the way the light travels on arriving
     normal: Floats  # [P, 3], unit: geometric, as the surface is oriented
-    power: (
-        Floats  # [P, 3], watts (RGB) in scene units, over the number of emitted paths: their sum is the arriving flux
-    )
+    power: Floats  # [P, 3], watts (RGB) in scene units, over the number of emitted paths: they sum to the arriving flux
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
@@ -42,11 +37,12 @@ def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorde
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
-    emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
-    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see `emission`) emit none. Compiles
-    nothing again when the scene is edited in place or for another seed; with a ``recorder`` of `trace` Python runs but
-    once, which is most of the time in scenes of many materials. Raises ValueError for scenes with media, and for
-    numbers below 1.
+    emit none), so that sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
+    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see ``emission``) emit none.
+
+    Nothing is compiled again for another seed, or for a scene that was edited in place. With a ``recorder`` of
+    ``trace`` Python runs but once, which saves most of the time in scenes of many materials. Raises ValueError for
+    scenes with media, and for numbers below 1.
     """
     if paths < 1 or depth < 1:
         raise ValueError(f"trace_photons: paths is {paths} and depth {depth}; each must be at least 1")
@@ -67,7 +63,7 @@ def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorde
 def trace(
     scene: mi.Scene, _: None, lights: Lights, keys: mi.UInt32, count: mi.UInt32, zero: mi.Float, paths: int, depth: int
 ) -> tuple[Columns, mi.Int32]:
-    """The columns of all slots, and their bounces; ``count`` is ``paths``, and ``zero`` is 0, as data."""
+    """(columns, bounces) of all slots; ``count`` is ``paths`` and ``zero`` is 0, as data."""
     slots = paths * depth
     sequence = randomness.stream(keys, randomness.PHOTONS)
     path = dr.arange(mi.UInt32, paths)
@@ -95,7 +91,7 @@ def trace(
 def _hit(
     s: LightState, *, scene: mi.Scene, options: PathOptions, out: Columns, bounce: mi.Int32, paths: mi.UInt32
 ) -> tuple[LightState]:
-    """One vertex of a light path: write it down, scatter."""
+    """One vertex of a light path: write it into its slot, scatter."""
     si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & (cos_in > 0)

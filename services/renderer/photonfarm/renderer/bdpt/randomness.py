@@ -32,14 +32,14 @@ SHIFTS = 64
 
 
 def image_keys(seeds: Sequence[int]) -> mi.UInt32:
-    """The seeds [K] as device data."""
+    """The seeds as device data [K]."""
     keys = mi.UInt32(list(seeds))
     dr.make_opaque(keys)  # a single one would be a literal
     return keys
 
 
 def stream(key: mi.UInt32, purpose: int, number: mi.UInt32 | int = 0) -> mi.UInt32:
-    """Sequence of a purpose, of an image or a pixel: the Tiny Encryption Algorithm (Zafar et al. 2010)."""
+    """The sequence of a key (an image's), a purpose and a number (a pixel's): Tiny Encryption (Zafar et al. 2010)."""
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
 
@@ -56,7 +56,7 @@ class RandomNumbers(Protocol):
 
 @dataclass(slots=True)
 class Sampler:
-    """A point of a sequence, read one pair of dimensions after the other. Loop state."""
+    """A point of a sequence, read one pair of dimensions after the other; it is part of the loops' state."""
 
     sequence: mi.UInt32  # which sequence
     index: mi.UInt32  # which point, its bits reversed
@@ -68,7 +68,7 @@ class Sampler:
         return _unit(_scramble(dr.brev(_scramble(self.index, seed)), _mix(seed)))
 
     def next_independent(self) -> mi.Float:
-        """A number in [0, 1) that is not stratified, for what gains nothing by it."""
+        """A number in [0, 1) that is not stratified, for what stratifying gains nothing."""
         return mi.Float(_mix(self._next_seed() ^ self.index) >> 8) * _ULP
 
     def next_2d(self) -> mi.Point2f:
@@ -80,6 +80,7 @@ class Sampler:
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
 
     def _next_seed(self) -> mi.UInt32:
+        """The seed of the next pair of dimensions' scramble."""
         self.dimension += 1
         return _mix(self.sequence ^ (self.dimension * 0x9E3779B9))
 
@@ -90,9 +91,9 @@ def sampler(sequence: mi.UInt32, index: mi.UInt32) -> Sampler:
 
 
 def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
-    """By how much eye paths' numbers are shifted to those of the light paths they are joined to [K·64·n_C].
+    """The shifts from eye paths' numbers to those of the light paths that they are joined to [K·64·n_C].
 
-    Uniform below the number of light paths, for each image of a launch, depth and connection.
+    They are uniform below the number of light paths: one for each image of a launch, depth and connection.
     """
     table = [
         np.random.default_rng([seed, PAIRING, launch.first_sample]).integers(
@@ -104,7 +105,7 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
 
 
 def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
-    """A stratified point in [0, 1)² for each of ``n`` lanes, neighbours in space for neighbours in number.
+    """A stratified point in [0, 1)² for each of ``n`` [1] lanes, close in space for lanes that are close in number.
 
     Lane k gets a uniform point of the k-th piece of Morton's curve, cut into n equal pieces (He and Owen, *Extensible
     grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together. The
@@ -117,7 +118,7 @@ def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
 
 
 def _every_other_bit(x: mi.UInt32) -> mi.UInt32:
-    """The bits of even number, moved together: 16 bits."""
+    """The 16 bits of even number, moved together."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits
     return x
@@ -151,4 +152,5 @@ def _sobol_1(index: mi.UInt32) -> mi.UInt32:
 
 
 def _unit(reversed_bits: mi.UInt32) -> mi.Float:
+    """The number in [0, 1) whose binary digits these are, the last one first: the 24 that a Float holds."""
     return mi.Float(dr.brev(reversed_bits) >> 8) * _ULP

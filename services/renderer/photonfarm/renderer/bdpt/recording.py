@@ -1,4 +1,4 @@
-"""Launches traced by Python once and replayed afterwards: `dr.freeze`, with its key made explicit."""
+"""Launches are traced by Python once and replayed afterwards, by ``dr.freeze`` with its key made explicit."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ ATTEMPTS = 2
 class Recorder:
     """Calls a function of a scene, a sensor and other arguments, recorded once for each kind of call.
 
-    `dr.freeze` tells calls apart by its arguments' variables and by the hashes of Python's numbers among them, and has
-    been seen to replay the recording of another number (Dr.Jit 1.5). So each kind has a recording of its own.
+    ``dr.freeze`` tells calls apart by its arguments' variables and by the hashes of Python's numbers among them, and
+    has been seen to replay the recording of another number (Dr.Jit 1.5). So each kind has a recording of its own.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        """Record calls of `function`."""
+        """Record calls of ``function``."""
         self._function = function
         self._recorded: dict[Hashable, _Recording] = {}
 
     def __call__(self, kind: Hashable, scene: mi.Scene, sensor: mi.Sensor | None, *arguments: Any) -> Any:
-        """The function's result. `kind` holds every number that the kernels are made for.
+        """The function's result. ``kind`` holds every number that the kernels are made for.
 
-        What cannot be recorded is called as it is: for good if a second attempt fails too (lenses); Mitsuba makes some
-        tables when they are first asked for, which fails one attempt. The scene and the sensor of a recording are kept,
-        so that no others are taken for them.
+        Where recording fails, the function is called as it is: Mitsuba makes some tables when they are first asked for,
+        which fails one attempt. It is called so for good once a second attempt has failed (lenses). The scene and the
+        sensor of a recording are kept, so that no others are taken for them.
         """
         kind = (id(scene), id(sensor), kind)
         if kind not in self._recorded:
@@ -57,6 +57,8 @@ class Recorder:
 
 @dataclass(slots=True)
 class _Recording:
+    """A function recorded for one kind of call, and how many attempts have failed."""
+
     call: Callable[..., Any]
     scene: mi.Scene
     sensor: mi.Sensor | None
@@ -64,7 +66,7 @@ class _Recording:
 
 
 def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, recorded. Two variants at most: Dr.Jit records once more where it took data for a constant."""
+    """The function, recorded; in two variants at most, as Dr.Jit records again where it took data for a constant."""
     frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
     return frozen
 

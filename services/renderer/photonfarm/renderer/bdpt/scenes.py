@@ -8,9 +8,9 @@ UNBOUNDED = 0xFFFFFFFF
 
 
 def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
-    """Raise ValueError for media, for lights that shine along their normal only, and for lit instances.
+    """Raise ValueError for media and for lights that shine along their normal only.
 
-    The last only where there are ``light_paths``.
+    Where there are ``light_paths``, also for scenes that have both instances and area lights.
     """
     shapes = scene.shapes()
     for shape in shapes:
@@ -33,7 +33,7 @@ def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
 
 
 def depth_limit(max_depth: int) -> int:
-    """Path length in edges as an unsigned bound; −1 is unbounded. Raises ValueError below −1."""
+    """The longest path, in edges, as an unsigned number; −1 stands for no bound. Raises ValueError below −1."""
     if max_depth < -1:
         raise ValueError(f"bdpt: max_depth is {max_depth}; allowed are -1 (unbounded) and any number of edges from 0")
     return UNBOUNDED if max_depth == -1 else max_depth

@@ -40,7 +40,7 @@ class Selection:
     overall: mi.Float  # [N]: mean of pmf over the cells
 
     def choose(self, p: mi.Point3f, u: mi.Float) -> tuple[mi.Int32, mi.Float]:
-        """(number of a light, its probability) at points ``p``, by inversion of the running sum at u."""
+        """(number of a light, its probability) at points ``p``, by inversion of the running sum at ``u`` in [0, 1)."""
         first = self._cell(p) * self.count
         target = u * dr.gather(mi.Float, self.cdf, first + (self.count - 1))
         last = self.count - 1
@@ -48,15 +48,15 @@ class Selection:
         return light, dr.gather(mi.Float, self.pmf, first + light)
 
     def probability(self, p: mi.Point3f, emitter: mi.EmitterPtr) -> mi.Float:
-        """Probability of choosing ``emitter`` at points ``p``; 0 for the null pointer."""
+        """The probability of choosing ``emitter`` at points ``p``; 0 for the null pointer."""
         number = dr.reinterpret_array(mi.UInt32, emitter)
         slot = dr.gather(mi.UInt32, self.slot, number)
         return dr.gather(mi.Float, self.pmf, self._cell(p) * self.count + slot, number != 0)
 
     def _cell(self, p: mi.Point3f) -> mi.UInt32:
-        """The cell that points lie in or are next to; any one for points that are not finite.
+        """The cell that points lie in or are next to; some cell for points that are not finite.
 
-        NaN converts to what the processor likes: with AVX2 to what lies far outside the table.
+        The last minimum sees to that: NaN converts to what the processor likes, with AVX2 far outside the table.
         """
         place = dr.clip((p - self.lower) * self.cells_per_length, 0, CELLS - 0.5)
         x, y, z = (mi.UInt32(place[k]) for k in range(3))
@@ -103,5 +103,5 @@ def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box:
 
 
 def _over_cell(value: mi.Float, n: int) -> mi.Float:
-    """Sum over each cell's n entries, at every entry."""
+    """The sum over a cell's n entries, at each of them [C·n]."""
     return dr.repeat(dr.block_sum(value, n), n)

@@ -16,10 +16,8 @@ def require_variant() -> str:
     unsupported = [word for word in ("scalar", "spectral", "polarized") if word in variant]
     if unsupported:
         raise ValueError(
-            f"photonfarm.renderer.bdpt: variant {variant!r} is {unsupported[0]}; the integrator needs a "
-            f"vectorised, unpolarised "
-            "RGB variant, because its loops are traced by Dr.Jit and its light paths carry neither wavelengths "
-            "nor Mueller "
-            "matrices; use 'llvm_ad_rgb' or 'cuda_ad_rgb'"
+            f"photonfarm.renderer.bdpt: variant {variant!r} is {unsupported[0]}; the integrator needs a vectorised, "
+            "unpolarised RGB variant, because its loops are traced by Dr.Jit and its light paths carry neither "
+            "wavelengths nor Mueller matrices; use 'llvm_ad_rgb' or 'cuda_ad_rgb'"
         )
     return str(variant)

@@ -13,7 +13,7 @@ roulette is in none of the densities: it thins samples of a technique and compen
 technique's density is.
 
 Letters: p solid-angle densities, cos = |n_geometric · d|, "in" the edge by which a vertex was reached, "rev" against
-the walk. All functions take and return ``mi.Float``, or plain floats: the tests sum the weights of one path by hand.
+the walk. All functions take and return ``mi.Float``, or plain floats: tests sum the weights of one path by hand.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 Number: TypeAlias = "mi.Float | float"
+"""What the weights are made of: arrays of the renderer, or plain numbers of the tests."""
 
 LARGEST = 1e30
 """Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
@@ -32,8 +33,8 @@ LARGEST = 1e30
 def light_start(nee_density: Number, emission: Number) -> Number:
     """dVCM of a light path's first ray: p_NEE(y₀)/e (Georgiev 2012, eq. 31), completed on arrival.
 
-    ``nee_density``: in area at y₀; for a light at infinity, whose "position" is a direction, in solid angle over the r²
-    that arriving multiplies with (§5.1, last paragraph).
+    ``nee_density`` is per area at y₀. For a light at infinity, whose "position" is a direction, it is per solid angle,
+    over the r² that arriving multiplies with (§5.1, last paragraph).
     """
     return dr.minimum(nee_density / emission, LARGEST)
 
@@ -41,15 +42,15 @@ def light_start(nee_density: Number, emission: Number) -> Number:
 def eye_start(light_ratio: Number, p_camera: Number) -> Number:
     """dVCM of a primary ray: n_T/p_cam (eq. 31), completed on arrival; 0 where the sensor cannot be hit.
 
-    ``p_camera``: density of the ray's direction in solid angle, normalised over the crop window.
+    ``p_camera`` is the density of the ray's direction per solid angle, normalised over the crop window.
     """
     return dr.select(p_camera > 0, dr.minimum(light_ratio / p_camera, LARGEST), 0)
 
 
 def arrive(dvcm: Number, dvc: Number, r2: Number, cos_in: Number) -> tuple[Number, Number]:
-    """(dVCM, dVC) on reaching a later vertex, between eqs. 31–33 and 34–36.
+    """(dVCM, dVC) on arrival at a later vertex, where solid-angle densities become area densities.
 
-    The solid-angle densities become area densities.
+    This is what lies between eqs. 31–33 and 34–36.
     """
     return dr.minimum(dvcm * r2 / cos_in, LARGEST), dr.minimum(dvc / cos_in, LARGEST)
 
@@ -75,7 +76,8 @@ def scatter_delta(dvc: Number, cos_out: Number) -> tuple[Number, Number]:
 def hit_emitter(nee_direction_density: Number, emission: Number, dvcm: Number, dvc: Number) -> Number:
     """Weight of s=0: 1/(1 + p_ω·dVCM + e·dVC) (eqs. 37, 43), dVCM from *before* and dVC from *after* the arrival.
 
-    Written with p_ω instead of the area density, so that r²/cos cancels and the environment needs no case of its own.
+    It is written with p_ω instead of the area density, so that r²/cos cancels and the environment needs no case of its
+    own.
     """
     return 1 / (1 + nee_direction_density * dvcm + emission * dvc)
 
@@ -85,7 +87,7 @@ def next_event(
 ) -> Number:
     """Weight of s=1: 1/(1 + wL + wC), wC = ratio·(n·dVCM + p_rev·dVC) (eqs. 37, 44, 45).
 
-    ``ratio``: e·cos_x/(p_NEE·cos₀), the density with which a light path from the same point would arrive at x, over
+    ``ratio`` is e·cos_x/(p_NEE·cos₀): the density with which a light path from the same point would arrive at x, over
     p_NEE.
     """
     return 1 / (1 + p_bsdf_over_p_nee + ratio * (count_before * dvcm + p_reverse * dvc))

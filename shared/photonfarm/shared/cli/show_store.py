@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @contextlib.contextmanager
 def progress() -> Iterator[Tell]:
-    """Something to tell how far a check is: a bar on a terminal, a line per scene elsewhere; both to stderr."""
+    """A progress callback for a check: a bar on a terminal, else a line per scene; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _line
@@ -53,7 +53,7 @@ def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
 
 
 def check(report: StoreReport, as_json: bool) -> None:
-    """What was read and found, by scene and cause, and what to do."""
+    """Print what a check read and found, by scene and cause, and what to do about it."""
     if as_json:
         click.echo(json.dumps(_document(report), indent=2))
         return
@@ -127,7 +127,7 @@ def _group(group: Group) -> dict[str, Any]:
 
 
 def found(matches: Matches, store: str | Path, as_json: bool) -> None:
-    """Samples: what they are, where they lie, and how to look at one and render it."""
+    """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
         samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
         click.echo(json.dumps({"count": matches.count, "nearest": matches.nearest, "samples": samples}, indent=2))
@@ -142,9 +142,9 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
 
 
 def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_json: bool) -> None:
-    """Write merged views, of so many passes at the least, into a folder that is made for them, and tell of each.
+    """Write merged views of at least `least` passes into `folder`, which is created, and print a line for each.
 
-    Raises StoreError if there is none, or where they cannot be written.
+    Raises StoreError if there is no such view, or if they cannot be written.
     """
     written = []
     for key, view in views:
@@ -182,7 +182,7 @@ def _sample(sample: FoundSample, store: str | Path) -> None:
 
 
 def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
-    """The command lines to look at a sample, and to render what is missing of it."""
+    """The command lines that read a sample, and those that render what is missing of it."""
     listed = {}
     if sample.complete:
         program = (
@@ -192,7 +192,7 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
         listed["look at it"] = shlex.join(["python", "-c", program])
     lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
     if sample.guided is False:
-        lacking.add(sample.jobs[1])  # which is rendered for its view's guides alone, if it is committed
+        lacking.add(sample.jobs[1])  # a committed job is rendered again for its guides alone
     for job in dict.fromkeys(sample.jobs):
         if job in lacking:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
@@ -204,7 +204,7 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
 
 
 def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
-    """What became of an upgrade, scene by scene, and how it goes on.
+    """Print the outcome of an upgrade, scene by scene, and the command that continues it.
 
     Raises StoreError at the end if a scene cannot be upgraded.
     """

@@ -1,4 +1,4 @@
-"""The verbs `photonfarm store …`: looking into a store, without Mitsuba or torch; `upgrade` alone talks to Redis."""
+"""The verbs `photonfarm store …`, which need neither Mitsuba nor torch; only `upgrade` uses Redis."""
 
 from __future__ import annotations
 

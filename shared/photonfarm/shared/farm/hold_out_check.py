@@ -1,4 +1,4 @@
-"""Whether a request leaves something to train on and something to validate on, asked before anything is rendered."""
+"""Whether a request leaves something to train on and something to validate on, checked before anything is rendered."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from photonfarm.shared.store.io.storage import is_vacant
 
 
 def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Request) -> None:
-    """Raise SpecError if of all that is planned or requested nothing or everything would be held out.
+    """Raise SpecError if nothing or everything of what is planned and requested would be held out.
 
-    Nothing is written. The trainer finds the same, but only once all is rendered.
+    Nothing is written. The trainer checks the same, but only after everything is rendered.
     """
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:

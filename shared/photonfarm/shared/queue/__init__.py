@@ -1,19 +1,19 @@
-"""The queue: RQ, with jobs that are nothing but their names, and `reconcile`, which fills it from the store.
+"""The queue: RQ, whose jobs are only names, and `reconcile`, which fills it from the store.
 
-Redis is disposable: every job in it can be derived again from plans and markers. And it is not trusted: whoever can
-write to it can delay jobs, and can neither run code in a worker nor change what is stored. Keys of ours, beside RQ's:
+Redis is disposable: every job in it can be derived again from plans and markers. It is also not trusted: a client that
+can write to it can delay jobs, but can neither run code in a worker nor change what is stored. Our keys, beside RQ's:
 
-    alive:<job name>                    heartbeat of a job being rendered; the value is the worker's name
-    rq:photonfarm:failed:<job name>     why a job failed; it is not queued again while this lasts
-    rq:photonfarm:failures:<job name>   how often a job has failed
-    rq:photonfarm:starts:<job name>     how often a job was started without an end
-    rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
-    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host with the process space, the
-                                        job it renders, or -, and the process of its supervisor
-    rq:photonfarm:paused:<worker name>  why a worker takes no jobs
-    rq:photonfarm:left:<scene id>:<worker name>  why a worker leaves a scene alone
-    rq:photonfarm:store                 the id of the store that this Redis serves, while somebody works with it
-    rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
+alive:<job name>                    heartbeat of a job being rendered; the value is the worker's name
+rq:photonfarm:failed:<job name>     why a job failed; it is not queued again while this lasts
+rq:photonfarm:failures:<job name>   how often a job has failed
+rq:photonfarm:starts:<job name>     how often a job was started without reporting an end
+rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
+rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host with the process space, the
+job it renders, or -, and the process of its supervisor
+rq:photonfarm:paused:<worker name>  why a worker takes no jobs
+rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
+rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
+rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of

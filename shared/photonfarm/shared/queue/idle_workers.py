@@ -1,6 +1,6 @@
-"""What holds workers up, by their own account: that they take no jobs, or leave a scene alone.
+"""Why workers are idle, as they report it: they take no jobs, or skip a scene.
 
-It is said with every heartbeat and gone with it, and is text for people: nothing is decided by it.
+A report is written with every heartbeat and expires with it. It is text for people: no decision depends on it.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _SCENE_AND_WORKER = re.compile("([0-9a-f]{32}):(.+)", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class HeldUp:
-    """What workers say, by name; printable."""
+    """The workers' reports, by name; printable."""
 
     paused: dict[str, str]  # why a worker takes no jobs
-    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it leaves the scene alone
+    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it skips the scene
 
 
 def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
-    """Say for a time why a worker takes no jobs, if it takes none, and which scenes it leaves alone."""
+    """Report why a worker takes no jobs, if it takes none, and which scenes it skips; expires after `ttl_s`."""
     ttl_ms = int(ttl_s * 1000)
     with connection.pipeline(transaction=False) as pipeline:
         if paused is None:
@@ -42,12 +42,12 @@ def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mappi
 
 
 def forget_held_up(connection: Redis, worker: str, left: Iterable[str]) -> None:
-    """A worker is held up by nothing any more, and leaves none of these scenes."""
+    """Remove the reports of a worker: it takes jobs again, and skips none of these scenes."""
     connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
 
 
 def read_held_up(connection: Redis) -> HeldUp:
-    """What workers say now."""
+    """The reports that workers have made."""
     left: dict[str, dict[str, str]] = {}
     for name, reason in _said(connection, LEFT).items():
         if found := _SCENE_AND_WORKER.fullmatch(name):

@@ -1,7 +1,7 @@
-"""`photonfarm store check`: reads everything that a store holds, says what is wrong with it, and sets that aside.
+"""`photonfarm store check`: reads everything in a store, reports what is wrong with it, and sets that aside.
 
-Nothing is deleted and no value is changed. One scene after the other, and one row after the other: memory is what the
-plans take, 32 bytes a sample, and one row of each array for each thread.
+Nothing is deleted and no value is changed. Scenes and rows are read one after the other: memory holds the plans, 32
+bytes a sample, and one row of each array for each thread.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_i
 from photonfarm.shared.store.write.store import Store
 
 Progress = Callable[[str, int, int, int], None]
-"""Is told the scene's name, jobs checked, jobs to check, and bytes read."""
+"""Called with the scene's name, the jobs checked, the jobs to check, and the bytes read."""
 
 
 AT_ONCE = 32
-"""Jobs handed to the threads at a time, in whose order findings are told."""
+"""The number of jobs handed to the threads at a time; findings are reported in their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def check_store(
 
 
 def said(halves: HalvesResult) -> str:
-    """The outcome of the test between A and B in words."""
+    """The outcome of the test between A and B, in words."""
     few = "" if halves.tells else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
     return few + (
         f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
@@ -116,7 +116,7 @@ class _SceneChecking:
         self._tell = tell
         self._findings = Findings()
         self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
-        self._same: dict[int, bool] = {}  # of such jobs: whether they came out the same when they were rendered again
+        self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
         self._scenes = scenes
         self._tally, self._guide_tally = Tally(HalvesTest(scenes)), Tally(HalvesTest(scenes))
 
@@ -143,7 +143,7 @@ class _SceneChecking:
         return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
-        """The plans once they are checked, and which were written again; before the jobs, which need them."""
+        """Check the plans, before the jobs, which need them; also returns what was written again."""
         check = PlanCheck(self._storage, spec, self._name)
         found = list(check.check_plans())
         self._add(found)
@@ -171,7 +171,7 @@ class _SceneChecking:
             self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
 
     def _guides(self, guides: Checked, committed: set[int], quarantine: Quarantine | None) -> list[str]:
-        """Check the scene's guides, if it has some; what of their settings and declarations has been mended."""
+        """Check the scene's guides, if it has some; returns what of their settings and declarations was mended."""
         if not self._storage.names(guides.name):
             return []
         check = GuideCheck(guides, committed)
@@ -181,7 +181,7 @@ class _SceneChecking:
         return check.repair(quarantine, found) if quarantine else []
 
     def _read(self, scene: Checked, committed: list[int], total: Tally, called: str) -> None:
-        """Read all that committed jobs have stored there, and look for what they have not."""
+        """Read everything that committed jobs stored there, and look for what is missing."""
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):
                 jobs = committed[done : done + AT_ONCE]
@@ -196,7 +196,7 @@ class _SceneChecking:
         self._add(strangers(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
-        """Findings; equal halves that came out equal when they were rendered again are not set aside once more."""
+        """The findings, with another cause for equal halves that were equal again after being rendered again."""
         for finding in found:
             equal = finding.cause in (Cause.EQUAL_HALVES, Cause.EQUAL_SAMPLES)
             again = equal and finding.job is not None and self._came_out_the_same(finding.job)
@@ -205,12 +205,12 @@ class _SceneChecking:
     def _came_out_the_same(self, job: int) -> bool:
         if job not in self._same:
             self._same[job] = False
-            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or a finding of its own
+            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or reported by itself
                 self._same[job] = was_set_aside(self._storage, self._name, job, self._marker((False, job)))
         return self._same[job]
 
     def _marker(self, part: JobPart) -> bytes:
-        """The marker that findings of a job are about; raises FileNotFoundError if it is set aside in the meantime."""
+        """The marker that findings of a job refer to; raises FileNotFoundError if it was set aside in the meantime."""
         if part not in self._markers:  # found when all samples were looked at
             self._markers[part] = self._storage.read(markers.name_of(self._name, part[1]))
         return self._markers[part]

@@ -1,7 +1,7 @@
 """Samples that have a half in common: a seed was used twice.
 
-Seeds have 32 bits, so that among many samples some have one in common by chance. Rendered again, these would come out
-the same; so they are told from those that a fault has made.
+Seeds have 32 bits, so that among many samples some have one in common by chance. Such samples would be equal again when
+rendered again, so they are distinguished from those that a fault has made.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Cause, Finding
 
 DRAWN = 4
-"""Seeds of a half that a renderer may draw: three are tried, and one may be the other half's."""
+"""The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""
 
 
 def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
@@ -48,7 +48,7 @@ def _shared(scene: Checked, cause: Cause, row: int, other: int) -> Finding:
 
 
 def _seeds(scene: Checked, row: int) -> set[int]:
-    """The seeds that the halves of a sample may have been rendered with, by its key; none if no plan tells that."""
+    """The seeds that the halves of a sample may have been rendered with, by its key; none without a plan."""
     sample = plans.sample_at(scene.plans, row) if scene.plans else None
     if sample is None:
         return set()

@@ -12,7 +12,7 @@ from photonfarm.shared.store.write.findings import Cause, Finding
 
 
 def strangers(scene: Checked) -> Iterator[Finding]:
-    """Files of jobs that are not committed, and files that are none of ours."""
+    """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
     foreign = [
         f"{scene.name}/{markers.COMMITTED}/{name}"

@@ -1,6 +1,6 @@
 """What the format declares: its version, and every array with type, shape, unit and convention. Part of the version.
 
-docs/store-format.md tells readers the same; a test compares the two, and every array carries it in its attributes.
+docs/store-format.md repeats it for readers; a test compares the two, and every array carries it in its attributes.
 
 Shape letters: R rows of a plan, H W image, K photon slots, L lit points, G movable groups; of the base: P points,
 V vertices, F triangles, S shapes.
@@ -33,14 +33,14 @@ def new_store_id() -> str:
 
 
 def is_store_id(value: object) -> bool:
-    """Whether a value is written as a store's id."""
+    """Whether a value has the form of a store's id."""
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) is not None
 
 
 def check_version(name: object, version: object, where: str, document: str = "photonfarm.json") -> None:
-    """Return for what this program reads and writes; raises StoreError, with what to do, for any other format.
+    """Return for the format that this program reads and writes; raises StoreError, with a remedy, for any other.
 
-    `document` is what states them.
+    `document` is the name of the file that states them.
     """
     if name == FORMAT and type(version) is int and version == VERSION:
         return
@@ -75,12 +75,12 @@ class Declared:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What the stored array says of itself."""
+        """The attributes of the stored array."""
         return {"unit": self.unit, "convention": self.convention}
 
     @property
     def fill(self) -> float | int:
-        """What is read where nothing is written: NaN, −1, or 0 for what has no sign."""
+        """The value read where nothing is written: NaN, −1, or 0 for unsigned types."""
         return {"f": np.nan, "i": -1, "u": 0}[np.dtype(self.dtype).kind]
 
 
@@ -191,7 +191,7 @@ OUTPUTS = (
         "surfaces met before: 0 straight from a light; -1: an empty slot, 0 in the other arrays",
     ),
 )
-"""What jobs produce. The first axis names what a row belongs to."""
+"""The arrays that jobs produce. The first axis names what a row belongs to."""
 
 _MEAN = "mean over the pixel"
 _FIRST = "of the first surface"
@@ -298,7 +298,7 @@ GUIDES = (
         "normal, by light that arrives straight from lights; noisy and rounded as direct",
     ),
 )
-"""What jobs produce of their new views for a scene that has guides, in groups of their own."""
+"""The arrays that jobs produce for new views in a scene with guides, in groups of their own."""
 
 PLAN_INPUTS = (
     Declared(
@@ -331,7 +331,7 @@ PLAN_INPUTS = (
         "sample_key", ("sample", "byte"), ("R", KEY_BYTES), "|u1", "1", "the sample's content key; zeros: unused row"
     ),
 )
-"""What a plan asks for."""
+"""The arrays of a plan's inputs."""
 
 BASE = {
     "geometry": (
@@ -358,4 +358,4 @@ BASE = {
         Declared("face", ("point",), ("P",), "<u4", "row of faces", "the triangle that the point lies in"),
     ),
 }
-"""What is stored once per scene, by group."""
+"""The arrays that are stored once per scene, by group."""

@@ -1,4 +1,4 @@
-"""Settings put into a spec's TOML file, which keeps everything else byte for byte: comments, order, spaces."""
+"""Settings written into a spec's TOML file, which keeps everything else byte for byte: comments, order, spaces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene import spec as scene
 
 BYTE_ORDER_MARK = "\ufeff"
-"""Some editors begin a file with it."""
+"""The byte-order mark with which some editors begin a file."""
 
 Settings = Mapping[str, Mapping[str, int | float]]
 """Table → key → number."""
@@ -34,9 +34,9 @@ def writable(name: str) -> Path:
 
 
 def write(file: Path, settings: Settings) -> None:
-    """Put settings into a TOML file; it changes at once or not at all.
+    """Write settings into a TOML file, atomically.
 
-    Raises SpecError where the file writes a table in a way that leaves no place for them.
+    Raises SpecError if a table is written in a form that leaves no place for them.
     """
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
@@ -70,7 +70,7 @@ def put(text: str, settings: Settings, *, where: str) -> str:
 
 
 def _canonical(document: dict[str, Any]) -> str:
-    """Text to compare by: a NaN equals itself in it."""
+    """A text for comparisons, in which a NaN equals itself."""
     return json.dumps(document, sort_keys=True, default=repr)
 
 

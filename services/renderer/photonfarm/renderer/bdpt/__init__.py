@@ -10,8 +10,8 @@ and XML alike::
     spp=16)
 
 Raises RuntimeError if no variant is set, ValueError for scalar, spectral and polarised ones. ``mi.render`` wraps
-errors raised while rendering (a ValueError that says what is refused) in a RuntimeError; ``integrator.render(scene,
-…)`` raises them as they are.
+errors raised while rendering (a ValueError that names what is refused) in a RuntimeError; ``integrator.render(scene,
+…)`` raises them unchanged.
 """
 
 from photonfarm.renderer.bdpt.variant import require_variant

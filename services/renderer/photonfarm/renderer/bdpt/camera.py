@@ -1,4 +1,4 @@
-"""The sensor's side of light tracing, and what of sensor and film this integrator accepts."""
+"""The sensor's side of light tracing, and the sensors and films that this integrator accepts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SensorSample:
     d: Any  # Vector3f: unit direction to the lens
     position: Any  # Point2f: where the film is hit, in pixels of the crop window
     weight: Any  # Spectrum: importance/r², normalised over the crop window
-    area_density_over_cos: Any  # Float: p_cam/r², by which primary rays would find the surface, without its cosine
+    area_density_over_cos: Any  # Float: p_cam/r², the density of primary rays at the surface, without its cosine
     start: Any  # Point3f: where primary rays through this film position begin (the near plane)
     valid: Any  # Bool
 

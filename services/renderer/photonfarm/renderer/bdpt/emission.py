@@ -29,7 +29,7 @@ from photonfarm.renderer.bdpt.randomness import along_curve
 from photonfarm.renderer.bdpt.selection import Selection, read_selection
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
-"""How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""
+"""The kinds of light. EYE_ONLY: no light paths start there; HIT_ONLY: eye paths hit it by chance alone, weight 1."""
 
 _KIND_BY_CLASS = {
     "AreaLight": AREA,
@@ -41,7 +41,7 @@ _KIND_BY_CLASS = {
     "DirectionalEmitter": DIRECTION,
 }
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
-"""How the names of the parameters begin that say how brightly a light shines."""
+"""The beginnings of the names of parameters that scale a light's brightness."""
 
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 
@@ -67,7 +67,7 @@ class Lights:
     radius: Any  # Float, 1: its radius
 
     def only(self, kind: int) -> bool:
-        """Whether every light that can be selected is of this kind; decided on the host: the rest costs nothing."""
+        """Whether every light that can be selected is of this kind; decided on the host, at no other cost."""
         return all(k in (kind, HIT_ONLY) for k in self.kinds)
 
     def has(self, kind: int) -> bool:
@@ -136,7 +136,7 @@ def read_lights(scene: Any) -> Lights:
 
 
 def _registry_id(emitter: Any) -> int:
-    """Dr.Jit's number of an emitter: a literal, so reading it waits for nothing."""
+    """Dr.Jit's number of an emitter: a literal, so reading it needs no synchronisation."""
     return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
 
 
@@ -155,8 +155,8 @@ def _kind(emitter: Any, shape: Any) -> int:
 def is_flat(mesh: Any) -> Any:
     """Whether a mesh light's vertex normals are its faces' (Bool, 1), as data.
 
-    Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such
-    lights are left to hits, with selection probability 0.
+    Otherwise Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such lights
+    get selection probability 0, and only hits find them.
     """
     if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
         return mi.Bool(True)
@@ -214,7 +214,7 @@ def _normalise(weight: Any, n: int) -> tuple[Any, Any]:
 
 
 def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
-    """Axis and cosine of the cut-off angle of each light; a whole sphere for all but spot lights."""
+    """The axis and the cosine of the cut-off angle of each light; a whole sphere for all but spot lights."""
     n = len(emitters)
     if not any(emitter.class_name() == "SpotLight" for emitter in emitters):
         return mi.Vector3f(*(dr.opaque(mi.Float, x, n) for x in (0, 0, 1))), dr.opaque(mi.Float, -1, n)
@@ -227,7 +227,7 @@ def _cones(parameters: list[Any], emitters: list[Any]) -> tuple[Any, Any]:
 
 
 def _box(scene: Any) -> Any:
-    """The scene's bounding box, or that of a unit sphere where there is no shape."""
+    """The scene's bounding box, or that of a unit sphere if there is no shape."""
     box = scene.bbox()
     return box if box.valid() and scene.shapes() else mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])
 
@@ -318,7 +318,7 @@ def hit_densities(
 
 @dataclass(slots=True)
 class Emission:
-    """The start of light paths: a ray and what the weights at the first hit need to know of y₀."""
+    """The start of light paths: a ray, and what the weights at the first hit depend on at y₀."""
 
     ray: Any  # Ray3f
     throughput: Any  # Spectrum: Le·cos₀/e
@@ -333,7 +333,7 @@ class Emission:
 
 
 def sample_emission(lights: Lights, rng: Any, path: Any, paths: Any) -> Emission:
-    """Start light paths, number ``path`` (UInt32) of ``paths``: neighbours in number set out in like directions."""
+    """Start light paths, number ``path`` (UInt32) of ``paths``: neighbours in number start in similar directions."""
     n = dr.width(rng.index)
     index = _choose_start(lights, rng)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)

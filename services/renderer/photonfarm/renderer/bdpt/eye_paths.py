@@ -36,20 +36,20 @@ class EyeState:
     throughput: Any  # Spectrum
     radiance: Any  # Spectrum: the estimate so far
     eta: Any  # Float: product of relative refractive indices, for Russian roulette
-    dvcm: Any  # Float: see weights.py, as they left the vertex before
+    dvcm: Any  # Float: see weights.py, after leaving the vertex before
     dvc: Any  # Float
     depth: Any  # UInt32: edges up to this vertex
 
 
 @dataclass(slots=True)
 class Connectable:
-    """Light vertices, and which of them this pass's eye paths are joined to."""
+    """Light vertices, and the choice of those that this pass's eye paths are joined to."""
 
     vertices: LightVertices
-    seen: Any  # UInt32: number each was drawn from
-    paths: Any  # UInt32, 1: how many there are for each image
+    seen: Any  # UInt32: the number of vertices that each was drawn from
+    paths: Any  # UInt32, 1: the number of light paths of each image
     image: Any  # UInt32: image of the launch that a lane belongs to
-    first: Any  # UInt32: the light path of its image that a lane is joined to, but for the shift
+    first: Any  # UInt32: the light path of its image that a lane is joined to, before the shift
     shifts: Any  # UInt32: see randomness.shifts
 
 
@@ -95,7 +95,7 @@ def trace_eye_paths(
 def _bounce(
     s: EyeState, *, scene: Any, lights: Lights | None, options: PathOptions, connectable: Connectable | None
 ) -> tuple[EyeState]:
-    """One vertex of an eye path: light it shines by itself, light from a light, light from light paths, scatter."""
+    """Process one vertex of an eye path: a light hit, next event estimation, connections, and the bounce."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
@@ -164,7 +164,7 @@ def _bounce(
 
 
 def reverse_pdf(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> Any:
-    """Density of sampling ``si.wi`` from ``wo``."""
+    """The density of sampling ``si.wi`` from ``wo``."""
     exchanged = mi.SurfaceInteraction3f(si)
     wi = mi.Vector3f(si.wi)
     exchanged.wi = wo
@@ -189,7 +189,7 @@ def _scatter(s: EyeState, ctx: Any, si: Any, bsdf: Any, bs: Any, bs_weight: Any,
 def _roulette(s: EyeState, options: PathOptions) -> None:
     """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges.
 
-    Paths are kept by their throughput without refraction's scaling.
+    The probability of survival is the throughput without refraction's scaling.
     """
     kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
     roulette = s.depth > options.rr_depth
@@ -215,9 +215,10 @@ class OwnVertex:
 
 
 def connect_all(scene: Any, options: PathOptions, connectable: Connectable, own: OwnVertex) -> Any:
-    """Mean over connections to kept vertices of other light paths, as radiance (Spectrum).
+    """The mean over connections to kept vertices of other light paths, as radiance (Spectrum).
 
-    The first vertices make n_C of them; later ones half, as they carry less of the image's noise for the same time.
+    The first vertices make n_C connections, later ones half as many, as they add less of the image's noise in the same
+    time.
     """
     later = (options.connections + 1) // 2
     near = own.depth <= _NEAR_VERTICES
@@ -272,7 +273,7 @@ def _connect(scene: Any, options: PathOptions, connectable: Connectable, own: Ow
 
 
 def _surface(vertex: LightVertices, active: Any) -> Any:
-    """The surface at a kept vertex (SurfaceInteraction3f), found again from its intersection record."""
+    """The surface at a kept vertex (SurfaceInteraction3f), recomputed from its intersection record."""
     pi = dr.zeros(mi.PreliminaryIntersection3f)
     pi.t, pi.prim_uv, pi.prim_index = vertex.t, vertex.prim_uv, vertex.prim_index
     pi.shape = dr.reinterpret_array(mi.ShapePtr, vertex.shape)

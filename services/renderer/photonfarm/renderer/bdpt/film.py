@@ -1,4 +1,4 @@
-"""Where estimates go: sums over the pixels of several images in device memory, and Mitsuba's film at the end."""
+"""Films: sums over the pixels of several images in device memory, and Mitsuba's film at the end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import mitsuba as mi
 
 @dataclass(slots=True)
 class Splat:
-    """Adds images of light paths on the lens to a stack of images."""
+    """Adds splats, which are joins of light paths to the lens, to a stack of images."""
 
     image: Any  # Spectrum, K·H·W: sums, image after image
     scale: Any  # Float, 1: eye paths per light path over samples per pixel
@@ -20,7 +20,7 @@ class Splat:
     height: int
 
     def add(self, position: Any, value: Any, active: Any) -> None:
-        """Add ``value`` (Spectrum) at ``position`` (Point2f, pixels of the crop window); what falls outside is lost."""
+        """Add ``value`` (Spectrum) at ``position`` (Point2f, pixels of the crop window); values outside are dropped."""
         inside = active & dr.all((position >= 0) & (position < mi.ScalarVector2f(self.width, self.height)))
         pixel = mi.UInt32(position.y) * self.width + mi.UInt32(position.x)
         dr.scatter_add(self.image, value * self.scale, self.offset + pixel, inside)
@@ -35,11 +35,11 @@ class Images:
 
     @classmethod
     def black(cls, pixels: int) -> Images:
-        """Black images with so many pixels in all."""
+        """Black images with `pixels` pixels in all."""
         return cls(dr.zeros(mi.Spectrum, pixels), dr.zeros(mi.Float, pixels))
 
     def add(self, part: Images, first_pixel: int) -> None:
-        """Add a part of the samples, to the pixels from ``first_pixel`` on."""
+        """Add images from a part of the samples, to the pixels from ``first_pixel`` on."""
         if dr.width(part.hit) == dr.width(self.hit):
             self.radiance += part.radiance
             self.hit += part.hit
@@ -54,7 +54,7 @@ class Images:
         return mi.TensorXf(dr.ravel(self.radiance), (dr.width(self.hit) // (width * height), height, width, 3))
 
     def put(self, film: Any) -> None:
-        """Put the one image into a film, each pixel with weight 1."""
+        """Put the single image into a film, each pixel with weight 1."""
         width, height = film.crop_size()
         channels = [*self.radiance]
         if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):

@@ -33,7 +33,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
 
-    Raises ValueError for a value outside these ranges, and on rendering for what it cannot render without bias.
+    Raises ValueError for a value outside these ranges, and on rendering for scenes that it cannot render without bias.
     """
 
     def __init__(self, props: Any) -> None:
@@ -66,7 +66,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             )
 
     def to_string(self) -> str:
-        """Mitsuba's description of an object."""
+        """Mitsuba's description of the integrator."""
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
         return (
             f"BidirectionalPathTracer[max_depth={depth}, rr_depth={self.rr_depth}, connections={self.connections}, "
@@ -103,7 +103,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def render_seeds(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Any:
         """Independent images of one view (TensorXf [K, H, W, 3]), one for each seed; small ones in one launch.
 
-        Each is the image that ``render`` gives for its seed: bit by bit on one thread where an image's samples and its
+        Each is the image that ``render`` gives for its seed: bit by bit on one thread if an image's samples and its
         light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
         ``render`` does.
         """
@@ -111,7 +111,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
     def _render(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Images:
-        sensor.sampler().seed(0, 1)  # what another integrator left there would be evaluated with our input
+        sensor.sampler().seed(0, 1)  # or another integrator's state there would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
         with dr.suspend_grad():
@@ -151,7 +151,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 
 def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
-    """Trace the light paths and the eye paths of a launch. Where it is recorded, Python runs once for each kind."""
+    """Trace the light paths and the eye paths of a launch. If it is recorded, Python runs once for each kind."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
     if lights is not None and options.traces_light:
@@ -185,16 +185,16 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
 
 
 def spread(lane: Any, light_ratio: Any) -> Any:
-    """The light path (UInt32) that an image's eye path of a number is joined to, but for the shift.
+    """The light path (UInt32) that an image's eye path number ``lane`` is joined to, before the shift.
 
-    That number, but where there are more light paths than eye paths: there the eye paths take ones from all over, since
-    neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.
+    It is the path of the same number. If there are more light paths than eye paths, the joined ones are spread over
+    all, since neighbouring light paths start alike. Any choice is right, as the shift is uniform over all light paths.
     """
     return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
 
 def connection_count(connections: int, max_depth: int) -> float:
-    """Technique count of connections: n_C over a nominal number of vertices per light path.
+    """The technique count of connections: n_C over a nominal number of vertices per light path.
 
     A connection picks one of a path's vertices at random, so each (s, t) gets n_C/length of them on average. Any
     constant keeps the estimate unbiased (the counts only shape the weights); 3 is about the length in the closed rooms

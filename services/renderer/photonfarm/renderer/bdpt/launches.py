@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 LAUNCH_PATHS = 1 << 20
-"""Most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
+"""The most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +26,8 @@ class Launch:
 
 
 def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator[Launch]:
-    """Several images together where they are small, each by itself in several launches where they are not."""
-    paths = int(pixels * max(1.0, light_ratio))  # for a sample of each pixel
+    """Split images into launches: small images share one, large ones take several."""
+    paths = int(pixels * max(1.0, light_ratio))  # for one sample of each pixel
     together = max(1, min(images, LAUNCH_PATHS // (paths * spp)))
     samples = max(1, min(spp, LAUNCH_PATHS // paths))
     for first_image in range(0, images, together):
@@ -41,13 +41,13 @@ def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator
 
 
 def _light_paths(eye_paths: int, light_ratio: float) -> int:
-    """Light paths that belong to the first eye paths of an image: at least one for any of them."""
+    """The number of light paths for the first eye paths of an image: at least one for any of them."""
     return max(int(eye_paths > 0), round(eye_paths * light_ratio)) if light_ratio else 0
 
 
 @dataclass(slots=True)
 class Lanes:
-    """A launch as its kernels see it: what shapes them as integers, what may differ between launches as data.
+    """A launch as its kernels see it: integers that determine their shape, and data that may differ between launches.
 
     Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, and the
     samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
@@ -82,12 +82,12 @@ class Lanes:
 
     @property
     def kind(self) -> tuple[int, ...]:
-        """The numbers that kernels are made for."""
+        """The numbers that kernels are compiled for."""
         return self.images, self.width, self.height, self.samples, self.light_paths
 
     @property
     def pixels(self) -> int:
-        """Of one image."""
+        """The number of pixels of one image."""
         return self.width * self.height
 
     def eye(self) -> tuple[Any, Any, Any]:

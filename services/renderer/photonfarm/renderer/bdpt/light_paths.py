@@ -1,7 +1,7 @@
 """Light sub-paths: from a light into the scene, each vertex but the first joined to the lens (t=1), one of each kept.
 
-The first vertex is not joined: direct light is next event estimation's, whose noise is less than that of splats, and
-which is complete for it (lights that it cannot sample start no light paths either).
+The first vertex is not joined: direct light is left to next event estimation, which is less noisy than splats, and
+complete (lights that it cannot sample start no light paths either).
 
 The vertex kept for connections is drawn uniformly among those a connection can reach, by reservoir sampling (Vitter,
 *Random Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each path
@@ -33,7 +33,7 @@ _MAX_THROUGHPUT_KEPT = 0.95
 
 @dataclass(frozen=True, slots=True)
 class PathOptions:
-    """What both kinds of sub-path need to know; numbers which may change between renders are in device memory."""
+    """The options of both kinds of sub-path; numbers that may change between renders are in device memory."""
 
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
@@ -45,7 +45,7 @@ class PathOptions:
 
     @property
     def kind(self) -> tuple[int, ...]:
-        """The numbers that kernels are made for."""
+        """The numbers that kernels are compiled for."""
         return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light
 
 
@@ -53,7 +53,7 @@ class PathOptions:
 class LightVertices:
     """One kept vertex for each of N light paths.
 
-    What the surface is there is found again from its intersection record.
+    The surface there is recomputed from its intersection record.
     """
 
     origin: Any  # Point3f: the ray that reached it
@@ -78,14 +78,14 @@ class LightState:
     ray: Any  # Ray3f: to this vertex
     hit: Any  # PreliminaryIntersection3f: where it arrives
     throughput: Any  # Spectrum
-    dvcm: Any  # Float: see weights.py, as they left the vertex before
+    dvcm: Any  # Float: see weights.py, after leaving the vertex before
     dvc: Any  # Float
     depth: Any  # UInt32: edges up to this vertex
     seen: Any  # UInt32: vertices a connection could reach so far
 
 
 def empty_vertices(n: int) -> LightVertices:
-    """Room for one vertex of each of n light paths."""
+    """Memory for one vertex of each of n light paths."""
     return LightVertices(
         *(
             dr.empty(kind, n)
@@ -102,7 +102,7 @@ def trace_light_paths(
 
     ``path`` is a path's number among the ``paths`` (UInt32, 1) of its image in this launch.
 
-    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) where no connections are wanted.
+    Returns (kept vertices, number each was drawn from: UInt32 [n]), or (None, ·) without connections.
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
@@ -123,7 +123,7 @@ def trace_light_paths(
 
 
 def first_state(scene: Any, lights: Lights, start: Emission, rng: Any) -> LightState:
-    """Loop variables at the first hit."""
+    """The loop variables at the first hit."""
     active = mi.Bool(start.valid)
     hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     active &= hit.is_valid()
@@ -141,7 +141,7 @@ def vertex_bounce(
     splat: Splat,
     vertices: LightVertices | None,
 ) -> tuple[LightState]:
-    """One vertex of a light path: arrive, join to the lens, keep it perhaps, scatter."""
+    """Process one vertex of a light path: arrive, join to the lens, perhaps keep it, and scatter."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
@@ -193,8 +193,8 @@ def vertex_bounce(
 def _from_lens(start: Any, si: Any) -> Any:
     """The ray from the near plane to just before a surface.
 
-    The other way round, `spawn_ray_to` would leave out the last part, and what stands just behind the near plane would
-    hide nothing, though it hides all from primary rays.
+    In the other direction, `spawn_ray_to` would leave out the last part: objects just behind the near plane would
+    hide nothing, although they hide the surface from primary rays.
     """
     end = si.spawn_ray_to(start).o
     way = end - start
@@ -203,7 +203,7 @@ def _from_lens(start: Any, si: Any) -> Any:
 
 
 def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
-    """Sample the next direction. Delta lobes: importance-mode weight times Veach's factor (Veach 1997, eq. 5.20)."""
+    """Sample the next direction. Delta lobes get the importance-mode weight times Veach's factor (1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
     bs, delta_weight = bsdf.sample(importance, si, s.rng.next_1d(), s.rng.next_2d(), s.active)
@@ -227,7 +227,8 @@ def scatter(s: LightState, si: Any, bsdf: Any, cos_in: Any, count: Any) -> None:
 def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     """Russian roulette by the throughput relative to the start: after ``rr_depth`` edges as in Mitsuba's ``path``.
 
-    Before, only of paths that have lost more than two thirds of it: they cost as much as others and carry less.
+    Before that, it meets only paths that have lost more than two thirds of it: they cost as much as others and carry
+    less.
     """
     left = dr.max(s.throughput) / dr.max(start.throughput)
     kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
@@ -236,7 +237,7 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
 
 
 def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
-    """(BSDF·|cos_s(wi)|, pdf) of radiance in along ``wo`` and out along ``si.wi``: directions exchanged.
+    """(BSDF·|cos_s(wi)|, pdf) of radiance that arrives along ``wo`` and leaves along ``si.wi``: directions exchanged.
 
     The pdf is the density of sampling ``si.wi`` from ``wo``: the reverse density of a light path's bounce.
     """
@@ -247,7 +248,7 @@ def _exchanged(ctx: Any, bsdf: Any, si: Any, wo: Any, active: Any) -> tuple[Any,
 
 
 def start_weights(start: Emission, lights: Lights, p: Any, r2: Any, mask: Any) -> tuple[Any, Any]:
-    """(dVCM, dVC) of light paths' first rays, which arrive at ``p`` over the squared distance ``r2``; see weights.py.
+    """(dVCM, dVC) of light paths' first rays, which end at ``p`` with the squared length ``r2``; see weights.py.
 
     Lanes outside ``mask`` may hold anything. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ an area light's cos₀ cancels.
     """

@@ -1,4 +1,4 @@
-"""Photons: the surface hits of light sub-paths, handed out as arrays; the same walk as the renderer's light paths."""
+"""Photons: the surface hits of light sub-paths as arrays; they follow the same walk as the integrator's light paths."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Photons:
 def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
-    ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
+    ``power`` of a hit is the arriving power, before reflection, divided by the number of emitted paths (dead lights
     emit none), so sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
-    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see `emission`) emit none. Compiles
-    nothing again when the scene is edited in place or for another seed; with a ``recorder`` of `trace` Python runs but
-    once, which is most of the time in scenes of many materials. Raises ValueError for scenes with media, and for
+    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see `emission`) emit none. Nothing
+    is compiled again when the scene is edited in place or for another seed; with a ``recorder`` of `trace` Python runs
+    only once, which is most of the time in scenes of many materials. Raises ValueError for scenes with media, and for
     numbers below 1.
     """
     if paths < 1 or depth < 1:
@@ -65,7 +65,7 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Re
 def trace(
     scene: Any, _: Any, lights: Lights, keys: Any, count: Any, zero: Any, paths: int, depth: int
 ) -> tuple[tuple[Any, ...], Any]:
-    """Positions, directions, normals and powers of all slots, and their bounces; ``count`` is ``paths``, opaque."""
+    """The positions, directions, normals and powers of all slots, and their bounces; ``count`` is ``paths``, opaque."""
     slots = paths * depth
     sequence = randomness.stream(keys, randomness.PHOTONS)
     path = dr.arange(mi.UInt32, paths)
@@ -91,7 +91,7 @@ def trace(
 
 
 def _hit(s: LightState, *, scene: Any, options: PathOptions, out: Any, bounce: Any, paths: Any) -> tuple[LightState]:
-    """One vertex of a light path: write it down, scatter."""
+    """Process one vertex of a light path: store the hit, and scatter."""
     si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & (cos_in > 0)

@@ -1,14 +1,14 @@
 """Random numbers: Owen-scrambled Sobol' points, in pairs of dimensions, each with its own scramble.
 
-A *sequence* is what is stratified together: the samples of one pixel for eye paths, all light paths of an image for
-light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol' whose index and
+The points of a *sequence* are stratified together: the samples of one pixel for eye paths, all light paths of an image
+for light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol' whose index and
 coordinates are scrambled as Owen does, by hashing (Burley, *Practical Hash-based Owen Scrambling*, JCGT 2020; the
 permutation is that of Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point is uniform, and
 an estimate from them has the expectation of independent ones; sequences of different seeds, pixels or purposes are
 independent of each other.
 
-Seeds enter the kernels as data, so another seed never compiles anything. The sensor's own sampler only says how many
-samples a pixel gets by default: two kinds of path would use it up differently.
+Seeds enter the kernels as data, so another seed never compiles anything. The sensor's own sampler only sets the default
+number of samples per pixel: the two kinds of path would consume it differently.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LIGHT, EYE, PAIRING, PHOTONS = range(4)
 _ULP = 1 / (1 << 24)
 
 SHIFTS = 64
-"""Depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
+"""The depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
 
 
 def image_keys(seeds: Sequence[int]) -> Any:
@@ -39,14 +39,14 @@ def image_keys(seeds: Sequence[int]) -> Any:
 
 
 def stream(key: Any, purpose: int, number: Any = 0) -> Any:
-    """Sequence (UInt32) of a purpose, of an image or a pixel: the Tiny Encryption Algorithm (Zafar et al. 2010)."""
+    """The sequence (UInt32) of a purpose, of an image or pixel: the Tiny Encryption Algorithm (Zafar et al. 2010)."""
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
 
 
 @dataclass(slots=True)
 class Sampler:
-    """A point of a sequence, read one pair of dimensions after the other. Loop state."""
+    """A point of a sequence, whose dimensions are read in pairs. Loop state."""
 
     sequence: Any  # UInt32: which sequence
     index: Any  # UInt32: which point, its bits reversed
@@ -58,7 +58,7 @@ class Sampler:
         return _unit(_scramble(dr.brev(_scramble(self.index, seed)), _mix(seed)))
 
     def next_independent(self) -> Any:
-        """A number in [0, 1) (Float) that is not stratified, for what gains nothing by it."""
+        """A number in [0, 1) (Float) that is not stratified, for uses that gain nothing by it."""
         return mi.Float(_mix(self._next_seed() ^ self.index) >> 8) * _ULP
 
     def next_2d(self) -> Any:
@@ -80,9 +80,9 @@ def sampler(sequence: Any, index: Any) -> Sampler:
 
 
 def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> Any:
-    """By how much eye paths' numbers are shifted to those of the light paths they are joined to: UInt32 [K·64·n_C].
+    """The shifts from eye paths' numbers to those of the light paths they are joined to: UInt32 [K·64·n_C].
 
-    Uniform below the number of light paths, for each image of a launch, depth and connection.
+    They are uniform below the number of light paths, for each image of a launch, depth and connection.
     """
     table = [
         np.random.default_rng([seed, PAIRING, launch.first_sample]).integers(
@@ -94,7 +94,7 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> Any:
 
 
 def along_curve(lane: Any, n: Any, rng: Sampler) -> Any:
-    """A stratified point in [0, 1)² (Point2f) for each of ``n`` lanes, neighbours in space for neighbours in number.
+    """A stratified point in [0, 1)² (Point2f) for each of ``n`` lanes; neighbours in number lie close together.
 
     Lane k gets a uniform point of the k-th piece of Morton's curve, cut into n equal pieces (He and Owen, *Extensible
     grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together. The
@@ -107,7 +107,7 @@ def along_curve(lane: Any, n: Any, rng: Sampler) -> Any:
 
 
 def _every_other_bit(x: Any) -> Any:
-    """The bits of even number, moved together: 16 bits."""
+    """The bits of even number, packed together: 16 bits."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits
     return x
@@ -124,7 +124,7 @@ def _mix(x: Any) -> Any:
 
 
 def _scramble(x: Any, seed: Any) -> Any:
-    """A scramble of Owen's kind for numbers whose bits are reversed: bits flip by a hash of the bits below them."""
+    """An Owen scramble of numbers whose bits are reversed: each bit is flipped by a hash of the bits below it."""
     x = x + seed
     x ^= x * 0x6C50B47C
     x ^= x * 0xB82F1E52

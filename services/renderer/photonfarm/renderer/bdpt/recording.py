@@ -12,7 +12,7 @@ import drjit as dr
 log = logging.getLogger(__name__)
 
 RECORDINGS = 16
-"""Kinds of launch kept ready: the oldest makes room for a new one."""
+"""The number of recordings kept: the oldest makes room for a new one."""
 
 ATTEMPTS = 2
 
@@ -20,8 +20,9 @@ ATTEMPTS = 2
 class Recorder:
     """Calls a function of a scene, a sensor and other arguments, recorded once for each kind of call.
 
-    `dr.freeze` tells calls apart by its arguments' variables and by the hashes of Python's numbers among them, and has
-    been seen to replay the recording of another number (Dr.Jit 1.5). So each kind has a recording of its own.
+    `dr.freeze` distinguishes calls by the variables of their arguments and by the hashes of Python's numbers among
+    them, and was observed to replay the recording of another number (Dr.Jit 1.5). So each kind has a recording of its
+    own.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -30,11 +31,11 @@ class Recorder:
         self._recorded: dict[Hashable, _Recording] = {}
 
     def __call__(self, kind: Hashable, scene: Any, sensor: Any, *arguments: Any) -> Any:
-        """The function's result. `kind` holds every number that the kernels are made for.
+        """Call the function; `kind` holds every number that the kernels are compiled for.
 
-        What cannot be recorded is called as it is: for good if a second attempt fails too (lenses); Mitsuba makes some
-        tables when they are first asked for, which fails one attempt. The scene and the sensor of a recording are kept,
-        so that no others are taken for them.
+        A call that cannot be recorded runs unrecorded: for good if a second attempt fails too (lenses); Mitsuba makes
+        some tables at their first use, which fails one attempt. The scene and the sensor of a recording are kept, so
+        that no others are taken for them.
         """
         kind = (id(scene), id(sensor), kind)
         if kind not in self._recorded:
@@ -61,7 +62,7 @@ class _Recording:
 
 
 def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, recorded. Two variants at most: Dr.Jit records once more where it took data for a constant."""
+    """The function, recorded. Two variants at most: Dr.Jit records once more if it took data for a constant."""
     frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
     return frozen
 

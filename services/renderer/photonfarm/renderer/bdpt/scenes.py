@@ -1,4 +1,4 @@
-"""What this integrator accepts of a scene."""
+"""The scenes that this integrator accepts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ UNBOUNDED = 0xFFFFFFFF
 def check_scene(scene: Any, *, light_paths: bool) -> None:
     """Raise ValueError for media, for lights that shine along their normal only, and for lit instances.
 
-    The last only where there are ``light_paths``.
+    Lit instances are refused only with ``light_paths``.
     """
     shapes = scene.shapes()
     for shape in shapes:

@@ -13,7 +13,8 @@ roulette is in none of the densities: it thins samples of a technique and compen
 technique's density is.
 
 Letters: p solid-angle densities, cos = |n_geometric · d|, "in" the edge by which a vertex was reached, "rev" against
-the walk. All functions take and return ``mi.Float`` (or plain floats: the tests sum the weights of one path by hand).
+against the walk. All functions take and return ``mi.Float`` (or plain floats: the tests sum one path's weights by
+hand).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any
 import drjit as dr
 
 LARGEST = 1e30
-"""Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
+"""Sums are clamped to this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
 
 
 def light_start(nee_density: Any, emission: Any) -> Any:

@@ -1,6 +1,6 @@
-"""`photonfarm measure-frames`: what the parts of one frame cost on this machine, and what its pixels show.
+"""`photonfarm measure-frames`: the cost of the parts of one frame on this machine, and the surfaces in its pixels.
 
-Times are wall times until a part's result lies in numpy's memory, in a process whose thread pool is one thread.
+A part is timed on the wall clock until its result is in numpy's memory, in a process whose thread pool is one thread.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.find import scene_named
 
 WARM_UPS = 2
-"""Frames before those that count: the first compiles kernels, the second is the first to replay recorded launches."""
+"""The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What a row of the store shows."""
+    """The configuration and the view of a row of the store."""
 
     row: int
     modification: Modification
@@ -53,8 +53,8 @@ def write_frame_costs(
     """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
 
     The backend must have been loaded, with one thread.
-    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError where the scene's files are
-    not here.
+    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError if the scene's files are
+    not on this machine.
     """
     opened = Store(store)
     reader = SceneReader(store, scene_id := scene_named(opened, scene))
@@ -87,7 +87,7 @@ def frame_costs(
 ) -> FrameCosts:
     """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
 
-    Frames are taken again where there are fewer than are timed.
+    If there are fewer frames than are timed, they are repeated.
     """
     films = [PartialFilm(scene.spec, k) for k in kept]
     surface = np.stack([_surfaces(scene, frame) for frame in frames])
@@ -122,11 +122,11 @@ def _surfaces(scene: LoadedScene, frame: Frame) -> NDArray[np.uint8]:
 def _seconds(
     scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[Frame], timed: int
 ) -> NDArray[np.float64]:
-    """Of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
+    """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
     stays = len({frame.key for frame in frames}) == 1
     measured = []
     for seed, frame in enumerate(islice(in_turn(frames), WARM_UPS + timed)):
-        if stays:  # there would be nothing to edit
+        if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
         measured.append(_time_frame(scene, cloud, films, frame, seed))
     return np.array(measured[WARM_UPS:]).T
@@ -145,7 +145,7 @@ def _time_frame(
 
 
 def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
-    """Seconds to trace the configuration's photons, and to find which the view sees; zeros for a scene without."""
+    """Seconds to trace the configuration's photons, and to find those that the view sees; zeros for a scene without."""
     photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
     if photons is None:
         return 0.0, 0.0

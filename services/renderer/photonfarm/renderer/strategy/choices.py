@@ -1,4 +1,4 @@
-"""Candidates at equal cost: what each makes of the CPU time that a spec accepts for a half-estimate."""
+"""Candidates at equal cost: the error of each in the CPU time that a spec accepts for a half-estimate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from photonfarm.renderer.strategy.pilot import longest
 
 @dataclass(frozen=True, slots=True)
 class Offer(Measured):
-    """A candidate at the samples per pixel that the time buys; `time_s` is that of such a half-estimate."""
+    """A candidate at the samples per pixel that fit the time; `time_s` is that of such a half-estimate."""
 
     half_spp: int
     half_error: float  # relMSE of such a half-estimate
@@ -20,7 +20,7 @@ class Offer(Measured):
 
 
 def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
-    """Every candidate that was measured, at the samples that `half_s` buys it.
+    """Every measured candidate, at the samples per pixel that fit `half_s`.
 
     The variance of an image is that of a sample over their number, so error × time is error a sample × time / samples.
     """
@@ -51,7 +51,7 @@ def _per_sample_s(row: Row, half_s: float) -> float:
 
 
 def best(offered: dict[Candidate, Offer]) -> Offer:
-    """Of least error × time, among those measured longest."""
+    """The offer of least error × time, among those measured longest."""
     return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
 
 
@@ -60,10 +60,10 @@ def _cost(offer: Offer) -> float:
 
 
 def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
-    """The settings to take where those given are accepted now: themselves, unless others are significantly better.
+    """The settings to take if the given ones are accepted now: themselves, unless others are significantly better.
 
-    A whole number of samples changes the cost a little, at which something else may be better still; so gains are
-    followed until there is none, and a plan that is written asks for itself. Where they lead back, nothing is gained.
+    A whole number of samples changes the cost a little, at which another candidate may be better still; so gains are
+    followed until there is none, and a plan that is written confirms itself. A cycle gains nothing.
     """
     seen = [(candidate, half_spp)]
     while (better := _better(measurement, *seen[-1])) is not None:

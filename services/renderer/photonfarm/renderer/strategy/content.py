@@ -1,4 +1,4 @@
-"""What a scene contains, and what follows from that alone, without measuring."""
+"""The content of a scene, and the restrictions that follow from it without a measurement."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _LIGHTS = {
 }
 _BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
 _CAMERAS = {"PerspectiveCamera": "pinhole", "ThinLensCamera": "thin lens"}
-"""Cameras that light paths can be joined to."""
+"""The cameras that light paths can be joined to."""
 
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """The facts of one loaded scene, as it stands."""
+    """The facts of one loaded scene in its present state."""
 
-    lights: Mapping[str, int]  # that shine, by kind
+    lights: Mapping[str, int]  # lights that shine, by kind
     dark: int  # lights of radiance 0: they are never selected
     surfaces: int
-    specular: int  # of them, those that only reflect or refract like a mirror or clear glass
+    specular: int  # of these, those that only reflect or refract like a mirror or clear glass
     camera: str  # "pinhole", "thin lens", or Mitsuba's name of another
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Something that is not modelled, and why."""
+    """A technique that is left out, and the reason."""
 
     what: str
     why: str
@@ -48,7 +48,7 @@ class LeftOut:
 
 
 def read(scene: Any, camera: Any) -> Content:
-    """What a Mitsuba scene contains, seen by one of Mitsuba's sensors."""
+    """Read the content of a Mitsuba scene, seen by one of Mitsuba's sensors."""
     shining = [emitter for emitter in scene.emitters() if _shines(emitter)]
     kinds = Counter(_LIGHTS.get(emitter.class_name(), emitter.class_name()) for emitter in shining)
     return Content(
@@ -61,7 +61,7 @@ def read(scene: Any, camera: Any) -> Content:
 
 
 def _shines(emitter: Any) -> bool:
-    """Whether any of its brightness is above zero, and its scale and its image are, if it has them."""
+    """Whether any of its brightness parameters is above zero, and its scale and image too, if it has them."""
     import mitsuba as mi
 
     parameters = mi.traverse(emitter)
@@ -84,7 +84,7 @@ def _is_specular(shape: Any) -> bool:
 def restrict(
     content: Content, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
 ) -> tuple[list[Candidate], list[LeftOut]]:
-    """The candidates that may help, and what is left out. `hit_share`: of the light paths, those that hit a surface."""
+    """The candidates that may help, and what is left out; `hit_share`: the share of light paths that hit a surface."""
     candidates = list(candidates)
     reason = _why_no_light_paths(content, max_depth, hit_share)
     if reason:
@@ -109,7 +109,7 @@ def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> s
 
 
 def sentences(content: Content, max_depth: int) -> Sequence[str]:
-    """What is modelled in any case, and what lights that are off cost."""
+    """What every plan models, and the lights that are off."""
     lights = ", ".join(f"{count} {kind}" for kind, count in sorted(content.lights.items())) or "none"
     found = [
         f"lights: {lights}",

@@ -1,4 +1,4 @@
-"""What works on this machine, and what to do about what does not; each check is a real use, not a look at versions."""
+"""What works on this machine, and remedies for what does not; each check is a real use, not a look at versions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Finding:
     name: str
     works: bool
     detail: str
-    exit_code: int = 0  # of the command, if this does not work and is needed
+    exit_code: int = 0  # of the command, if this check fails and is required
 
 
 def examine(store: str | Path, redis_url: str) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""The contact sheet: what lies in the store, sample by sample, as one page that needs no other file."""
+"""The contact sheet: the samples of a store on one page that needs no other file."""
 
 from __future__ import annotations
 

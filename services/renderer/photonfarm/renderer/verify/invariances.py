@@ -1,7 +1,8 @@
-"""What must not change an image: technique counts, how lights are grouped, units, how a scene came to be as it is.
+"""Changes that must not change an image: technique counts, the grouping of lights, units, the history of a scene.
 
-And what one seed promises. `checks` yields all of them by name, quick or long; each runs by itself, says what it found,
-and can be repeated with `command`. Equal seeds give equal bytes with one thread only (`backend.load(threads=1)`).
+Also the promises about equal seeds. `checks` yields all of them by name, quick or long; each runs by itself, reports
+its figures, and can be repeated with `command`. Equal seeds give equal bytes with one thread only
+(`backend.load(threads=1)`).
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ DEPTH = 5
 COUNTS = tuple(Settings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
-"""Scenes with rare bright samples, of which a few renders say too little; they have rows of their own."""
+"""The scenes with rare bright samples, for which a few renders prove too little; they have rows of their own."""
 _MORE_COUNTS = tuple(name for name in hard_scenes.HARD_SCENES if name not in _SKEWED)
 _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a check found."""
+    """The result of a check."""
 
-    faults: tuple[str, ...]  # why it failed; none: it passed
+    faults: tuple[str, ...]  # why it failed; empty: it passed
     figures: str  # what was measured, in words
     cpu_s: float
 
@@ -52,7 +53,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Something that must hold."""
+    """A property that must hold."""
 
     name: str
     said: str  # what must hold
@@ -61,18 +62,18 @@ class Check:
 
     @property
     def command(self) -> str:
-        """Runs it again."""
+        """The command that runs it again."""
         return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
 
     def run(self) -> Finding:
-        """Render what it takes, and judge."""
+        """Render what the check needs, and judge it."""
         start = time.process_time()
         faults, figures = self.find()
         return Finding(tuple(faults), figures, time.process_time() - start)
 
 
 def checks(*, long: bool) -> Iterator[Check]:
-    """All invariances; the long version looks at more scenes, more sharply."""
+    """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
     for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
         yield Check(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
@@ -102,9 +103,9 @@ def checks(*, long: bool) -> Iterator[Check]:
 
 
 def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
-    """The checks of these names, or whose names begin like them; all for an empty choice.
+    """The checks of these names, or whose names begin with them; all for an empty choice.
 
-    Raises ValueError for a name that stands for none.
+    Raises ValueError for a name that matches none.
     """
     everything = list(checks(long=long))
     for name in names:
@@ -115,7 +116,7 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
 
 
 def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
-    """A table of checks and what they found, and the commands that repeat those that failed."""
+    """A table of checks and their results, and the commands that repeat the failed ones."""
     lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [
         f"- {check.name}: {'; '.join(finding.faults)}. Again: `{check.command}`"
@@ -129,7 +130,7 @@ def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
 
 
 def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], Scene]]:
-    """Scenes by name: the quick ones, and for the long version ``more`` of them."""
+    """Scenes by name: the quick ones, and for the long version also those in ``more``."""
     names = (*quick, *more) if long else quick
     return {name.replace("_", "-"): hard_scenes.HARD_SCENES[name] for name in names}
 
@@ -138,7 +139,7 @@ def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> d
 
 
 def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Every pair of counts against the usual one with more samples. The path tracer (0, 0) may be noisy."""
+    """Compare every pair of counts with the usual one at more samples. The path tracer (0, 0) may be noisy."""
     scene = load(build(effort.size))
     truth = _images(scene, ALL[0], effort, TRUTH_SEEDS, effort.truth_spp)
     faults, ratios = [], []
@@ -151,7 +152,7 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
 
 
 def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """All lights against the even ones plus the odd ones, each switched off in place."""
+    """Compare all lights with the even ones plus the odd ones, each switched off in place."""
     scene = load(build(effort.size))
     parameters = mi.traverse(scene)
     keys = _brightness_keys(parameters)
@@ -170,7 +171,7 @@ def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Times 8 with the same seed, where nothing but the exponent changes; times 3 with others."""
+    """Compare radiances times 8 with the same seed, where only the exponent changes; and times 3 with other seeds."""
     scene = load(build(effort.size))
     before = _images(scene, ALL[0], effort, 0)
     _brighten(scene, 8)
@@ -182,15 +183,15 @@ def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], st
 
 
 _SUMS = 1e-5
-"""Largest difference of a pixel, relative to itself and the mean, that is rounding of float32 sums alone."""
+"""The largest difference of a pixel, relative to itself and the mean, that float32 sums alone can cause."""
 _NEAR, _SHARE = 1e-3, 0.9
-"""Share of the pixels that must be this near with one seed; in the others a path has met or missed an edge."""
+"""The limit of a near pixel, and the share of near pixels with one seed; in others a path met or missed an edge."""
 _NEAR_SCALED = {1e3: _NEAR, 1e-3: 2e-2}
-"""The same by factor of scale: below one unit, ray offsets do not become smaller with the scene."""
+"""The limit by factor of scale: below one unit, ray offsets do not become smaller with the scene."""
 
 
 def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
-    """The cove, all lengths times a factor, against itself: with the same seeds, and with others."""
+    """Compare the cove with itself at all lengths times a factor: with the same seeds, and with others."""
     images = _images(load(scaled(factor)(effort.size)), ALL[0], effort, 0)
     same = _images(load(scaled(1.0)(effort.size)), ALL[0], effort, 0)
     near = float(np.mean(_differences(images, same) < _NEAR_SCALED[factor]))
@@ -204,10 +205,10 @@ def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
 
 
 def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """The light dimmed, then a box and the camera moved, in place and in the description.
+    """Dim the light, then move a box and the camera, in place and in the description, and compare.
 
-    The light bit by bit. Embree keeps moved meshes otherwise than new ones, and Mitsuba inverts a camera's transform in
-    other precision when it loads it, so that there the last bits differ.
+    The light must match bit by bit. Embree stores moved meshes otherwise than new ones, and Mitsuba inverts a camera's
+    transform at another precision when it loads it, so that there the last bits differ.
     """
     step, new = [0.2, -0.1, 0.15], [0.2, -3.0, 1.1]
     at = mi.ScalarTransform4f().translate([-0.3, 0.2, 0.3]) @ mi.ScalarTransform4f().scale(0.2)
@@ -215,7 +216,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     box = {"type": "cube", "to_world": at, "bsdf": hard_scenes.grey(0.5)}
     start = {**build(effort.size), "box": box}
     scene = load(start)
-    _images(scene, ALL[0], effort, 5)  # so that there is something to be left over
+    _images(scene, ALL[0], effort, 5)  # so that a stale state could show
     parameters = mi.traverse(scene)
     parameters["light.emitter.radiance.value"] = mi.Color3f(1.5, 2.0, 2.5)
     parameters.update()
@@ -239,7 +240,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
 
 
 def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """A seed twice, another between; and several at once. Bit by bit, for each of the usual counts."""
+    """Render a seed twice, another between, and several at once: bit by bit equal, for each of the usual counts."""
     scene = load(build(effort.size))
     faults = []
     for settings in ALL:
@@ -258,7 +259,7 @@ def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[st
 
 
 def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Bit by bit: other seeds, several of them, other numbers of samples, a dimmed or dead light, a moved camera."""
+    """Compare recorded launches bit by bit: other seeds, other numbers of samples, dimmed lights, a moved camera."""
     scene = load(build(effort.size))
     parameters, sensor = mi.traverse(scene), scene.sensors()[0]
     key = _brightness_keys(parameters)[0]
@@ -286,7 +287,7 @@ def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str], str]:
-    """Weights of real paths; see `weight_check`."""
+    """Compare the weights of real paths; see `weight_check`."""
     faults, figures = [], []
     for settings in ALL:
         found = weight_check.compare_weights(build, settings, lanes=lanes)
@@ -309,7 +310,7 @@ def _images(scene: Any, settings: Settings, effort: Effort, seed: int, spp: int 
 
 
 def _compare(a: Images, b: Images, effort: Effort) -> tuple[BlockTest, list[str]]:
-    """The block z-test, and what is wrong by it."""
+    """The block z-test, and its faults."""
     tests = [block_z_test(a, b, blocks, SIGNIFICANCE, ROUNDING) for blocks in (effort.blocks, 1)]
     faults = [f"|z| is {test.z_max:.2f}, the limit {test.z_limit:.2f}" for test in tests if not test.passed]
     if not tests[0].mean_ratio_standard_error <= effort.resolution:
@@ -323,7 +324,7 @@ def _ratio(test: BlockTest) -> str:
 
 
 def _differences(a: Images, b: Images) -> Images:
-    """[K, H, W, 3] relative to the pixel or, where that is dark, to the mean."""
+    """The differences, [K, H, W, 3], relative to the pixel or, if that is dark, to the mean."""
     return np.asarray(np.abs(a - b) / np.maximum(np.abs(b), np.mean(b)))
 
 

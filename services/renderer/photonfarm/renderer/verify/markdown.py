@@ -1,4 +1,4 @@
-"""The stability report as Markdown: verdict, table, pictures, what is hard and what is refused."""
+"""The stability report as Markdown: verdict, table, pictures, hard cases and refusals."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ _PICTURES = (
 
 
 def _verdict(report: Report) -> str:
-    """How many rows and scenes pass; refusals that have no row are counted by themselves."""
+    """The numbers of rows and scenes that pass; refusals without a row are counted separately."""
     rows, scenes = report.rows(), report.scenes()
     others = [not result.faults for result in report.results if result.row is None]
     parts = [f"**{sum(rows.values())} of {len(rows)} rows pass**, {sum(scenes.values())} of {len(scenes)} scenes"]
@@ -107,7 +107,7 @@ def _line(results: list[Result]) -> str:
 
 
 def _seen(biases: Sequence[float | None]) -> str:
-    """The worst of some biases that would be seen."""
+    """The worst of the smallest biases that would fail."""
     if None in biases:
         return "unknown"
     worst = 100 * max(bias for bias in biases if bias is not None)
@@ -135,7 +135,7 @@ def _path_ratio(result: Result) -> str:
 
 
 def _is_rounding(result: Result) -> bool:
-    """Whether it passes only because differences of rounding are let pass: above the noise, and no trifle."""
+    """Whether it passes only because of the tolerance for rounding: above the noise, and not negligible."""
     if result.faults or result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return False
     off = abs(result.mean_ratio - 1)
@@ -143,7 +143,7 @@ def _is_rounding(result: Result) -> bool:
 
 
 def _rounded(scenes: Sequence[Sequence[Result]]) -> str:
-    """What is ° in the table, and can be of one colour all over in the picture, beside what `path` has there."""
+    """The entries marked ° in the table, which may colour a whole picture, beside the same ratio of `path`."""
     if not scenes:
         return ""
     worst = [max(results, key=_deviation) for results in scenes]

@@ -17,7 +17,7 @@ from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
 from photonfarm.shared.core.pictures import Picture
 
 FAILURES = Path(".stability")
-"""Where the renders of failures are kept."""
+"""The folder for the renders of failures."""
 
 
 Key = TypeVar("Key", int, str)
@@ -25,7 +25,7 @@ Key = TypeVar("Key", int, str)
 
 @dataclass(slots=True)
 class Report:
-    """What a run found."""
+    """The results of a run."""
 
     results: list[Result] = field(default_factory=list)
     pictures: list[tuple[str, Picture]] = field(default_factory=list)  # label, triple of the first settings
@@ -36,11 +36,11 @@ class Report:
         return not any(result.faults for result in self.results)
 
     def rows(self) -> dict[int, bool]:
-        """Number → whether all of the row's scenes that were rendered passed, with all settings."""
+        """Whether each row passed, by number: all of its scenes that were rendered, with all settings."""
         return _all_passed((result.row, result) for result in self.results if result.row is not None)
 
     def scenes(self) -> dict[str, bool]:
-        """Label → whether the scene passed with all settings; one for each line of the table."""
+        """Whether each scene passed with all settings, by label; one for each line of the table."""
         return _all_passed((result.label, result) for result in self.results if result.row is not None)
 
 
@@ -55,12 +55,12 @@ def examine(
     items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[Settings] = (),
     failures: Path = FAILURES, tell: Callable[[str], None] = lambda _: None,
 ) -> Report:  # fmt: skip
-    """Run the scenes (see `rows.chosen`), keep the renders of failures, tell of each as it is done."""
+    """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""
     report = Report()
     for item in items:
         for outcome in run(item, quick=quick, seed=seed, settings=settings):
             _add(report, outcome, failures, tell)
-        gc.collect()  # the next scene's kernels are found in the cache only once this scene is gone
+        gc.collect()  # Dr.Jit finds the next scene's kernels in its cache only once this scene is gone
     return report
 
 
@@ -76,7 +76,7 @@ def _add(report: Report, outcome: Outcome, failures: Path, tell: Callable[[str],
 
 
 def write(report: Report, out: Path, command: str) -> None:
-    """Write stability.md, stability.json and stability.png into a folder; `command` is what made them."""
+    """Write stability.md, stability.json and stability.png into a folder; `command` is the command that made them."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "stability.md").write_text(markdown(report, command), encoding="utf-8")
     (out / "stability.json").write_text(as_json(report, command), encoding="utf-8")

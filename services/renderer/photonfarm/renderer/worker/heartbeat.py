@@ -1,4 +1,4 @@
-"""A worker's heartbeat and a job's deadline, both kept by threads that no rendering holds up."""
+"""A worker's heartbeat and a job's deadline, both kept by threads that rendering does not block."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ STDERR = 2
 
 
 class Heart:
-    """Tells Redis that the worker and its job are alive, and what holds it up, from a thread with its own connection.
+    """Writes the heartbeat of the worker and its job, and why it is idle, from a thread with its own connection.
 
-    `paused` says why it takes no jobs, and `left` by scene id why it leaves scenes alone for now.
+    `paused` is the reason why it takes no jobs, and `left` by scene id the reason why it skips scenes for now.
     """
 
     def __init__(self, settings: WorkerSettings, store: Store, words: int | None) -> None:
@@ -45,20 +45,20 @@ class Heart:
         threading.Thread(target=self._keep_beating, daemon=True).start()
 
     def end(self) -> None:
-        """Say that the worker's child is gone; its supervisor keeps the name."""
+        """Remove the heartbeat of the worker's child; its supervisor keeps the name."""
         self._ended.set()
         queue.free_job(self._connection, self._settings.name)
         queue.forget_held_up(self._connection, self._settings.name, {*self.left, *self._left_told})
 
     @contextlib.contextmanager
     def working(self, name: str) -> Iterator[None]:
-        """Beat for a job too while the block runs; past the deadline the process ends, and says where it hung."""
+        """Beat for a job too while the block runs; past the deadline the process ends, and prints where it hung."""
         self._job = name
         if self._words is not None:
             with contextlib.suppress(BrokenPipeError):
                 os.write(self._words, f"{JOB_IN_HAND}{name}\n".encode())
         self._beat()
-        # its watchdog is a thread without Python's lock, so that native code that never returns is ended as well
+        # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
         faulthandler.dump_traceback_later(
             self._settings.deadline_s, exit=True, file=STDERR if self._words is None else self._words
         )

@@ -1,4 +1,4 @@
-"""What a worker says while all is well: a line after its first job and then one a minute, and why it pauses."""
+"""The log of a worker in normal operation: a line after its first job and then one a minute, and why it pauses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What became of jobs."""
+    """Counts of jobs and samples."""
 
     jobs: int = 0  # done
     failed: int = 0
@@ -23,7 +23,7 @@ class Tally:
     seconds: float = 0.0  # of all
 
     def __add__(self, other: Tally) -> Tally:
-        """Both together."""
+        """The sum of both."""
         return Tally(
             self.jobs + other.jobs,
             self.failed + other.failed,
@@ -33,31 +33,31 @@ class Tally:
 
     @property
     def line(self) -> str:
-        """As a child tells it."""
+        """The counts as a child writes them to its supervisor."""
         return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
 
     @classmethod
     def of(cls, line: str) -> Tally:
-        """What a child has told."""
+        """The counts in a line of a child."""
         jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
         return cls(int(jobs), int(failed), int(samples), float(seconds))
 
     def __str__(self) -> str:
-        """As people are told."""
+        """The counts in words."""
         failed = f", {self.failed} failed" if self.failed else ""
         return f"{counted(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
 
 
 def counted(jobs: int) -> str:
-    """So many jobs, in words."""
+    """A number of jobs, in words."""
     return f"{jobs} job{'s' * (jobs != 1)}"
 
 
 class Talk:
-    """Counts jobs, and says how it goes; nothing if the settings say quiet, but for what holds the worker up."""
+    """Counts jobs, and logs progress; with `quiet` only what holds the worker up."""
 
     def __init__(self, settings: WorkerSettings) -> None:
-        """Count from now on."""
+        """Start counting."""
         log.setLevel(logging.WARNING if settings.quiet else logging.INFO)
         self._name = settings.name
         self._every_s = settings.report_s
@@ -69,7 +69,7 @@ class Talk:
 
     @contextlib.contextmanager
     def timing(self, name: str) -> Iterator[None]:
-        """A job, as long as the block runs."""
+        """Time a job while the block runs."""
         began = time.monotonic()
         yield
         now = time.monotonic()
@@ -87,7 +87,7 @@ class Talk:
             )
 
     def pausing(self, reason: str | None) -> None:
-        """Say once that no jobs are taken, and once that they are again."""
+        """Log once that no jobs are taken, and once that they are taken again."""
         if reason and not self._pausing:
             log.warning("worker %s: takes no jobs: %s", self._name, reason)
         elif self._pausing and not reason:
@@ -95,7 +95,7 @@ class Talk:
         self._pausing = bool(reason)
 
     def waiting(self, ahead: Mapping[str, str]) -> None:
-        """Say once of each scene that its jobs are left for a reason, and once that they are taken again."""
+        """Log once for each scene why its jobs are skipped, and once that they are taken again."""
         for scene_id in ahead.keys() - self._waiting:
             log.warning("worker %s: takes no jobs of scene %s: %s", self._name, scene_id, ahead[scene_id])
         for scene_id in self._waiting - ahead.keys():

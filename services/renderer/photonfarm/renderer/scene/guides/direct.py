@@ -1,4 +1,4 @@
-"""What lights send straight to points, and to surfaces that reflect it.
+"""Light that arrives straight from lights, at points and at surfaces that reflect it.
 
 Shape letters: L lit points, N rays.
 """
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 def point_light(
     scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec, recorder: Recorder | None = None
 ) -> F32:
-    """Irradiance (L, 3) of points on the side of their normals by what lights send directly; 0 without light samples.
+    """Direct irradiance (L, 3) of points, on the side of their normals; 0 without light samples.
 
-    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
-    `recorder` of `irradiance` Python runs but once.
+    It takes one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
+    `recorder` of `irradiance` Python runs only once.
     """
     if not wanted.light_samples or not scene.emitters():
         return np.zeros_like(position)
@@ -49,7 +49,7 @@ def point_light(
 
 
 def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u: list[Any]) -> Any:
-    """What one sample of the lights brings to each point, on the side of its normal (Color3f)."""
+    """The irradiance of each point by one sample of the lights, on the side of its normal (Color3f)."""
     count = dr.width(position)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
@@ -69,11 +69,11 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """How rays came to a surface."""
+    """How rays reached a surface."""
 
-    met: Any  # Bool: there is one
+    met: Any  # Bool: there is a surface
     direction: Any  # Vector3f: of the ray that meets it
-    followed: Any  # UInt32: surfaces left behind
+    followed: Any  # UInt32: surfaces passed on the way
 
 
 @dataclass(slots=True)
@@ -98,7 +98,7 @@ class Arrives:
 
 @dataclass(frozen=True, slots=True)
 class _Surface:
-    """Where direct light is asked for."""
+    """A surface that reflects direct light."""
 
     scene: Any
     lights: Lights
@@ -113,7 +113,7 @@ class _Surface:
 def lit(
     scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: Settings
 ) -> Arrives:
-    """What lights send straight to a surface and it reflects: as a white diffuse one, and by all of its lobes."""
+    """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
     nothing = Arrives(mi.Color3f(0), mi.Color3f(0))
     if lights is None or not settings.light_samples:
         return nothing
@@ -128,7 +128,7 @@ def lit(
 
 
 def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
-    """The mean over shadow rays to points of lights; of other lobes the share that the balance heuristic leaves."""
+    """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
     count = at.settings.light_samples
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
 
@@ -157,7 +157,7 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
 
 
 def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
-    """What one ray along a sample of the BSDF meets of lights, with the share that shadow rays leave of it."""
+    """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
     u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
     ray = at.si.spawn_ray(at.si.to_world(bs.wo))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
 
 PURPOSE = "direct"
-"""Of the seed of direct light, which follows from the view's key."""
+"""The purpose of the seed of direct light, which is derived from the view's key."""
 
 
 def view_guides(
@@ -36,7 +36,7 @@ def view_guides(
 ) -> Guides:  # fmt: skip
     """The guides of a view in the scene's present configuration; `key` is the view's.
 
-    `arrives` is what `point_light` gives. With a `recorder` of `trace` Python runs but once for all views.
+    `arrives` is the result of `point_light`. With a `recorder` of `trace` Python runs only once for all views.
     """
     camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
     pixels = camera.height * camera.width
@@ -86,7 +86,7 @@ def _rows(column: Any) -> NDArray[np.float64]:
 
 
 def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:
-    """The guides of the sums over each pixel's rays."""
+    """The guides, given the sums over each pixel's rays."""
 
     def image(values: NDArray[np.float64]) -> F32:
         shaped = values.reshape(camera.height, camera.width, -1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Rays followed through mirrors and glass, and what they find on the way and at the end."""
+"""Rays followed through mirrors and glass, and the surfaces on the way and at the end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def trace(
     scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
     settings: Settings,
 ) -> dict[str, Any]:  # fmt: skip
-    """What `images` makes means of, by name, of each ray; zeros where there is nothing.
+    """The quantities that `images` averages, by name, for each ray; zeros where there is nothing.
 
     `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
     plane, whose distance from the eye is `settings.near` / `along`.
@@ -61,9 +61,9 @@ class _Path:
     active: Any  # Bool: the ray has not been traced yet
     ray: Any  # Ray3f
     throughput: Any  # Color3f
-    emission: Any  # Color3f: of all that was met
+    emission: Any  # Color3f: of all surfaces on the way
     length: Any  # Float: from the eye to the ray's origin
-    followed: Any  # UInt32: surfaces left behind
+    followed: Any  # UInt32: surfaces passed on the way
 
 
 def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings) -> tuple[_Path, Any]:
@@ -85,9 +85,9 @@ def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings)
 
 
 def _follow(scene: Any, s: _Path, si: Any, settings: Settings) -> _Path:
-    """One surface `si` on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
+    """Process one surface `si` on the way: its emission, and the ray that leaves it if it has delta lobes alone.
 
-    Sampled at 1/2, glass gives the lobe that takes more than half, with its probability, which is what it takes.
+    Sampled at 1/2, glass gives the lobe that takes more than half of the light, with a probability equal to its share.
     """
     emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
     bsdf = si.bsdf()

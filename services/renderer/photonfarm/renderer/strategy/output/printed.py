@@ -14,7 +14,7 @@ from photonfarm.renderer.strategy.reasons import BLACK, plus_minus, reasons_for
 
 
 def lines(plan: Plan) -> list[str]:
-    """The verdict, what is modelled, what is left out, why, what that saves, and the measurement it rests on."""
+    """The verdict, the modelled content, what is left out, the reasons, the saving, and the measurement."""
     m = plan.measurement
     origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
     return [
@@ -67,7 +67,7 @@ def _halves(plan: Plan) -> list[str]:
 
 
 def _unchosen(plan: Plan) -> list[str]:
-    """Of light paths and connections, those that the plan does without though they were measured."""
+    """The techniques, of light paths and connections, that were measured and are not in the plan."""
     if plan.measurement.left_out or not plan.offers:
         return []
     if not plan.candidate.light_ratio:
@@ -100,7 +100,7 @@ def _why(plan: Plan) -> list[str]:
 
 
 def _not_taken(plan: Plan) -> list[str]:
-    """Why the best measured is not what the plan says, where it is not."""
+    """Why the plan does not have the best measured settings, if it does not."""
     reasons = []
     chosen, fitting, any_cost = plan.offers[plan.candidate], best(_fitting(plan)), best(dict(plan.offers))
     if fitting.candidate != plan.candidate:
@@ -132,7 +132,7 @@ def _savings(plan: Plan) -> Sequence[str]:
 
 
 def _measured(plan: Plan) -> list[str]:
-    """The table, its legend and an empty line each; nothing where nothing was measured."""
+    """The table, its legend and an empty line each; nothing without a measurement."""
     if not plan.offers:
         return []
     return [*table(list(plan.offers.values()), plan.candidate), "", *legend(plan.spec), ""]

@@ -40,7 +40,7 @@ def _remark(offer: Offer, chosen: Candidate) -> str:
 
 
 def legend(spec: SceneSpec) -> list[str]:
-    """What the columns are."""
+    """The meaning of the columns."""
     film, now = spec.film, spec.transport.half_spp
     return [
         "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "

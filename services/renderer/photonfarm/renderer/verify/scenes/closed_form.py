@@ -1,4 +1,4 @@
-"""Rows whose image is known in closed form; the derivation stands above each."""
+"""Rows whose image is known in closed form; the derivation is stated with each."""
 
 from __future__ import annotations
 

@@ -11,11 +11,11 @@ import numpy as np
 from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Scene, Truth
 
 LANES = 1 << 20
-"""Most samples of one launch: bounds the memory of Mitsuba's own integrators."""
+"""The most samples of one launch: bounds the memory of Mitsuba's own integrators."""
 TRUTH_SEEDS = 1_000_000
-"""Seeds of truths begin here, above those of bdpt."""
+"""The first seed of truths, above those of bdpt."""
 GRID = 24
-"""Points per pixel and axis at which a known image is averaged over each pixel."""
+"""The points per pixel and axis over which a known image is averaged."""
 
 
 def render(scene: Any, integrator: dict[str, Any], spp: int, seeds: range) -> Images:

@@ -1,7 +1,7 @@
-"""Real paths through a scene with their vertices stored, and the weights that the integrator's functions give them.
+"""Real paths through a scene with their vertices stored, and their weights by the integrator's functions.
 
 Eye paths walk as the integrator's do, each vertex is joined to a light by next event estimation, and each such path is
-then looked at as any technique would have made it: the sums of `bdpt.weights` are run from the lens towards the light
+then treated as made by any of the techniques: the sums of `bdpt.weights` are run from the lens towards the light
 and from the light towards the lens, in the order of the integrator's loops, with densities from the integrator
 (`emission`, `selection`, `camera`) and from Mitsuba.
 
@@ -88,7 +88,7 @@ def walk(scene: Any, lights: Lights, *, paths: int, edges: int, seed: int) -> It
 
 
 def _choice(lights: Lights, si: Any, rng: randomness.Sampler) -> Any:
-    """Number of the light that next event estimation chooses with the same numbers."""
+    """The number of the light that next event estimation chooses with the same random numbers."""
     return dr.zeros(mi.UInt32) if lights.selection is None else lights.selection.choose(si.p, rng.next_1d())[0]
 
 
@@ -123,7 +123,7 @@ class Pinhole:
 
     @classmethod
     def of(cls, scene: Any) -> Pinhole:
-        """That of a scene's first sensor."""
+        """The pinhole of a scene's first sensor."""
         parameters = mi.traverse(scene.sensors()[0])
         frame = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
         half = np.tan(np.deg2rad(float(parameters["x_fov"][0])) / 2)
@@ -207,7 +207,7 @@ def weights_of(scene: Any, lights: Lights, joined: Joined, lens: Pinhole, settin
 
 
 def _eye_sums(joined: Joined, st: Steps, settings: TechniqueCounts) -> tuple[dict[int, tuple[Any, Any]], Any]:
-    """((dVCM, dVC) on arriving at v₁ … v₍ₖ₋₁₎, the same as they left v₁)."""
+    """((dVCM, dVC) on arriving at v₁ … v₍ₖ₋₁₎, the same on leaving v₁)."""
     k = len(joined.bounces) + 1
     dvcm, dvc = weights.eye_start(mi.Float(settings.light_ratio), joined.start.density), mi.Float(0)
     arrived = {}
@@ -222,7 +222,7 @@ def _eye_sums(joined: Joined, st: Steps, settings: TechniqueCounts) -> tuple[dic
 def _scattered(
     bounce: Bounce, arrived: tuple[Any, Any], count: float, cos_out: Any, p: Any, p_reverse: Any
 ) -> tuple[Any, Any]:
-    """(dVCM, dVC) as they leave a vertex."""
+    """(dVCM, dVC) on leaving a vertex."""
     vcm, vc = weights.scatter(*arrived, count, cos_out, p, p_reverse)
     delta_vcm, delta_vc = weights.scatter_delta(arrived[1], cos_out)
     return dr.select(bounce.delta, delta_vcm, vcm), dr.select(bounce.delta, delta_vc, vc)
@@ -267,7 +267,7 @@ def _light_sums(lights: Lights, joined: Joined, st: Steps, settings: TechniqueCo
 
 
 def _direction_density(lights: Lights, joined: Joined) -> Any:
-    """Density of a light path's direction from a light at infinity; 1 of those that have only one."""
+    """The density of a light path's direction from a light at infinity; 1 for lights with a single direction."""
     reference = dr.zeros(mi.Interaction3f)
     reference.p = lights.centre
     ds = dr.zeros(mi.DirectionSample3f)
@@ -292,9 +292,9 @@ def _light_tracing_weight(
 
 
 def stored(lights: Lights, joined: Joined, lens: Pinhole) -> Paths:
-    """The complete paths for the oracle: positions, normals and densities of Mitsuba's, the rest from first principles.
+    """The complete paths for the oracle: positions, normals and densities of Mitsuba, the rest from first principles.
 
-    That is: densities of light paths' starts from areas, cones and the scene's radius, the camera's from its field of
+    The rest: densities of light paths' starts from areas, cones and the scene's radius, the camera's from its field of
     view, the choice of lights from the table and the point's cell.
     """
     st, kept = steps(joined, lens), np.array(joined.complete)
@@ -368,7 +368,7 @@ def _columns(kept: Any, values: list[Any]) -> Any:
 
 
 def _column(kept: Any, value: Any) -> Any:
-    """[N] or [N, 3] of the kept lanes, float64 unless of another kind."""
+    """The values of the kept lanes, [N] or [N, 3], float64 unless of another kind."""
     array = np.array(value)
     array = array.T if array.ndim == 2 else array
     array = np.broadcast_to(array, (len(kept), *array.shape[1:])) if len(array) == 1 else array

@@ -29,7 +29,7 @@ Mask = npt.NDArray[np.bool_]
 class Paths:
     """N paths of k edges, as they lie in the scene, and the densities of single steps.
 
-    Columns of ends that have none of it (the lens has no normal, a point light neither) are not read.
+    Columns of ends without a value (the lens and a point light have no normal) are not read.
     """
 
     position: F64  # [N, k + 1, 3]
@@ -37,7 +37,7 @@ class Paths:
     to_light: F64  # [N, k + 1]: solid-angle density of the BSDF's sampling from the eye's side towards the light
     to_eye: F64  # [N, k + 1]: the other way round
     delta: Mask  # [N, k + 1]: scattered by a mirror or a smooth interface here
-    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror, see above
+    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror
     infinite: Mask  # [N]: the light is at infinity: v₀ stands for a direction
     distant: F64  # [N, 3]: direction to it
     hittable: Mask  # [N]: a ray can find the light
@@ -65,7 +65,7 @@ def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64
 
 
 def weights(paths: Paths, counts: F64) -> F64:
-    """[N, k + 1]: weight of each technique; 0 for those that cannot make the path, NaN where none can."""
+    """[N, k + 1]: the weight of each technique; 0 if it cannot make the path, NaN if none can."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = log_densities(paths) + np.log(counts)
         weighted = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -74,7 +74,7 @@ def weights(paths: Paths, counts: F64) -> F64:
 
 
 def log_densities(paths: Paths) -> F64:
-    """[N, k + 1]: log of each technique's density; −∞ where it cannot make the path."""
+    """[N, k + 1]: log of each technique's density; −∞ if it cannot make the path."""
     k = paths.edges
     r2, at_light_end, at_eye_end = _edges(paths)
     area_from_light, area_from_eye = at_eye_end / r2, at_light_end / r2  # of an edge: density per solid angle → area

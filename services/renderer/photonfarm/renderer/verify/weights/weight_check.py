@@ -19,9 +19,9 @@ from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCo
 from photonfarm.renderer.verify.weights.oracle import Mask, Paths
 
 TOLERANCE = 1e-3
-"""Of the sum of a path's weights, and of each weight relative to the oracle's."""
+"""The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""
 REFRACTED = 2e-2
-"""The same through a ball of glass: rays start a little off its surface, so it is not quite a ball."""
+"""The tolerance through a ball of glass: rays start a little off its surface, so it is not quite a ball."""
 EDGES = 6
 _SIZE = 16
 _GRAZING = 4.0  # proportion of densities beyond which the ray's offset decides where it leaves the glass
@@ -70,24 +70,24 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "rotated-envmap": hard_scenes.rotated_envmap,
     "many-lights": hard_scenes.many_lights,
 }
-"""What the tests look at."""
+"""The scenes of the tests."""
 LONG_SCENES = {**SCENES, **{name.replace("_", "-"): build for name, build in hard_scenes.HARD_SCENES.items()}}
-"""What the long version looks at."""
+"""The scenes of the long version."""
 
 
 @dataclass(slots=True)
 class Comparison:
-    """What came of one scene."""
+    """The errors of the weights in one scene."""
 
     paths: int = 0
     with_delta: int = 0  # of them with a mirror or a smooth interface on the way
     sum_error: float = 0.0  # largest |Σ weights − 1|
     weight_error: float = 0.0  # largest |weight − oracle's| relative to the oracle's, of paths without refraction
-    refracted_error: float = 0.0  # of paths with it, but for grazing ones
+    refracted_error: float = 0.0  # of paths with refraction, except grazing ones
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What is beyond the tolerance; NaN is."""
+        """The errors beyond the tolerance; NaN is beyond it."""
         named = (
             ("the sum of a path's weights", self.sum_error, TOLERANCE),
             ("a weight", self.weight_error, TOLERANCE),
@@ -99,7 +99,7 @@ class Comparison:
 
 
 def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0) -> Comparison:
-    """All techniques of all paths of 2 … `EDGES` edges that ``lanes`` primary rays make."""
+    """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     count = connection_count(settings.connections, EDGES)
@@ -128,11 +128,11 @@ def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes:
 def _can_be_walked(paths: Paths) -> Mask:
     """[N]: whether eye paths find all vertices.
 
-    Rays start a little off surfaces: seen from the vertex itself the next one may lie behind a grazing surface.
+    Rays start a little off surfaces: seen from the vertex itself the next one may be hidden by a grazing surface.
     """
     return np.asarray((paths.delta | (paths.to_light > 0))[:, 2:-1].all(axis=1))
 
 
 def _largest(before: float, errors: npt.ArrayLike) -> float:
-    """NaN if any is."""
+    """The largest error so far; NaN if any is."""
     return float(np.max(np.append(errors, before)))

@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs nothing else: pictures and plots are in it."""
+"""The report as one HTML file, which contains its pictures and plots."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
 
 
 def _first_row(panels: list[Panel]) -> str:
-    """The first thing to be seen: large pictures side by side."""
+    """The first part of the page: large pictures side by side."""
     figures = "".join(_figure(panel.caption, (panel.picture, panel.caption), width=LARGE_WIDTH) for panel in panels)
     return f'<div class="row">{figures}</div>'
 
@@ -132,7 +132,7 @@ def _pictures(found: list[Case], contents: Contents) -> str:
 
 
 def _figure(caption: str, *pictures: tuple[Picture, str], width: int = PICTURE_WIDTH) -> str:
-    """Pictures with the words that stand for them, one below the other, so wide at least as they are stored."""
+    """Pictures with their alternative texts, one below the other, enlarged to at least `width`."""
     images = "".join(
         f'<img alt="{escape(alt)}" src="{png_uri(picture, max(1, -(-width // picture.shape[1])))}">'
         for picture, alt in pictures

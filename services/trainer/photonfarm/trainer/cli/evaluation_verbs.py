@@ -1,4 +1,4 @@
-"""The verbs that ask what was learned: evaluate, infer, report."""
+"""The verbs for trained networks: evaluate, infer, report."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 class Several(click.Option):
-    """An option that may be repeated, of which a configuration file may give one."""
+    """An option that may be repeated; a configuration file may give a single value."""
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
-        """The values; click takes the letters of a single one apart."""
+        """The values as a tuple; click would split a single text into letters."""
         return super().type_cast_value(ctx, [value] if isinstance(value, str | int) else value)
 
 
@@ -56,7 +56,7 @@ inception_option = click.option(
 
 
 def measuring(command: Callable[..., None]) -> Callable[..., None]:
-    """The options that say what is measured, against what and on which device; `_how` takes all but the runs."""
+    """The options for what is measured, against what and on which device; `_how` takes all but the runs."""
     options = (
         store_option, runs_option, references_option, denoisers_option, kept_option, samples_option, inception_option,
         device_option,
@@ -73,7 +73,7 @@ def _how(
     inception: Path | None,
     **others: Any,
 ) -> dict[str, Any]:
-    """What `compare` takes, every denoiser with every share of the pixels; UsageError for options that need others."""
+    """The arguments of `compare`: every denoiser with every share of the pixels. Raises UsageError."""
     if kept and not denoisers:
         raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
     if inception and references is None:
@@ -131,7 +131,7 @@ def report(
 
 @contextmanager
 def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """What tells how far it has come: a bar for each predictor on a terminal, a line elsewhere; both to stderr."""
+    """A progress callback: a bar for each predictor on a terminal, else a line; both on stderr."""
     from rich import markup
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

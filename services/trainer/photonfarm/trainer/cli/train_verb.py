@@ -28,16 +28,16 @@ class ChoiceOrOwn(click.Choice[str]):
 
 
 class Pairs(click.Option):
-    """KEY=VALUE, as often as wanted, of which a configuration file makes a table."""
+    """KEY=VALUE, repeatable; a table in a configuration file."""
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
-        """The pairs as written; those of a table as they would be."""
+        """The pairs as written; a table's entries in the same form."""
         pairs = [f"{key}={json.dumps(given)}" for key, given in value.items()] if isinstance(value, Mapping) else value
         return super().type_cast_value(ctx, pairs)
 
 
 def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
-    """The values of `Pairs` by their keys, each as in JSON, or text."""
+    """The values of `Pairs` by their keys, each parsed as JSON, or kept as text."""
     found: dict[str, Any] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")

@@ -1,4 +1,4 @@
-"""The networks by name, each with what it needs to see; those of a user's own are named `MODULE:NAME`."""
+"""The networks by name, each with its needs; a user's own are named `MODULE:NAME`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """An architecture: what makes its network, and what that reads."""
+    """An architecture: the constructor of its network, and the inputs it reads."""
 
     make: Callable[[NetworkSettings, SceneFrame], Any]
     needs: Needs
@@ -49,11 +49,11 @@ ARCHITECTURES: dict[str, Kind] = {
 
 
 def kind_of(architecture: str) -> Kind:
-    """The architecture of a name. Raises SpecError for one of a user's own that cannot be had.
+    """The architecture of a name. Raises SpecError for a user's own that cannot be loaded.
 
-    That is a subclass of `torch.nn.Module` which is made from `NetworkSettings` and `SceneFrame`, and whose `forward`
-    takes `Inputs` and returns the image (B, H, W, 3), linear radiance × exposure. What it reads beside camera and
-    buffers its attribute `needs` says, a `Needs`; without one it reads no more.
+    Such a network is a subclass of `torch.nn.Module` with the arguments `NetworkSettings` and `SceneFrame`, whose
+    `forward` takes `Inputs` and returns the image (B, H, W, 3), linear radiance × exposure. Its attribute `needs`, a
+    `Needs`, states the inputs it reads beside camera and buffers; without it there are none.
     """
     if architecture in ARCHITECTURES:
         return ARCHITECTURES[architecture]
@@ -66,7 +66,7 @@ def kind_of(architecture: str) -> Kind:
 def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     """A freshly initialised network; the same weights for the same seed on one version of torch.
 
-    Raises SpecError where the scene lacks what the architecture needs, and as `kind_of` does.
+    Raises SpecError if the scene lacks what the architecture needs, and as `kind_of` does.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

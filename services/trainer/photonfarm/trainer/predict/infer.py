@@ -1,7 +1,7 @@
-"""`photonfarm infer`: what a trained network shows of a sample, or of a camera path.
+"""`photonfarm infer`: a trained network's image of a sample, or of a camera path.
 
 The views of a path are in no store, and their buffers come from the renderer: from a file that `photonfarm buffers`
-wrote, or from that verb, run as a process of its own where it is installed.
+wrote, or from that verb, run as a process of its own if it is installed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NOT_JUDGED = "was trained on (it is not held out), so no error is told: the netw
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What was written, and how good it is or how fast it went."""
+    """The files that were written, and a sentence on the error or the time."""
 
     files: tuple[Path, ...]
     sentence: str
@@ -96,9 +96,9 @@ def _judged(image: F32, batch: Batch) -> str:
 
 
 def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
-    """What `photonfarm buffers` makes of the arguments, such as --orbit 24, for the scene of the run.
+    """The frames that `photonfarm buffers` makes for the arguments, such as --orbit 24, and the scene of the run.
 
-    Raises SpecError where the verb is not installed, PhotonfarmError with its exit code where it failed.
+    Raises SpecError if the verb is not installed, PhotonfarmError with its exit code if it failed.
     """
     if not is_installed(VERB):
         raise SpecError(
@@ -115,7 +115,7 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
 
 
 def _ended(code: int) -> PhotonfarmError:
-    """An error with the exit code of the verb, which has said why."""
+    """An error with the exit code of the verb, which has printed the reason."""
     error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
     error.exit_code = code
     return error
@@ -178,7 +178,7 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Unrendered:
-    """A frame as a sample whose image nobody rendered."""
+    """A frame in the form of a sample, without a rendered image."""
 
     modification: Modification
     view: View
@@ -191,7 +191,7 @@ class _Unrendered:
 
 
 def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[Batch]:
-    """The frames one by one, in memory that is used again."""
+    """The frames one by one, in memory that is reused."""
     points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
     memory = Batch.empty(1, points, spec, run.needs)
     if memory.inputs.photons is not None:
@@ -206,7 +206,7 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
 
 
 def _source(store: str | Path, run: TrainedRun) -> StoreSource:
-    """The samples of the run's scene; StoreError where there is no store."""
+    """The samples of the run's scene; StoreError if there is no store."""
     return StoreSource(Store(store).root, run.scene_id)
 
 

@@ -1,6 +1,6 @@
 """The report of one or several runs on one store: report.html, report.md and report.json.
 
-The page holds its pictures and plots; the Markdown has them beside it.
+The HTML contains its pictures and plots; the Markdown has them in files beside it.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
 
-    Runs, and denoisers of one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder is
-    not a run or what is asked for cannot be compared, StoreError without a readable checkpoint or store or if `out`
-    cannot be written, IncompleteError if nothing is held out.
+    Runs, and denoisers given one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder
+    is not a run or the runs cannot be compared, StoreError without a readable checkpoint or store or if `out` cannot be
+    written, IncompleteError if nothing is held out.
     """
     loaded = [TrainedRun.load(run) for run in runs]
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()  # what cannot be written should not be measured first
+        tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
     contents = gathered(
         store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, tell=tell, timed=timed,

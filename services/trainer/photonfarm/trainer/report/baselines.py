@@ -1,4 +1,4 @@
-"""What an error is measured by who knows nothing: the mean colour, and the network before its first step."""
+"""Baselines for errors: the mean colour, and the network before its first step."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Gauges:
 
     @classmethod
     def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Gauges:
-        """On some held-out samples of a run; raises IncompleteError without samples to take the colour of."""
+        """Measure both on some held-out samples of a run; raises IncompleteError without samples for the colour."""
         settings = run.settings.model_copy(update={"device": "cpu"})
         with Feed(source, settings, needs=run.needs) as feed:
             arrived, _ = feed.arrivals()

@@ -1,4 +1,4 @@
-"""All that a report says, gathered once for its page, its Markdown and its JSON."""
+"""The contents of a report, gathered once for its page, its Markdown and its JSON."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Entry:
     """A row of the report's tables."""
 
     name: str
-    architecture: str | None  # of a network; None for a denoiser that nobody trained
+    architecture: str | None  # of a network; None for an untrained denoiser
     row: Row
-    time: FrameTime | None  # None where the renderer is not installed
+    time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contents:
-    """A report: the data, the runs, what their networks are worth, and where the first of them fails."""
+    """A report: the data, the runs, the errors of their networks, and the worst cases of the first one."""
 
     card: DatasetCard
     stories: tuple[RunStory, ...]
@@ -49,13 +49,13 @@ class Contents:
     entries: tuple[Entry, ...]
     costs: FrameCosts | None
     untimed: str  # why there are no costs
-    machine: Machine  # that times were taken on
+    machine: Machine  # on which times were taken
     worst: tuple[WorstCase, ...]
-    published: str | None  # which of the paper's tables stands beside ours
+    published: str | None  # the name of the paper's table beside ours
 
     @property
     def measure(self) -> Entry:
-        """The entry that times are ratios of: light_transport, or else the first."""
+        """The entry that ratios of times refer to: light_transport, or else the first."""
         return next((entry for entry in self.entries if entry.architecture == "light_transport"), self.entries[0])
 
     def document(self) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def gathered(
     tell: Tell | None = None,
     timed: bool = True,
 ) -> Contents:
-    """Measure everything, without the times of frames where they are not wanted. Raises what `compare` raises."""
+    """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
@@ -140,9 +140,9 @@ def _entries(
 
 
 class _CloseLook:
-    """What is measured of single frames once the first network has made its images: their costs, and the worst cases.
+    """Measures single frames once the first network has made its images: their costs, and the worst cases.
 
-    Called as `evaluate.Choose`, right after networks have been timed, it names the worst cases' rows.
+    It is called as `evaluate.Choose`, right after networks have been timed, and returns the worst cases' rows.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class _CloseLook:
         return [case.row for case in self.worst]
 
     def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[View]:
-        """The views that have references, with the images that the first network made of them."""
+        """The views that have references, with the first network's images of them."""
         source = StoreSource(self._store, self._scene_id)
         source.refresh()
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))

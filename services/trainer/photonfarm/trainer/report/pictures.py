@@ -1,4 +1,4 @@
-"""Held-out views in a report: the target, each predictor's image, and where it is wrong [supplement Figs. 6 to 8]."""
+"""Held-out views in a report: the target, each predictor's image, and its errors [supplement Figs. 6 to 8]."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Panel:
 
 
 def rows(contents: Contents) -> list[list[Panel]]:
-    """What went in, what came out, what is right, and the difference: of the first entry, by view, best first."""
+    """Rows of pictures: the first entry's input, output, target and difference, one row for each view, best first."""
     entry = contents.entries[0]
     there = [target for target in contents.evaluation.shown if target.row in entry.row.shown]
     made = [(_shown(entry.name, entry.row.shown[target.row], target.image), target) for target in there]
@@ -55,20 +55,20 @@ def rows(contents: Contents) -> list[list[Panel]]:
 
 
 def first_row(contents: Contents) -> list[Panel]:
-    """The panels of the view whose error is the median of those that are shown; none where none was measured."""
+    """The panels of the view whose error is the median of the shown ones; none if none was measured."""
     found = rows(contents)
     return found[(len(found) - 1) // 2] if found else []
 
 
 def overview(contents: Contents) -> Picture:
-    """All rows as one picture without words, each pixel drawn as several."""
+    """All rows as one picture without text, each pixel enlarged."""
     lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in rows(contents)]
     sheet: Picture = np.concatenate(lines)
     return sheet[:-GAP, :-GAP]
 
 
 def _framed(picture: Picture) -> Picture:
-    """The picture at a size to be looked at, with a white margin to the right and below."""
+    """The picture enlarged, with a white margin to the right and below."""
     scale = max(1, -(-OVERVIEW_WIDTH // picture.shape[1]))
     large = picture.repeat(scale, axis=0).repeat(scale, axis=1)
     framed: Picture = np.pad(large, ((0, GAP), (0, GAP), (0, 0)), constant_values=255)
@@ -87,12 +87,12 @@ def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
 
 
 def cases(contents: Contents) -> list[Case]:
-    """Some views as they come, then the worst."""
+    """The first views, then the worst ones."""
     return [_case(contents, target) for target in contents.evaluation.shown]
 
 
 def legend_of_cases(contents: Contents) -> str:
-    """What the pictures show, in sentences."""
+    """The legend of the pictures, in sentences."""
     others = "" if not contents.worst else f", then the worst cases of {contents.entries[0].name}, found automatically"
     return (
         "Shown as clip(exposure · I, 0, 1)^(1/2.2); below each image its difference to the target, from black (0) over "

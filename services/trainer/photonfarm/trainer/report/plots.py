@@ -1,4 +1,4 @@
-"""The plots of a report, as SVG: error over what was spent on it, and over the time of a frame [supplement Fig. 5]."""
+"""The plots of a report, as SVG: error over its cost, and over the time of a frame [supplement Fig. 5]."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ COLOURS = (
     "#1f5fa8", "#c2571a", "#3b8f4d", "#8a4fa3", "#8c6d31", "#777777", "#d62728", "#17a2b8", "#e377c2", "#a6a61a",
     "#111111", "#8fbcff",
 )  # fmt: skip
-"""Of the predictors, by their places in the tables: each has its own in all plots; beyond twelve they come again."""
+"""The colours of the predictors, by their places in the tables, in all plots; they repeat beyond twelve."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot, and what it shows in words."""
+    """A plot, and its content in words."""
 
     name: str  # of its file
     about: str
@@ -50,7 +50,7 @@ class Plot:
 
 
 CURVES, TIMES = "curve-", "time-"
-"""How the names of both kinds of plots begin."""
+"""The beginnings of the names of both kinds of plots."""
 
 OF_CURVES = (
     "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
@@ -59,14 +59,14 @@ OF_CURVES = (
 
 
 def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
-    """Title, a sentence on how they are read, and plots of each kind that there are any of."""
+    """The title, an explanation, and the plots of each kind, without empty kinds."""
     kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
     found = [(title, said, [plot for plot in drawn if plot.name.startswith(kind)]) for title, said, kind in kinds]
     return [each for each in found if each[2]]
 
 
 def plots(contents: Contents) -> list[Plot]:
-    """Learning curves, then each metric over the time of a frame where that is known."""
+    """Learning curves, then each metric over the time of a frame if that is known."""
     return [*_curves(contents), *_over_time(contents)]
 
 
@@ -101,7 +101,7 @@ def _curves(contents: Contents) -> Iterator[Plot]:
     )  # fmt: skip
     for name, label, x in axes:
         if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
-            continue  # all was rendered before much was learned
+            continue  # everything was rendered before the first validation
         about = f"Held-out error over {label}"
         yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
@@ -144,7 +144,7 @@ class Measure:
 
 
 def measures() -> list[Measure]:
-    """The metrics of Fig. 5, and those that we put beside them."""
+    """The metrics of Fig. 5, and further ones of ours."""
 
     def feature(block: int) -> Measure:
         def value(entry: Entry) -> Estimate | None:
@@ -194,7 +194,7 @@ def _over_time(contents: Contents) -> Iterator[Plot]:
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
-"""Kinds of predictors, each with how matplotlib marks them and joins them by a line: as `OF_TIME` says."""
+"""The kinds of predictors, each with its marker and the line that joins them; `OF_TIME` explains them."""
 
 OF_TIME = (
     "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
@@ -241,7 +241,7 @@ def _scatter(axes: Axes, measure: Measure, points: Sequence[Placed]) -> None:
 
 
 def _plain_ticks(axes: Axes) -> None:
-    """Round numbers on logarithmic axes of so little that few powers of ten lie in them, written in full."""
+    """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
     from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
@@ -254,6 +254,6 @@ def _plain_ticks(axes: Axes) -> None:
 
 
 def _round_numbers(low: float, high: float) -> list[float]:
-    """1, 2, 3, 5 and 7, and ten times and a tenth of these and so on, as far as they lie between."""
+    """The numbers 1, 2, 3, 5 and 7, times powers of ten, that lie between two values."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     return [number for decade in decades for one in (1, 2, 3, 5, 7) if low <= (number := one * 10.0**decade) <= high]

@@ -69,7 +69,7 @@ def _cost(contents: Contents) -> str:
 
 
 def _gpu(contents: Contents) -> str:
-    """What a GPU took part in."""
+    """The tasks that ran on a GPU."""
     trained = [story.name for story in contents.stories if story.on_gpu]
     found = [f"trained {', '.join(trained)}"] if trained else []
     if contents.evaluation.device != "cpu":
@@ -104,7 +104,7 @@ def _versions(versions: dict[str, list[str]]) -> str:
 
 
 def _paper(contents: Contents) -> Table:
-    """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; published figures beside ours, where there are."""
+    """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; with the published figures, if there are any."""
     beside = contents.published is not None
     columns = ["time per frame, ms", f"× {contents.measure.name}"]
     if _has_references(contents):
@@ -199,7 +199,7 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 
 
 def _further(contents: Contents) -> Table:
-    """What the paper does not have, and its Fig. 5 in numbers."""
+    """Metrics that the paper does not have, and its Fig. 5 in numbers."""
     shown = [m for m in measures() if m.name.startswith(("feature", "flip"))] if _has_references(contents) else []
     first = contents.evaluation.rows[0]
     rows = []

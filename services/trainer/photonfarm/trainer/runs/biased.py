@@ -1,7 +1,7 @@
-"""What training refuses, because noisy targets would move its least away from the clean image; light to import.
+"""The settings that training refuses, because they bias under noisy targets; light to import.
 
-A network that is trained on noisy targets finds the clean image only if the gradient is, but for factors that do not
-see the noise, linear in the target: then its mean is the gradient with the mean target [supplement 3.2, Lemma 1].
+A network that is trained on noisy targets finds the clean image only if the gradient is, up to factors that do not
+depend on the noise, linear in the target: then its mean is the gradient with the mean target [supplement 3.2, Lemma 1].
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 PAGE = "docs/results/firefly.md"
-"""Where the figures below are made: a pixel of mean 0.90 with rare bright samples."""
+"""The source of the figures below: a pixel of mean 0.90 with rare bright samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bias:
-    """Why something is refused."""
+    """The reason why a setting is refused."""
 
     why: str
     ends_at: tuple[float, float, float] | None = None  # of PAGE's pixel, at 4, 16 and 256 samples a target
 
     def rule(self, instead: str) -> str:
-        """The second half of a message: what was measured, and what is allowed."""
+        """The second half of a message: the measurement, and what is allowed instead."""
         measured = ""
         if self.ends_at is not None:
             values = ", ".join(f"{value:.2f}" for value in self.ends_at)
@@ -56,7 +56,7 @@ LOSSES: Mapping[str, Bias] = {
     **dict.fromkeys(("relative_undetached", "relative_prediction"), UNDETACHED),
     **dict.fromkeys(("ssim", "ms_ssim", "dssim", "lpips", "perceptual", "vgg", "flip"), STRUCTURE),
 }
-"""Values of `loss` that users of other trainers know."""
+"""The values of `loss` that users of other trainers know."""
 
 KEYS: Mapping[str, Bias] = {
     **dict.fromkeys(("gradient_clip", "gradient_clipping", "gradient_clip_val", "grad_clip"), CLIPPED_GRADIENT),
@@ -64,11 +64,11 @@ KEYS: Mapping[str, Bias] = {
     **dict.fromkeys(("clamp", "clamp_targets", "clip_targets", "firefly_clamp", "max_radiance"), CLAMPED),
     **dict.fromkeys(("tone_map", "tone_mapping", "tonemap", "gamma"), DISPLAY),
 }
-"""Keys that other trainers have."""
+"""The keys of other trainers."""
 
 
 def refuse(settings: Any) -> Any:
-    """The settings as they are; ValidationError, which names key, value and reason, if something in them biases."""
+    """Return the settings unchanged; ValidationError, which names key, value and reason, if one of them biases."""
     if not isinstance(settings, Mapping):
         return settings
     found = {key: KEYS[key].rule("leave the key out") for key in settings if key in KEYS}

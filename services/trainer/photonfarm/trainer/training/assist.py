@@ -1,4 +1,4 @@
-"""What the other processes of a group do while rank 0 trains: their part of each batch, and what it tells them."""
+"""The other processes of a group while rank 0 trains: they compute their part of each batch, at its commands."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from photonfarm.trainer.training.recovery import GoodState
 
 
 def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
-    """Train with rank 0 until that ends; `source` makes the samples of a scene by its id.
+    """Train with rank 0 until that ends; `source` makes the samples of a scene, given its id.
 
-    The folder `run`, which rank 0 writes, is read where the run goes on. Raises what `train` does.
+    A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
     """
     torch.set_num_threads(settings.threads)
     what, told = ranks.hear()
@@ -35,7 +35,7 @@ def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: 
 
 
 def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
-    """Do what rank 0 tells, until it tells the end."""
+    """Follow the commands of rank 0, until it sends the end."""
     while (heard := ranks.hear())[0] != "end":
         what, told = heard
         if what == "rows":

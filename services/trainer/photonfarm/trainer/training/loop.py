@@ -48,7 +48,7 @@ class Outcome:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """What SIGTERM and SIGINT set, for `train`; for the main thread of a process."""
+    """A `Stop` for `train` that SIGTERM and SIGINT set; for the main thread of a process."""
     stop = Stop()
     names = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(name, lambda *_: stop.set()) for name in names]
@@ -61,7 +61,7 @@ def stop_on_signals() -> Iterator[Stop]:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What a session of training has around it; `train` says what each is for."""
+    """The environment of a session of training; `train` describes its parts."""
 
     run: Path
     watch: Stopwatch
@@ -87,17 +87,18 @@ def train(
     group: Group = ALONE,
     show: Show | None = None,
 ) -> Outcome:
-    """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
+    """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
-    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
-    metrics.jsonl as it is written; `count`, after each step and where a run begins, how many draws there were by then
-    and how many samples have arrived. `waited` seconds have gone by already. Of a `group` this is rank 0. At each
-    validation `show` gets the step, targets and predictions of the first held-out samples. Raises SpecError for a run
-    of another network, scene or store, a device that is not there or a hold-out that leaves nothing, StoreError for a
-    folder that cannot be written or that another trainer has, DivergedError where a loss is not finite, or the held-out
-    error is that or much worse than it was, and there is nothing to go back to, or it has been gone back to too often;
-    the last checkpoint stays.
+    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` is called with each record
+    of metrics.jsonl as it is written; `count`, after each step and at the beginning, with the number of draws and of
+    arrived samples. `waited` seconds have passed already. In a `group` this is rank 0. At each validation `show` is
+    called with the step, targets and predictions of the first held-out samples.
+
+    Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
+    nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
+    the held-out error is not finite, or the latter much worse than before, and there is no good state, or the run has
+    gone back too often; the last checkpoint stays.
     """
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
@@ -127,7 +128,7 @@ class Session:
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
-        self._seconds_told: dict[str, float] = {}  # by the last validation
+        self._seconds_told: dict[str, float] = {}  # at the last validation
 
     def run(self) -> Outcome:
         """Train until something ends it."""
@@ -168,14 +169,14 @@ class Session:
         return {}
 
     def _continue(self, path: Path) -> checkpoint.Changes:
-        """Go on from a checkpoint; returns which settings are others than they were."""
+        """Resume from a checkpoint; returns the changed settings."""
         state = checkpoint.load(path)
         changed = checkpoint.check_continues(path, state, self._identity())
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
-        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have none
+        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have no recovery
         settle(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
-        if recovery["best"] and self._good.step is not None:  # with nothing to go back to, a best is of no use
+        if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
             self._best = Best.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
@@ -251,7 +252,7 @@ class Session:
             raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
 
     def _validate(self) -> None:
-        """Log the held-out error of the network that predicts, and compare it with the best before."""
+        """Log the held-out error of the predicting network, and compare it with the best before."""
         self._compared = None
         rows = self._following.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
@@ -260,7 +261,7 @@ class Session:
             try:
                 predict, loss = network_predictor(self._learner.predicting), self._settings.loss
                 now = validate(predict, self._step, found, self._around.show, loss=loss)
-            except IncompleteError:  # a repair has taken all of them back, for now
+            except IncompleteError:  # a repair has removed all of them, for now
                 return
             finally:
                 self._following.ask_again()
@@ -292,7 +293,7 @@ class Session:
             self._best = Best(now.step, now.errors, now.by_shown)
 
     def _keep_or_go_back(self) -> None:
-        """Do what the last validation asks for, in all processes."""
+        """Keep the state after the last validation, or go back, in all processes."""
         found = self._compared
         if found is not None and found.is_clearly_worse:
             told = f"step {self._step}: {found.stated}"
@@ -304,7 +305,7 @@ class Session:
             self._good.keep(self._step)
 
     def _end_no_worse(self) -> None:
-        """Validate the last step, and end with the last good state if that is worse than one may be."""
+        """Validate the last step, and end with the last good state if the last one is worse than allowed."""
         if self._step != self._validated:
             self._validate()
         found = self._compared
@@ -316,7 +317,7 @@ class Session:
             self._validate()
 
     def _log_recovered(self, cause: str, found: Comparison | None = None) -> None:
-        self._compared = None  # the learner is another one now
+        self._compared = None  # the learner has changed
         self._log.write(
             "recovered",
             step=self._step,
@@ -328,7 +329,7 @@ class Session:
         )
 
     def _used(self) -> tuple[int, int]:
-        """Draws so far, and samples that have arrived."""
+        """The number of draws so far, and of arrived samples."""
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
     def _tell_count(self) -> None:

@@ -19,7 +19,7 @@ from photonfarm.shared.store.format.schema import bit_counts
 from photonfarm.shared.store.write.findings import Cause
 
 _FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)}
-"""For floats of 2 and 4 bytes: the integer type of their bits, the mask of the magnitude, the magnitude of infinity."""
+"""The integer type, the mask of the magnitude and the magnitude of infinity, by the bytes of a float."""
 
 
 @dataclass(slots=True)

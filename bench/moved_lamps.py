@@ -40,7 +40,7 @@ from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, f
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import Samples
-from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, units_of
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
 from photonfarm.trainer.data.store_source import StoredSample, StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
@@ -138,12 +138,12 @@ class Views:
     def predicted(self, predict: Predictor, candidate: Candidate) -> F64:
         """What a predictor says that the lamps change, (N, H, W, 3) in the metric space."""
         total = len(self.base[1].position)
-        memory = Batch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
+        memory = TrainingBatch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
         made = [[predict(self._filled(memory, look))[0].copy() for look in pair] for pair in self.pairs]
         shown = _shown(np.array(made, np.float32))
         return shown[:, 1] - shown[:, 0]
 
-    def _filled(self, memory: Batch, look: Look) -> Batch:
+    def _filled(self, memory: TrainingBatch, look: Look) -> TrainingBatch:
         """A look as a batch of one, in memory that is used again."""
         fill(memory, 0, look.sample, self.spec, self.base[1])
         if memory.inputs.photons is not None:
@@ -188,7 +188,7 @@ class Room:
     rows: tuple[Row, ...]
 
 
-def known_light(batch: Batch) -> F32:
+def known_light(batch: TrainingBatch) -> F32:
     """Emission, direct light and gloss of a batch's guides: an image of which nothing is learned."""
     guides = given(batch.inputs.guides)
     light: F32 = (guides.emission + guides.direct + guides.gloss).numpy()

@@ -22,7 +22,7 @@ from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
-from photonfarm.trainer.data.dataset import Batch, kept_count
+from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import (
@@ -230,7 +230,7 @@ class _Watched:
     units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
     samples: int = 0
 
-    def __call__(self, batch: Batch) -> F32:
+    def __call__(self, batch: TrainingBatch) -> F32:
         images = self.predict(batch)
         for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
             if row in self.wanted:

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import torch
 
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.runs.distributed import ALONE, Group
@@ -117,7 +117,7 @@ class Following:
         self._group.tell("rows", rows)
         self._feed.ask(self._group.part(rows))
 
-    def take(self) -> Batch | None:
+    def take(self) -> TrainingBatch | None:
         """The next drawn batch, this process' part of it read; draws of rows that are incomplete now do not count.
 
         None if no row is left in it: another batch is drawn instead, at the end.

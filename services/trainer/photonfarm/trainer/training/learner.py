@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
@@ -58,7 +58,7 @@ class Learner:
         """The learning rate of step `number`."""
         return self.rate_factor * rate_at(number, self._settings)
 
-    def step(self, number: int, batch: Batch) -> float:
+    def step(self, number: int, batch: TrainingBatch) -> float:
         """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss.
 
         The loss is the same in all processes. If it is not finite, nothing has changed.

@@ -19,7 +19,7 @@ from photonfarm.shared.scene.spec import SceneSpec, shape_ids
 if TYPE_CHECKING:
     from photonfarm.shared.farm.dry_run import DryRun
     from photonfarm.shared.farm.submission import Submission
-    from photonfarm.shared.queue import Cause, Failure, QueueStatus
+    from photonfarm.shared.queue import Failure, FailureCause, QueueStatus
     from photonfarm.shared.store import Store
 
 
@@ -321,7 +321,7 @@ def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Fai
     return missing
 
 
-def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Path) -> dict[str, Any]:
+def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: str | Path) -> dict[str, Any]:
     from photonfarm.shared.queue import repeating_command
 
     return {

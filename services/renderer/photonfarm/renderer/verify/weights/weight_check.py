@@ -76,7 +76,7 @@ LONG_SCENES = {**SCENES, **{name.replace("_", "-"): build for name, build in har
 
 
 @dataclass(slots=True)
-class Comparison:
+class WeightComparison:
     """The errors of the weights in one scene."""
 
     paths: int = 0
@@ -98,12 +98,14 @@ class Comparison:
         )
 
 
-def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0) -> Comparison:
+def compare_weights(
+    build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0
+) -> WeightComparison:
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     count = connection_count(settings.connections, EDGES)
-    result = Comparison()
+    result = WeightComparison()
     for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
         complete = np.array(joined.complete)
         if not complete.any():

@@ -38,7 +38,7 @@ _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InvarianceResult:
     """The result of a check."""
 
     faults: tuple[str, ...]  # why it failed; empty: it passed
@@ -65,11 +65,11 @@ class Check:
         """The command that runs it again."""
         return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
 
-    def run(self) -> Finding:
+    def run(self) -> InvarianceResult:
         """Render what the check needs, and judge it."""
         start = time.process_time()
         faults, figures = self.find()
-        return Finding(tuple(faults), figures, time.process_time() - start)
+        return InvarianceResult(tuple(faults), figures, time.process_time() - start)
 
 
 def checks(*, long: bool) -> Iterator[Check]:
@@ -115,7 +115,7 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
 
 
-def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
+def markdown(found: Sequence[tuple[Check, InvarianceResult]]) -> str:
     """A table of checks and their results, and the commands that repeat the failed ones."""
     lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [

@@ -52,7 +52,7 @@ class InvarianceResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class Invariance:
     """A property that must hold."""
 
     name: str
@@ -72,37 +72,37 @@ class Check:
         return InvarianceResult(tuple(faults), figures, time.process_time() - start)
 
 
-def checks(*, long: bool) -> Iterator[Check]:
+def checks(*, long: bool) -> Iterator[Invariance]:
     """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
     for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
-        yield Check(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
+        yield Invariance(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
                     partial(equal_means, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("hundred_lights",)).items():
-        yield Check(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
+        yield Invariance(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
                     partial(additive, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("plastics", "rotated_envmap", "mirror_room")).items():
-        yield Check(f"linear-{name}", "radiances times a factor give the image times it",
+        yield Invariance(f"linear-{name}", "radiances times a factor give the image times it",
                     partial(linear, build, effort), long)  # fmt: skip
     for factor in _NEAR_SCALED:
-        yield Check(
+        yield Invariance(
             f"scale-{factor:g}", "lengths times a factor give the same image", partial(scale, factor, effort), long
         )
     for name, build in _scenes(long, ("many_lights",), ("cove",)).items():
-        yield Check(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
+        yield Invariance(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
                     partial(update_equals_reload, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "plastics", "glass_caustic", "cove")).items():
-        yield Check(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
+        yield Invariance(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
                     partial(reproducible, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "glass_caustic", "cove")).items():
-        yield Check(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
+        yield Invariance(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
                     partial(recorded, build, effort), long)  # fmt: skip
     for name, build in (weight_check.LONG_SCENES if long else weight_check.SCENES).items():
-        yield Check(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
+        yield Invariance(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
                     partial(oracles_weights, build, _LANES[long]), long)  # fmt: skip
 
 
-def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
+def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
     """The checks of these names, or whose names begin with them; all for an empty choice.
 
     Raises ValueError for a name that matches none.
@@ -115,7 +115,7 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
 
 
-def markdown(found: Sequence[tuple[Check, InvarianceResult]]) -> str:
+def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     """A table of checks and their results, and the commands that repeat the failed ones."""
     lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [

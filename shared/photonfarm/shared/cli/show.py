@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from photonfarm.shared.store import Store
 
 
-class Finding(Protocol):
+class CheckResult(Protocol):
     """The result of one check of `photonfarm doctor`."""
 
     @property
@@ -348,7 +348,7 @@ def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: s
 # --------------------------------------------------------------------------------------------------------------- doctor
 
 
-def findings(found: Iterable[Finding], as_json: bool) -> int:
+def findings(found: Iterable[CheckResult], as_json: bool) -> int:
     """Print the results of checks as they come; returns the exit code of the first required check that failed, or 0."""
     console, code, seen = Console(soft_wrap=True), 0, []
     for finding in found:

@@ -22,7 +22,7 @@ from photonfarm.trainer.data.growth import Following, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -66,7 +66,7 @@ class Surroundings:
     run: Path
     watch: Stopwatch
     stop: Stop
-    group: Group
+    group: TrainingGroup
     script: Growth | None
     listen: Callable[[dict[str, Any]], object] | None
     count: Callable[[int, int], None] | None
@@ -84,7 +84,7 @@ def train(
     listen: Callable[[dict[str, Any]], object] | None = None,
     count: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
-    group: Group = ALONE,
+    group: TrainingGroup = ALONE,
     show: Show | None = None,
 ) -> Outcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.

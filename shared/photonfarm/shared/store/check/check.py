@@ -25,7 +25,7 @@ from photonfarm.shared.store.check.unplanned_files import strangers
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.findings import Cause, Finding, Findings, Group, JobPart, Remedy
+from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, JobPart, Remedy
 from photonfarm.shared.store.write.guides import GUIDES
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
@@ -51,7 +51,7 @@ class SceneReport:
     size_bytes: int
     back_facing_share: float | None  # of the pixels that meet something; None if none does
     halves: HalvesResult | None
-    groups: tuple[Group, ...]
+    groups: tuple[FindingGroup, ...]
     set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from photonfarm.renderer.verify import runner
 from photonfarm.renderer.verify.rows import SCENES
-from photonfarm.renderer.verify.runner import Outcome, compare, run, seen_bias
+from photonfarm.renderer.verify.runner import SceneOutcome, compare, run, seen_bias
 from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, Settings
 from photonfarm.renderer.verify.scenes.truths import rendered
 
@@ -19,7 +19,7 @@ def scene(label: str) -> Any:
     return next(scene for scene in SCENES if scene.label == label)
 
 
-def only(wrong: Any, **options: Any) -> Outcome:
+def only(wrong: Any, **options: Any) -> SceneOutcome:
     (outcome,) = run(wrong, quick=True, settings=[FIRST], **options)
     return outcome
 

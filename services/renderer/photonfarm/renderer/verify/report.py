@@ -12,7 +12,7 @@ from typing import TypeVar
 from photonfarm.renderer.verify.markdown import markdown as markdown
 from photonfarm.renderer.verify.pictures import keep, sheet, triple
 from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Outcome, Result, run
+from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Result, SceneOutcome, run
 from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
 from photonfarm.shared.core.pictures import Picture
 
@@ -64,7 +64,7 @@ def examine(
     return report
 
 
-def _add(report: Report, outcome: Outcome, failures: Path, tell: Callable[[str], None]) -> None:
+def _add(report: Report, outcome: SceneOutcome, failures: Path, tell: Callable[[str], None]) -> None:
     result = outcome.result
     if outcome.renders is not None and result.label not in dict(report.pictures):
         report.pictures.append((result.label, triple(outcome.renders)))

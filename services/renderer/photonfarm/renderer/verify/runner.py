@@ -80,7 +80,7 @@ class Renders:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SceneOutcome:
     """A result and its renders; a refusal has none."""
 
     result: Result
@@ -89,7 +89,7 @@ class Outcome:
 
 def run(
     item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[Settings] = ()
-) -> Iterator[Outcome]:
+) -> Iterator[SceneOutcome]:
     """One outcome for each pair of settings: those given among the scene's, else the quick ones if quick, else all.
 
     Yields nothing for a scene without a quick version, or that is not tried with any of these settings.
@@ -130,7 +130,7 @@ def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tu
 
 def _judged(
     item: HardScene, effort: Effort, settings: Settings, bdpt: Images, truth: Images, start: float, command: str
-) -> Outcome:
+) -> SceneOutcome:
     with np.errstate(all="ignore"):  # values that are not finite, and black images, are judged below
         blocks, whole = compare(bdpt, truth, effort.blocks), compare(bdpt, truth, 1)
         brightest, truth_brightest = _max_over_mean(bdpt), _max_over_mean(truth)
@@ -143,7 +143,7 @@ def _judged(
         _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
         int(np.isnan(bdpt).sum()), int(np.isinf(bdpt).sum()), time.process_time() - start, faults, command,
     )  # fmt: skip
-    return Outcome(result, Renders(bdpt, truth, blocks.z))
+    return SceneOutcome(result, Renders(bdpt, truth, blocks.z))
 
 
 def _faults(
@@ -226,7 +226,7 @@ def _refusal(scene: object, settings: Settings) -> str:
     return ""
 
 
-def _refused(refusal: Refusal, quick: bool) -> Outcome:
+def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     start = time.process_time()
     said = message_of(refusal)
     faults = [] if refusal.sentence in said else [f"not refused with {refusal.sentence!r}, but with {said!r}"]
@@ -237,4 +237,4 @@ def _refused(refusal: Refusal, quick: bool) -> Outcome:
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
         f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
-    return Outcome(result)
+    return SceneOutcome(result)

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from photonfarm.renderer.cli import report_stability
 from photonfarm.renderer.verify import report, rows
 from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
-from photonfarm.renderer.verify.runner import Result, plus_minus, run
+from photonfarm.renderer.verify.runner import SceneResult, plus_minus, run
 from photonfarm.renderer.verify.scenes.case import Settings
 from photonfarm.renderer.verify.scenes.truths import known
 
@@ -53,7 +53,7 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     assert "## Failures" in (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
 
 
-def rounding(mean_ratio: float, **changes: Any) -> Result:
+def rounding(mean_ratio: float, **changes: Any) -> SceneResult:
     """A result that differs by 60 standard errors of its noise, but by less than rounding may."""
     (refused,) = run(rows.REFUSALS[0], quick=True)
     return replace(

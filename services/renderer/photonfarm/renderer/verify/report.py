@@ -12,7 +12,7 @@ from typing import TypeVar
 from photonfarm.renderer.verify.markdown import markdown as markdown
 from photonfarm.renderer.verify.pictures import keep, sheet, triple
 from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Result, SceneOutcome, run
+from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
 from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
 from photonfarm.shared.core.pictures import Picture
 
@@ -27,7 +27,7 @@ Key = TypeVar("Key", int, str)
 class Report:
     """The results of a run."""
 
-    results: list[Result] = field(default_factory=list)
+    results: list[SceneResult] = field(default_factory=list)
     pictures: list[tuple[str, Picture]] = field(default_factory=list)  # label, triple of the first settings
 
     @property
@@ -44,7 +44,7 @@ class Report:
         return _all_passed((result.label, result) for result in self.results if result.row is not None)
 
 
-def _all_passed(results: Iterable[tuple[Key, Result]]) -> dict[Key, bool]:
+def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
     verdicts: dict[Key, bool] = {}
     for key, result in results:
         verdicts[key] = verdicts.get(key, True) and not result.faults

@@ -30,7 +30,7 @@ In the shining sphere `path` itself is 0.04 % too bright at depth 2, 0.07 % at d
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class SceneResult:
     """A scene's result with one pair of settings: a line of the table."""
 
     row: int | None
@@ -83,7 +83,7 @@ class Renders:
 class SceneOutcome:
     """A result and its renders; a refusal has none."""
 
-    result: Result
+    result: SceneResult
     renders: Renders | None = None
 
 
@@ -136,7 +136,7 @@ def _judged(
         brightest, truth_brightest = _max_over_mean(bdpt), _max_over_mean(truth)
     z_max = float(np.fmax(blocks.z_max, whole.z_max))
     faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
-    result = Result(
+    result = SceneResult(
         item.row, item.name, item.hard, item.truth.said, str(settings), effort.size, effort.seeds, effort.spp,
         effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
         _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
@@ -232,7 +232,7 @@ def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     faults = [] if refusal.sentence in said else [f"not refused with {refusal.sentence!r}, but with {said!r}"]
     if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
-    result = Result(
+    result = SceneResult(
         refusal.row, refusal.name, said, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
         f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,

@@ -65,18 +65,18 @@ def rounding(mean_ratio: float, **changes: Any) -> SceneResult:
 
 
 def test_what_passes_as_rounding_is_marked_and_stands_beside_path() -> None:
-    text = report.markdown(report.Report([rounding(1.00024)]), "made so")
+    text = report.markdown(report.StabilityReport([rounding(1.00024)]), "made so")
     assert "| 1.0002400 ± 4.0e-06 ° (≤ 0.003) | 1.0006600 ± 5.0e-06 | 0.046 %, 450 % |" in text
     assert "- 01-sphere: `bdpt` +0.024 %, `path` +0.066 %" in text
 
 
 def test_what_is_right_or_fails_is_not_called_rounding() -> None:
     for result in (rounding(1.00001), rounding(1.01, faults=("wrong",))):
-        assert "° (≤" not in report.markdown(report.Report([result]), "made so")
+        assert "° (≤" not in report.markdown(report.StabilityReport([result]), "made so")
 
 
 def test_every_column_of_the_table_is_explained_in_a_line_of_its_own() -> None:
-    text = report.markdown(report.Report([rounding(1.0)]), "made so")
+    text = report.markdown(report.StabilityReport([rounding(1.0)]), "made so")
     header = next(line for line in text.splitlines() if line.startswith("| row |"))
     explained = [line for line in text.splitlines() if line.startswith("- **")]
     for column in header.strip("| ").split(" | "):
@@ -86,9 +86,9 @@ def test_every_column_of_the_table_is_explained_in_a_line_of_its_own() -> None:
 
 def test_what_is_hard_is_said_once_for_each_row() -> None:
     results = [rounding(1.0), rounding(1.0, settings="0,0"), replace(rounding(1.0), name="deep")]
-    assert "## What is hard\n\n- 1: all of it\n" in report.markdown(report.Report(results), "made so")
+    assert "## What is hard\n\n- 1: all of it\n" in report.markdown(report.StabilityReport(results), "made so")
     results.append(replace(rounding(1.0), name="dim", hard="light is rare"))
-    text = report.markdown(report.Report(results), "made so")
+    text = report.markdown(report.StabilityReport(results), "made so")
     assert "- 1: *sphere, deep*: all of it; *dim*: light is rare\n" in text
 
 
@@ -109,7 +109,7 @@ def test_rows_and_scenes_are_counted_apart_and_refusals_without_a_row_by_themsel
         replace(one, row=2),
         replace(one, row=None, name="fog"),
     ]
-    text = report.markdown(report.Report(results), "made so")
+    text = report.markdown(report.StabilityReport(results), "made so")
     assert "**1 of 2 rows pass**, 2 of 3 scenes and 1 of 1 further refusals." in text
 
 

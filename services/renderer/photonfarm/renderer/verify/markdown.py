@@ -11,7 +11,7 @@ from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneResul
 from photonfarm.shared.core.statistics import two_sided_limit
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.verify.report import Report
+    from photonfarm.renderer.verify.report import StabilityReport
 
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "
@@ -31,7 +31,7 @@ _COLUMNS = ("row", "scene", "truth", "settings", "z max (limit)", "mean ratio (b
 _HEAD = f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 
-def markdown(report: Report, command: str) -> str:
+def markdown(report: StabilityReport, command: str) -> str:
     """The report as Markdown."""
     scenes: dict[str, list[SceneResult]] = {}
     for result in report.results:
@@ -78,7 +78,7 @@ _PICTURES = (
 )
 
 
-def _verdict(report: Report) -> str:
+def _verdict(report: StabilityReport) -> str:
     """The numbers of rows and scenes that pass; refusals without a row are counted separately."""
     rows, scenes = report.rows(), report.scenes()
     others = [not result.faults for result in report.results if result.row is None]

@@ -24,7 +24,7 @@ Key = TypeVar("Key", int, str)
 
 
 @dataclass(slots=True)
-class Report:
+class StabilityReport:
     """The results of a run."""
 
     results: list[SceneResult] = field(default_factory=list)
@@ -54,9 +54,9 @@ def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
 def examine(
     items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[Settings] = (),
     failures: Path = FAILURES, tell: Callable[[str], None] = lambda _: None,
-) -> Report:  # fmt: skip
+) -> StabilityReport:  # fmt: skip
     """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""
-    report = Report()
+    report = StabilityReport()
     for item in items:
         for outcome in run(item, quick=quick, seed=seed, settings=settings):
             _add(report, outcome, failures, tell)
@@ -64,7 +64,7 @@ def examine(
     return report
 
 
-def _add(report: Report, outcome: SceneOutcome, failures: Path, tell: Callable[[str], None]) -> None:
+def _add(report: StabilityReport, outcome: SceneOutcome, failures: Path, tell: Callable[[str], None]) -> None:
     result = outcome.result
     if outcome.renders is not None and result.label not in dict(report.pictures):
         report.pictures.append((result.label, triple(outcome.renders)))
@@ -75,7 +75,7 @@ def _add(report: Report, outcome: SceneOutcome, failures: Path, tell: Callable[[
         tell(f"  {'; '.join(result.faults)}\n  again: {result.command}\n  renders: {folder}")
 
 
-def write(report: Report, out: Path, command: str) -> None:
+def write(report: StabilityReport, out: Path, command: str) -> None:
     """Write stability.md, stability.json and stability.png into a folder; `command` is the command that made them."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "stability.md").write_text(markdown(report, command), encoding="utf-8")
@@ -84,7 +84,7 @@ def write(report: Report, out: Path, command: str) -> None:
         sheet(report.pictures).save(out / "stability.png")
 
 
-def as_json(report: Report, command: str) -> str:
+def as_json(report: StabilityReport, command: str) -> str:
     """All results, one object for each scene and settings."""
     results = [asdict(result) | {"label": result.label, "verdict": result.verdict} for result in report.results]
     rows, scenes = report.rows(), report.scenes()

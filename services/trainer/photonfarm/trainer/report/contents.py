@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, Row, Tell
+from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -33,7 +33,7 @@ class Entry:
 
     name: str
     architecture: str | None  # of a network; None for an untrained denoiser
-    row: Row
+    row: PredictorRow
     time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
 

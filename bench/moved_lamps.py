@@ -41,7 +41,7 @@ from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import Samples
 from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
-from photonfarm.trainer.data.store_source import StoredSample, StoreSource
+from photonfarm.trainer.data.store_source import RawSample, StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
@@ -103,7 +103,7 @@ def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
 class Look:
     """A view of one configuration, and all that a network may be told of it."""
 
-    sample: StoredSample  # its halves are the reference's
+    sample: RawSample  # its halves are the reference's
     photons: Photons | None  # None: the scene has none
 
 
@@ -258,7 +258,7 @@ class Stage:
         key = view_key(modification.key(self.spec.scene_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
         known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
-        return Look(StoredSample(modification, view, halves, 1.0, *known), frames.photons)
+        return Look(RawSample(modification, view, halves, 1.0, *known), frames.photons)
 
     def views(self, source: StoreSource, rows: Sequence[int]) -> Views:
         """The views of some samples, rendered anew."""

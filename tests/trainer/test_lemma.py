@@ -28,7 +28,7 @@ from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons
-from photonfarm.trainer.data.store_source import StoredSample
+from photonfarm.trainer.data.store_source import RawSample
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
@@ -61,7 +61,7 @@ class Seen:
 
     spec: SceneSpec
     base: tuple[Geometry, BasePointCloud]
-    sample: StoredSample
+    sample: RawSample
     photons: Photons
     noisy: F32
     converged: F32
@@ -89,7 +89,7 @@ def seen() -> Seen:
     converged = targets(scene, view, R, samples=CONVERGED, seed=2_000_000)
     visible = visibility_of(scene, view, rebuild(base[1], modification), traced)
     guides = scene.guides(view, view_key(key, view.vector), spec.guides, lit_points(base[1], modification))
-    sample = StoredSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), visible, 0, guides)
+    sample = RawSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), visible, 0, guides)
     noisy, converged = (x * np.float32(spec.exposure) for x in (noisy, converged))
     return Seen(spec, base, sample, traced, noisy, converged)
 

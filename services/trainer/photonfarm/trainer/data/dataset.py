@@ -45,7 +45,7 @@ from photonfarm.trainer.networks.inputs import (
 )
 
 
-class Sample(Protocol):
+class SourceSample(Protocol):
     """One sample as it is read; its images have their stored types."""
 
     @property
@@ -103,7 +103,7 @@ class SampleSource(Protocol):
     def taken_back(self) -> NDArray[np.int64]:
         """The rows that were complete before the last `refresh` and not after it; workers render them again."""
 
-    def read_batch(self, rows: Sequence[int]) -> Sequence[Sample]:
+    def read_batch(self, rows: Sequence[int]) -> Sequence[SourceSample]:
         """The samples of complete rows, valid until the next call; StoreError if one is incomplete or unreadable."""
 
     def read_photons(self, row: int) -> Photons:
@@ -196,7 +196,7 @@ def kept_count(spec: SceneSpec, of: int) -> int:
     return pixels // of
 
 
-def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+def kept_pixels(sample: SourceSample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from the sample's content key.
 
     So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
@@ -226,7 +226,7 @@ def read_into(
     return memory.filled(tuple(rows), tuple(units))
 
 
-def fill(batch: TrainingBatch, place: int, sample: Sample, spec: SceneSpec, cloud: BasePointCloud) -> None:
+def fill(batch: TrainingBatch, place: int, sample: SourceSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
     """Write one sample into a batch's memory, except its photons and its noisy colour.
 
     That is its camera, its buffers, its exposed targets; if needed, its points; and which points and photons the view

@@ -13,7 +13,7 @@ from photonfarm.renderer.cli import report_stability
 from photonfarm.renderer.verify import report, rows
 from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
 from photonfarm.renderer.verify.runner import SceneResult, plus_minus, run
-from photonfarm.renderer.verify.scenes.case import Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings
 from photonfarm.renderer.verify.scenes.truths import known
 
 
@@ -94,7 +94,7 @@ def test_what_is_hard_is_said_once_for_each_row() -> None:
 
 def test_path_is_compared_with_an_exact_truth_and_with_no_other() -> None:
     by_label = {scene.label: scene for scene in rows.SCENES}
-    (exact,) = run(by_label["05-empty"], quick=True, settings=[Settings(1, 1.0)])
+    (exact,) = run(by_label["05-empty"], quick=True, settings=[BdptSettings(1, 1.0)])
     assert exact.result.path_ratio == pytest.approx(1.0, abs=1e-5)
     (rendered,) = run(by_label["28-orthographic"], quick=True)
     assert rendered.result.path_ratio is None
@@ -146,8 +146,8 @@ def test_colours_of_z_are_those_of_the_legend() -> None:
 
 def test_rows_are_chosen_by_number_name_label_and_settings() -> None:
     with pytest.raises(ValueError, match=r"14-point-caustic is tried with 1,1 or"):
-        rows.chosen(["14"], settings=[Settings(0, 0.0)])
-    assert "point-caustic" not in {item.name for item in rows.chosen(settings=[Settings(0, 0.0)])}
+        rows.chosen(["14"], settings=[BdptSettings(0, 0.0)])
+    assert "point-caustic" not in {item.name for item in rows.chosen(settings=[BdptSettings(0, 0.0)])}
     (by_name,) = rows.chosen(["cove"])
     (by_label,) = rows.chosen(["11-cove"])
     assert [by_name] == [by_label] == rows.chosen(["11"])

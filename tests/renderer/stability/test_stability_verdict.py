@@ -11,7 +11,7 @@ import pytest
 from photonfarm.renderer.verify import runner
 from photonfarm.renderer.verify.rows import SCENES
 from photonfarm.renderer.verify.runner import SceneOutcome, compare, run, seen_bias
-from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, Settings
+from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, BdptSettings
 from photonfarm.renderer.verify.scenes.truths import rendered
 
 
@@ -102,7 +102,7 @@ def test_a_black_image_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_settings_that_are_not_complete_are_not_tried() -> None:
-    assert list(run(scene("14-point-caustic"), quick=True, settings=[Settings(0, 0.0)])) == []
+    assert list(run(scene("14-point-caustic"), quick=True, settings=[BdptSettings(0, 0.0)])) == []
 
 
 def test_one_seed_gives_one_result() -> None:

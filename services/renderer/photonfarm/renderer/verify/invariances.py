@@ -21,7 +21,7 @@ import numpy as np
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, Effort, Images, Scene, Settings
+from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, Scene
 from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
 from photonfarm.renderer.verify.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
@@ -29,7 +29,7 @@ from photonfarm.shared.core.statistics import BlockTest, block_z_test
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
 LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=512, resolution=0.005)
 DEPTH = 5
-COUNTS = tuple(Settings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
+COUNTS = tuple(BdptSettings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
 """The scenes with rare bright samples, for which a few renders prove too little; they have rows of their own."""
@@ -300,12 +300,12 @@ def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str
 # ------------------------------------------------ Their parts ------------------------------------------------
 
 
-def _integrator(settings: Settings) -> dict[str, Any]:
+def _integrator(settings: BdptSettings) -> dict[str, Any]:
     counts = {"connections": settings.connections, "light_ratio": settings.light_ratio}
     return {"type": "bdpt", "max_depth": DEPTH, **counts}
 
 
-def _images(scene: Any, settings: Settings, effort: Effort, seed: int, spp: int | None = None) -> Images:
+def _images(scene: Any, settings: BdptSettings, effort: Effort, seed: int, spp: int | None = None) -> Images:
     return render(scene, _integrator(settings), spp or effort.spp, range(seed, seed + effort.seeds))
 
 

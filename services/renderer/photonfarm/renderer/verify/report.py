@@ -13,7 +13,7 @@ from photonfarm.renderer.verify.markdown import markdown as markdown
 from photonfarm.renderer.verify.pictures import keep, sheet, triple
 from photonfarm.renderer.verify.rows import ROWS
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
-from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
 from photonfarm.shared.core.pictures import Picture
 
 FAILURES = Path(".stability")
@@ -52,7 +52,7 @@ def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
 
 
 def examine(
-    items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[Settings] = (),
+    items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = (),
     failures: Path = FAILURES, tell: Callable[[str], None] = lambda _: None,
 ) -> StabilityReport:  # fmt: skip
     """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
 from photonfarm.renderer.verify.scenes.truths import PATH, load, render
 from photonfarm.shared.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
 
@@ -88,7 +88,7 @@ class SceneOutcome:
 
 
 def run(
-    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[Settings] = ()
+    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = ()
 ) -> Iterator[SceneOutcome]:
     """One outcome for each pair of settings: those given among the scene's, else the quick ones if quick, else all.
 
@@ -129,7 +129,7 @@ def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tu
 
 
 def _judged(
-    item: HardScene, effort: Effort, settings: Settings, bdpt: Images, truth: Images, start: float, command: str
+    item: HardScene, effort: Effort, settings: BdptSettings, bdpt: Images, truth: Images, start: float, command: str
 ) -> SceneOutcome:
     with np.errstate(all="ignore"):  # values that are not finite, and black images, are judged below
         blocks, whole = compare(bdpt, truth, effort.blocks), compare(bdpt, truth, 1)
@@ -217,7 +217,7 @@ def message_of(refusal: Refusal, size: int = 8) -> str:
     return _refusal(load(refusal.build(size)), refusal.settings)
 
 
-def _refusal(scene: object, settings: Settings) -> str:
+def _refusal(scene: object, settings: BdptSettings) -> str:
     integrator = {"type": "bdpt", "connections": settings.connections, "light_ratio": settings.light_ratio}
     try:
         mi.load_dict(integrator).render(scene, seed=0, spp=1)

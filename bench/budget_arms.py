@@ -16,7 +16,7 @@ import numpy as np
 from photonfarm.shared.core.records import ViewBuffers, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.trainer.data.store_source import StoredSample
+from photonfarm.trainer.data.store_source import RawSample
 from room_study import HELD_OUT, ChosenSamples
 
 HALF_SPP = 1  # of what is rendered
@@ -78,11 +78,11 @@ class Arm(ChosenSamples):
         }
         self.rows = list(self._passes)
 
-    def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
+    def read_batch(self, rows: Sequence[int]) -> list[RawSample]:
         """The chosen samples of these rows, and the one that is held out as it is."""
         return [self._mean(row) for row in rows]
 
-    def _mean(self, row: int) -> StoredSample:
+    def _mean(self, row: int) -> RawSample:
         read = super().read_batch(self._passes.get(row, [row]))
         halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
         buffers: dict[str, Any] = {name: values.copy() for name, values in arrays_of(read[0].buffers).items()}

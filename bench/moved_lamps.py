@@ -40,8 +40,8 @@ from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, f
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import Samples
-from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, units_of
-from photonfarm.trainer.data.store_source import StoredSample, StoreSource
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
+from photonfarm.trainer.data.store_source import RawSample, StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
@@ -103,7 +103,7 @@ def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
 class Look:
     """A view of one configuration, and all that a network may be told of it."""
 
-    sample: StoredSample  # its halves are the reference's
+    sample: RawSample  # its halves are the reference's
     photons: Photons | None  # None: the scene has none
 
 
@@ -138,12 +138,12 @@ class Views:
     def predicted(self, predict: Predictor, candidate: Candidate) -> F64:
         """What a predictor says that the lamps change, (N, H, W, 3) in the metric space."""
         total = len(self.base[1].position)
-        memory = Batch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
+        memory = TrainingBatch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
         made = [[predict(self._filled(memory, look))[0].copy() for look in pair] for pair in self.pairs]
         shown = _shown(np.array(made, np.float32))
         return shown[:, 1] - shown[:, 0]
 
-    def _filled(self, memory: Batch, look: Look) -> Batch:
+    def _filled(self, memory: TrainingBatch, look: Look) -> TrainingBatch:
         """A look as a batch of one, in memory that is used again."""
         fill(memory, 0, look.sample, self.spec, self.base[1])
         if memory.inputs.photons is not None:
@@ -188,7 +188,7 @@ class Room:
     rows: tuple[Row, ...]
 
 
-def known_light(batch: Batch) -> F32:
+def known_light(batch: TrainingBatch) -> F32:
     """Emission, direct light and gloss of a batch's guides: an image of which nothing is learned."""
     guides = given(batch.inputs.guides)
     light: F32 = (guides.emission + guides.direct + guides.gloss).numpy()
@@ -258,7 +258,7 @@ class Stage:
         key = view_key(modification.key(self.spec.scene_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
         known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
-        return Look(StoredSample(modification, view, halves, 1.0, *known), frames.photons)
+        return Look(RawSample(modification, view, halves, 1.0, *known), frames.photons)
 
     def views(self, source: StoreSource, rows: Sequence[int]) -> Views:
         """The views of some samples, rendered anew."""

@@ -21,10 +21,10 @@ from typing import Any
 
 
 def settings(text: str) -> Any:
-    from photonfarm.renderer.verify.scenes.case import Settings
+    from photonfarm.renderer.verify.scenes.case import BdptSettings
 
     connections, light_ratio = text.split(",")
-    return Settings(int(connections), float(light_ratio))
+    return BdptSettings(int(connections), float(light_ratio))
 
 
 def main() -> int:

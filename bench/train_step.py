@@ -29,7 +29,7 @@ import store_contents
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES
@@ -140,7 +140,9 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: Clock, step
     )  # fmt: skip
 
 
-def timed(learner: Learner, batch: Batch, device: torch.device, clock: Clock, *, gradients: bool) -> dict[str, float]:
+def timed(
+    learner: Learner, batch: TrainingBatch, device: torch.device, clock: Clock, *, gradients: bool
+) -> dict[str, float]:
     """A step, or an image, and its parts, each by itself."""
     network = learner.network
     inputs = (batch.to(device).for_training() if gradients else batch.to(device)).inputs

@@ -19,7 +19,7 @@ from photonfarm.shared.core.records import F32, ViewBuffers
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import Emitters, SceneSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import POINTS_ONLY
 from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
@@ -115,7 +115,7 @@ def test_a_network_is_told_of_a_view_as_it_is_what_the_store_holds_of_it(work: P
     stored = room_study.images(run, source, held_out(source, HOLD_OUT, 2))
     made: list[F32] = []
 
-    def predict(batch: Batch) -> F32:
+    def predict(batch: TrainingBatch) -> F32:
         made.append(network(batch).copy())
         return made[-1]
 

@@ -14,7 +14,7 @@ from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import Batch, read_into
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
@@ -41,7 +41,7 @@ def small_room() -> SceneSpec:
 class Read:
     """Samples of the store as a network gets them, the network, and what the oracle sees of each sample."""
 
-    batch: Batch
+    batch: TrainingBatch
     network: Network
     cameras: list[Camera]
     points: Mask  # (B, P)
@@ -61,7 +61,7 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> Read:
     source, needs = StoreSource(root, scene.scene_id), ARCHITECTURES[SETTINGS.architecture].needs
     assert source.refresh().tolist() == [*range(6)]
     base = source.base()
-    batch = read_into(Batch.empty(len(ROWS), POINTS, spec, needs), source, ROWS, needs, base[1])
+    batch = read_into(TrainingBatch.empty(len(ROWS), POINTS, spec, needs), source, ROWS, needs, base[1])
     samples = source.read_batch(ROWS)
     cameras = [Camera.of(sample.view, spec) for sample in samples]
     points, photons = [], []

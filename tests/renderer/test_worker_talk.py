@@ -2,7 +2,7 @@
 
 import pytest
 
-from photonfarm.renderer.worker.log import Talk, Tally
+from photonfarm.renderer.worker.log import JobCounts, Talk
 from photonfarm.renderer.worker.settings import WorkerSettings
 
 
@@ -27,8 +27,8 @@ def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: 
 
 
 def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() -> None:
-    both = Tally.of(Tally(3, 1, 96, 10.25).line) + Tally(1, 0, 32, 2.0)
-    assert both == Tally(4, 1, 128, 12.25)
+    both = JobCounts.of(JobCounts(3, 1, 96, 10.25).line) + JobCounts(1, 0, 32, 2.0)
+    assert both == JobCounts(4, 1, 128, 12.25)
     assert str(both) == "4 jobs done, 1 failed, 128 samples, 12 s"
 
 

@@ -19,11 +19,11 @@ from photonfarm.shared.scene.spec import SceneSpec, shape_ids
 if TYPE_CHECKING:
     from photonfarm.shared.farm.dry_run import DryRun
     from photonfarm.shared.farm.submission import Submission
-    from photonfarm.shared.queue import Cause, Failure, QueueStatus
+    from photonfarm.shared.queue import Failure, FailureCause, QueueStatus
     from photonfarm.shared.store import Store
 
 
-class Finding(Protocol):
+class CheckResult(Protocol):
     """The result of one check of `photonfarm doctor`."""
 
     @property
@@ -321,7 +321,7 @@ def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Fai
     return missing
 
 
-def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Path) -> dict[str, Any]:
+def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: str | Path) -> dict[str, Any]:
     from photonfarm.shared.queue import repeating_command
 
     return {
@@ -348,7 +348,7 @@ def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Pa
 # --------------------------------------------------------------------------------------------------------------- doctor
 
 
-def findings(found: Iterable[Finding], as_json: bool) -> int:
+def findings(found: Iterable[CheckResult], as_json: bool) -> int:
     """Print the results of checks as they come; returns the exit code of the first required check that failed, or 0."""
     console, code, seen = Console(soft_wrap=True), 0, []
     for finding in found:

@@ -19,7 +19,7 @@ from photonfarm.shared.store.check.check import Progress as Tell
 from photonfarm.shared.store.check.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import Merged
-from photonfarm.shared.store.write.findings import Finding, Group, Remedy
+from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
 
 if TYPE_CHECKING:
     from photonfarm.shared.farm.upgrade import SceneUpgrade, Upgrade
@@ -114,7 +114,7 @@ def _document(report: StoreReport) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _group(group: Group) -> dict[str, Any]:
+def _group(group: FindingGroup) -> dict[str, Any]:
     first = [
         {"job": f.job, "guides": f.guides, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
     ]  # fmt: skip

@@ -42,7 +42,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class FailureCause:
     """Failures whose error and message are the same but for ids and numbers."""
 
     cause: str  # the message with … for what differs
@@ -139,12 +139,12 @@ def _ttls(connection: Redis, names: Sequence[str]) -> dict[str, int]:
     return dict(zip(names, found, strict=True))
 
 
-def causes(failures: Mapping[str, Failure]) -> list[Cause]:
+def causes(failures: Mapping[str, Failure]) -> list[FailureCause]:
     """Failures by their cause, the most frequent first."""
     grouped: dict[str, dict[str, Failure]] = {}
     for name, failure in sorted(failures.items(), key=lambda item: (not item[1].set_aside, item[0])):
         grouped.setdefault(_VARYING.sub("…", failure.reason), {})[name] = failure
-    found = [Cause(cause, sum(f.set_aside for f in jobs.values()), jobs) for cause, jobs in grouped.items()]
+    found = [FailureCause(cause, sum(f.set_aside for f in jobs.values()), jobs) for cause, jobs in grouped.items()]
     return sorted(found, key=lambda cause: -len(cause.jobs))
 
 

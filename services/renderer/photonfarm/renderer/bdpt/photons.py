@@ -21,7 +21,7 @@ Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photons:
+class TracedPhotons:
     """P = paths · depth slots; slot d·paths + i is hit d + 1 of path i.
 
     Empty slots have bounce −1 and zeros elsewhere.
@@ -36,7 +36,7 @@ class Photons:
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
-def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
+def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> TracedPhotons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is the arriving power, before reflection, divided by the number of emitted paths (dead lights
@@ -51,7 +51,7 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Re
     check_scene(scene, light_paths=True)
     if not scene.emitters():
         zeros = np.zeros((paths * depth, 3), np.float32)
-        return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(paths * depth, -1, np.int32))
+        return TracedPhotons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(paths * depth, -1, np.int32))
     with dr.suspend_grad():
         lights = read_lights(scene)
         keys = randomness.image_keys([seed & 0xFFFFFFFF])
@@ -59,7 +59,7 @@ def trace_photons(scene: Any, *, seed: int, paths: int, depth: int, recorder: Re
         traced = partial(recorder, (paths, depth, lights.kinds)) if recorder else trace
         out, bounce = traced(scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
-    return Photons(position, direction, normal, power / np.float32(paths), np.array(bounce))
+    return TracedPhotons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 
 
 def trace(

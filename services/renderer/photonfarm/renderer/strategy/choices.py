@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
 from photonfarm.renderer.strategy.comparison import Measured, saving
-from photonfarm.renderer.strategy.measurement import Measurement, Row
+from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement
 from photonfarm.renderer.strategy.pilot import longest
 
 
@@ -28,7 +28,7 @@ def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
     return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
 
 
-def _offer(row: Row, plain: Row, spp: int, half_s: float) -> Offer:
+def _offer(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> Offer:
     samples = row.cost.bought(half_s)
     cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
     relative = row.errors.relative_spread(plain.errors)
@@ -45,7 +45,7 @@ def _offer(row: Row, plain: Row, spp: int, half_s: float) -> Offer:
     )
 
 
-def _per_sample_s(row: Row, half_s: float) -> float:
+def _per_sample_s(row: CandidateRow, half_s: float) -> float:
     samples = row.cost.bought(half_s)
     return row.cost.time_s(samples) / samples
 

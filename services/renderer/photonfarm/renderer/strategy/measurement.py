@@ -42,7 +42,7 @@ Talk = Callable[[str], None]
 """A function that takes a line about the progress."""
 
 
-class Row(Frozen):
+class CandidateRow(Frozen):
     """One candidate: the values of `Measured`, and the two parts of its time."""
 
     connections: int
@@ -73,7 +73,7 @@ class Measurement(Frozen):
     max_depth: int
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
-    rows: tuple[Row, ...]  # empty if every view is black
+    rows: tuple[CandidateRow, ...]  # empty if every view is black
     shared: float  # as in `Choice`
     filled: tuple[float, ...]  # as in `light_reach`, with the next two
     near: tuple[tuple[float, ...], ...]
@@ -86,7 +86,7 @@ class Measurement(Frozen):
         """Whether a candidate was measured."""
         return any(row.candidate == candidate for row in self.rows)
 
-    def row(self, candidate: Candidate) -> Row:
+    def row(self, candidate: Candidate) -> CandidateRow:
         """The measurement of a candidate."""
         return next(row for row in self.rows if row.candidate == candidate)
 
@@ -99,7 +99,7 @@ class _Compared:
     spp: int
     half_s: float
     choice: pilot.Choice
-    rows: tuple[Row, ...]
+    rows: tuple[CandidateRow, ...]
 
 
 def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) -> Measurement:
@@ -187,14 +187,14 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> Row:
+def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
     """The cost that was timed beforehand, corrected by the many images of the pilot.
 
     If the pilot's images have far fewer samples, they are not used: their fixed part hides the time of their samples.
     """
     similar = RANGE * pilot_spp >= half_spp
     correction = measured.time_s / cost.time_s(pilot_spp) if similar else 1.0
-    return Row(
+    return CandidateRow(
         connections=measured.candidate.connections,
         light_ratio=measured.candidate.light_ratio,
         errors=measured.errors,

@@ -119,7 +119,7 @@ class _Evidence:
 
 
 @dataclass(slots=True)
-class Tally:
+class BlockSums:
     """Sums over one candidate's images of all views, for the light that is missing."""
 
     _grids: dict[int, dict[int, _Grid]] = field(default_factory=dict)  # by size and view
@@ -158,7 +158,7 @@ class Tally:
         )
 
 
-def missed(tally: Tally, others: Sequence[Tally]) -> float:
+def missed(tally: BlockSums, others: Sequence[BlockSums]) -> float:
     """The charge of the module's docstring, mean over the views: relMSE that the pilot was too short to see.
 
     All tallies are of the same views, in the same order.
@@ -166,7 +166,7 @@ def missed(tally: Tally, others: Sequence[Tally]) -> float:
     return float(np.max([_missed_in_blocks(tally, others, blocks) for blocks in BLOCKS], axis=0).mean())
 
 
-def _missed_in_blocks(tally: Tally, others: Sequence[Tally], blocks: int) -> NDArray[np.float64]:
+def _missed_in_blocks(tally: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
     """The charge of each view, (V,), for one size of blocks."""
     own = tally.evidence(blocks)
     charge = np.zeros_like(own.mean)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import Errors, Measured
-from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights
+from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
 
@@ -52,7 +52,7 @@ class Rounds:
         self.scouting_s = 0.0
         self.weights: dict[int, F32] = {}  # by view; black views are left out
         self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
-        self._tallies = {c: Tally() for c in candidates}
+        self._tallies = {c: BlockSums() for c in candidates}
         self._shared: dict[int, list[float]] = {}  # by view, of each pair
 
     # ------------------------------------------------------------------------------------------------------ rendering

@@ -13,7 +13,7 @@ from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32, Photons
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store.read.reader import Sample, SceneReader
+from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 COLUMNS = ("A", "B", "albedo", "normal", "depth", "photons")
 
@@ -64,7 +64,7 @@ def _line(reader: SceneReader, row: int) -> Line:
     return Line(row, removed, panels)
 
 
-def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> Picture:
+def photon_picture(sample: StoredSample, photons: Photons | None, spec: SceneSpec) -> Picture:
     """The photons that this view sees, each as a dot of its colour on the dimmed albedo; (H, W, 3)."""
     canvas = 0.15 * sample.buffers.albedo
     if photons is not None:
@@ -73,7 +73,7 @@ def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> 
     return pictures.of_albedo(canvas)
 
 
-def _visible(sample: Sample, photons: Photons, spec: SceneSpec) -> tuple[np.ndarray, np.ndarray, F32]:
+def _visible(sample: StoredSample, photons: Photons, spec: SceneSpec) -> tuple[np.ndarray, np.ndarray, F32]:
     """Pixel columns, rows and powers of the photons that lie on what the view's depth buffer shows."""
     camera = Camera.of(sample.view, spec)
     alive = photons.bounce >= 0

@@ -21,7 +21,7 @@ import numpy as np
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, Effort, Images, Scene, Settings
+from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, Scene
 from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
 from photonfarm.renderer.verify.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
@@ -29,7 +29,7 @@ from photonfarm.shared.core.statistics import BlockTest, block_z_test
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
 LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=512, resolution=0.005)
 DEPTH = 5
-COUNTS = tuple(Settings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
+COUNTS = tuple(BdptSettings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
 """The scenes with rare bright samples, for which a few renders prove too little; they have rows of their own."""
@@ -38,7 +38,7 @@ _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class InvarianceResult:
     """The result of a check."""
 
     faults: tuple[str, ...]  # why it failed; empty: it passed
@@ -52,7 +52,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class Invariance:
     """A property that must hold."""
 
     name: str
@@ -65,44 +65,44 @@ class Check:
         """The command that runs it again."""
         return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
 
-    def run(self) -> Finding:
+    def run(self) -> InvarianceResult:
         """Render what the check needs, and judge it."""
         start = time.process_time()
         faults, figures = self.find()
-        return Finding(tuple(faults), figures, time.process_time() - start)
+        return InvarianceResult(tuple(faults), figures, time.process_time() - start)
 
 
-def checks(*, long: bool) -> Iterator[Check]:
+def checks(*, long: bool) -> Iterator[Invariance]:
     """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
     for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
-        yield Check(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
+        yield Invariance(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
                     partial(equal_means, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("hundred_lights",)).items():
-        yield Check(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
+        yield Invariance(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
                     partial(additive, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("plastics", "rotated_envmap", "mirror_room")).items():
-        yield Check(f"linear-{name}", "radiances times a factor give the image times it",
+        yield Invariance(f"linear-{name}", "radiances times a factor give the image times it",
                     partial(linear, build, effort), long)  # fmt: skip
     for factor in _NEAR_SCALED:
-        yield Check(
+        yield Invariance(
             f"scale-{factor:g}", "lengths times a factor give the same image", partial(scale, factor, effort), long
         )
     for name, build in _scenes(long, ("many_lights",), ("cove",)).items():
-        yield Check(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
+        yield Invariance(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
                     partial(update_equals_reload, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "plastics", "glass_caustic", "cove")).items():
-        yield Check(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
+        yield Invariance(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
                     partial(reproducible, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "glass_caustic", "cove")).items():
-        yield Check(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
+        yield Invariance(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
                     partial(recorded, build, effort), long)  # fmt: skip
     for name, build in (weight_check.LONG_SCENES if long else weight_check.SCENES).items():
-        yield Check(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
+        yield Invariance(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
                     partial(oracles_weights, build, _LANES[long]), long)  # fmt: skip
 
 
-def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
+def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
     """The checks of these names, or whose names begin with them; all for an empty choice.
 
     Raises ValueError for a name that matches none.
@@ -115,7 +115,7 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
 
 
-def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
+def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     """A table of checks and their results, and the commands that repeat the failed ones."""
     lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [
@@ -300,12 +300,12 @@ def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str
 # ------------------------------------------------ Their parts ------------------------------------------------
 
 
-def _integrator(settings: Settings) -> dict[str, Any]:
+def _integrator(settings: BdptSettings) -> dict[str, Any]:
     counts = {"connections": settings.connections, "light_ratio": settings.light_ratio}
     return {"type": "bdpt", "max_depth": DEPTH, **counts}
 
 
-def _images(scene: Any, settings: Settings, effort: Effort, seed: int, spp: int | None = None) -> Images:
+def _images(scene: Any, settings: BdptSettings, effort: Effort, seed: int, spp: int | None = None) -> Images:
     return render(scene, _integrator(settings), spp or effort.spp, range(seed, seed + effort.seeds))
 
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from photonfarm.renderer.verify.pictures import FULL_Z
 from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Result, plus_minus
+from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
 from photonfarm.shared.core.statistics import two_sided_limit
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.verify.report import Report
+    from photonfarm.renderer.verify.report import StabilityReport
 
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "
@@ -31,9 +31,9 @@ _COLUMNS = ("row", "scene", "truth", "settings", "z max (limit)", "mean ratio (b
 _HEAD = f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 
-def markdown(report: Report, command: str) -> str:
+def markdown(report: StabilityReport, command: str) -> str:
     """The report as Markdown."""
-    scenes: dict[str, list[Result]] = {}
+    scenes: dict[str, list[SceneResult]] = {}
     for result in report.results:
         scenes.setdefault(result.label, []).append(result)
     parts = [
@@ -78,7 +78,7 @@ _PICTURES = (
 )
 
 
-def _verdict(report: Report) -> str:
+def _verdict(report: StabilityReport) -> str:
     """The numbers of rows and scenes that pass; refusals without a row are counted separately."""
     rows, scenes = report.rows(), report.scenes()
     others = [not result.faults for result in report.results if result.row is None]
@@ -88,7 +88,7 @@ def _verdict(report: Report) -> str:
     return f"{' '.join(parts)}.{tried}"
 
 
-def _line(results: list[Result]) -> str:
+def _line(results: list[SceneResult]) -> str:
     first = results[0]
     if first.z_limit is None:
         said = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
@@ -114,13 +114,13 @@ def _seen(biases: Sequence[float | None]) -> str:
     return f"{worst:.2g} %" if worst < 100 else f"{worst:.0f} %"
 
 
-def _deviation(result: Result) -> float:
+def _deviation(result: SceneResult) -> float:
     if result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return float("inf")
     return abs(result.mean_ratio - 1) / max(result.mean_ratio_standard_error, ROUNDING)
 
 
-def _ratio(results: Sequence[Result]) -> str:
+def _ratio(results: Sequence[SceneResult]) -> str:
     result = max(results, key=_deviation)
     if result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return "unknown"
@@ -128,13 +128,13 @@ def _ratio(results: Sequence[Result]) -> str:
     return f"{plus_minus(result.mean_ratio, result.mean_ratio_standard_error)}{rounding} (≤ {result.resolution:g})"
 
 
-def _path_ratio(result: Result) -> str:
+def _path_ratio(result: SceneResult) -> str:
     if result.path_ratio is None or result.path_ratio_standard_error is None:
         return "–"
     return plus_minus(result.path_ratio, result.path_ratio_standard_error)
 
 
-def _is_rounding(result: Result) -> bool:
+def _is_rounding(result: SceneResult) -> bool:
     """Whether it passes only because of the tolerance for rounding: above the noise, and not negligible."""
     if result.faults or result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return False
@@ -142,7 +142,7 @@ def _is_rounding(result: Result) -> bool:
     return off > ROUNDING and off > two_sided_limit(SIGNIFICANCE) * result.mean_ratio_standard_error
 
 
-def _rounded(scenes: Sequence[Sequence[Result]]) -> str:
+def _rounded(scenes: Sequence[Sequence[SceneResult]]) -> str:
     """The entries marked ° in the table, which may colour a whole picture, beside the same ratio of `path`."""
     if not scenes:
         return ""
@@ -159,7 +159,7 @@ def _per_cent(ratio: float | None) -> str:
     return "unknown" if ratio is None else f"{100 * (ratio - 1):+.3f} %"
 
 
-def _hard(results: Sequence[Result]) -> str:
+def _hard(results: Sequence[SceneResult]) -> str:
     """What is hard, one line for each row; scenes that share a sentence share it."""
     rows: dict[int, dict[str, list[str]]] = {}
     for result in results:
@@ -173,12 +173,12 @@ def _hard(results: Sequence[Result]) -> str:
     return "## What is hard\n\n" + "\n".join(lines) if lines else ""
 
 
-def _failures(results: Sequence[Result]) -> str:
+def _failures(results: Sequence[SceneResult]) -> str:
     lines = [f"- {r.label} ({r.settings}): {'; '.join(r.faults)}. Again: `{r.command}`" for r in results if r.faults]
     return "## Failures\n\n" + "\n".join(lines) if lines else ""
 
 
-def _unsupported(refusals: Sequence[Result]) -> str:
+def _unsupported(refusals: Sequence[SceneResult]) -> str:
     said = [f"- {r.label}: “{r.hard}” ({r.verdict})" for r in refusals]
     refused = "## Refused\n\n" + "\n".join([*said, f"- {REFUSED_ON_IMPORT}"])
     return refused + "\n\n## Done from the eye alone\n\n" + "\n".join(f"- {sentence}" for sentence in EYE_ALONE)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.runner import Outcome, Renders
+from photonfarm.renderer.verify.runner import Renders, SceneOutcome
 from photonfarm.shared.core.pictures import Picture, display
 
 SIDE = 96
@@ -73,7 +73,7 @@ def _draw_legend(whole: Any) -> None:
     draw.text((x + bar.shape[1] + _GAP, 27), brighter, "black", font)
 
 
-def keep(outcome: Outcome, folder: Path) -> Path:
+def keep(outcome: SceneOutcome, folder: Path) -> Path:
     """Write the renders [K, H, W, 3] as .npy and the triple as .png into a folder of this outcome; returns it."""
     from PIL import Image
 

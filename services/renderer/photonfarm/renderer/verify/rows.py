@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Sequence
 
 from photonfarm.renderer.verify.scenes import cameras, closed_form, lights, surfaces
-from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
 
 SCENES: tuple[HardScene, ...] = tuple(
     sorted((*closed_form.SCENES, *lights.SCENES, *surfaces.SCENES, *cameras.SCENES), key=lambda scene: scene.row)
@@ -19,7 +19,7 @@ ROWS = 36
 
 
 def chosen(
-    only: Sequence[str] = (), *, quick: bool = False, settings: Sequence[Settings] = ()
+    only: Sequence[str] = (), *, quick: bool = False, settings: Sequence[BdptSettings] = ()
 ) -> list[HardScene | Refusal]:
     """Scenes and refusals by row number, name or label, in order; all of them for an empty choice.
 
@@ -55,7 +55,7 @@ def _is_called(item: HardScene | Refusal, wanted: str) -> bool:
     return wanted in (item.label, item.name) or (wanted.isdigit() and item.row == int(wanted))
 
 
-def _is_tried(item: HardScene | Refusal, quick: bool, settings: Sequence[Settings]) -> bool:
+def _is_tried(item: HardScene | Refusal, quick: bool, settings: Sequence[BdptSettings]) -> bool:
     if isinstance(item, Refusal):
         return True
     return not (quick and item.quick is None) and (not settings or any(s in item.settings for s in settings))

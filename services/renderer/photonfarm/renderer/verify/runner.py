@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
 from photonfarm.renderer.verify.scenes.truths import PATH, load, render
 from photonfarm.shared.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
 
@@ -30,7 +30,7 @@ In the shining sphere `path` itself is 0.04 % too bright at depth 2, 0.07 % at d
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class SceneResult:
     """A scene's result with one pair of settings: a line of the table."""
 
     row: int | None
@@ -80,16 +80,16 @@ class Renders:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SceneOutcome:
     """A result and its renders; a refusal has none."""
 
-    result: Result
+    result: SceneResult
     renders: Renders | None = None
 
 
 def run(
-    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[Settings] = ()
-) -> Iterator[Outcome]:
+    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = ()
+) -> Iterator[SceneOutcome]:
     """One outcome for each pair of settings: those given among the scene's, else the quick ones if quick, else all.
 
     Yields nothing for a scene without a quick version, or that is not tried with any of these settings.
@@ -129,21 +129,21 @@ def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tu
 
 
 def _judged(
-    item: HardScene, effort: Effort, settings: Settings, bdpt: Images, truth: Images, start: float, command: str
-) -> Outcome:
+    item: HardScene, effort: Effort, settings: BdptSettings, bdpt: Images, truth: Images, start: float, command: str
+) -> SceneOutcome:
     with np.errstate(all="ignore"):  # values that are not finite, and black images, are judged below
         blocks, whole = compare(bdpt, truth, effort.blocks), compare(bdpt, truth, 1)
         brightest, truth_brightest = _max_over_mean(bdpt), _max_over_mean(truth)
     z_max = float(np.fmax(blocks.z_max, whole.z_max))
     faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
-    result = Result(
+    result = SceneResult(
         item.row, item.name, item.hard, item.truth.said, str(settings), effort.size, effort.seeds, effort.spp,
         effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
         _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
         _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
         int(np.isnan(bdpt).sum()), int(np.isinf(bdpt).sum()), time.process_time() - start, faults, command,
     )  # fmt: skip
-    return Outcome(result, Renders(bdpt, truth, blocks.z))
+    return SceneOutcome(result, Renders(bdpt, truth, blocks.z))
 
 
 def _faults(
@@ -217,7 +217,7 @@ def message_of(refusal: Refusal, size: int = 8) -> str:
     return _refusal(load(refusal.build(size)), refusal.settings)
 
 
-def _refusal(scene: object, settings: Settings) -> str:
+def _refusal(scene: object, settings: BdptSettings) -> str:
     integrator = {"type": "bdpt", "connections": settings.connections, "light_ratio": settings.light_ratio}
     try:
         mi.load_dict(integrator).render(scene, seed=0, spp=1)
@@ -226,15 +226,15 @@ def _refusal(scene: object, settings: Settings) -> str:
     return ""
 
 
-def _refused(refusal: Refusal, quick: bool) -> Outcome:
+def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     start = time.process_time()
     said = message_of(refusal)
     faults = [] if refusal.sentence in said else [f"not refused with {refusal.sentence!r}, but with {said!r}"]
     if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
-    result = Result(
+    result = SceneResult(
         refusal.row, refusal.name, said, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
         f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
-    return Outcome(result)
+    return SceneOutcome(result)

@@ -25,7 +25,7 @@ from rq.worker.base import StopRequested, WorkerStatus
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
 from photonfarm.renderer.worker.heartbeat import Heart
-from photonfarm.renderer.worker.log import Talk, Tally
+from photonfarm.renderer.worker.log import JobCounts, Talk
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import (
@@ -120,7 +120,7 @@ class RenderWorker(SimpleWorker):
         )
         self._talk = Talk(settings)
         self._words = words
-        self._tally = Tally()
+        self._tally = JobCounts()
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
@@ -242,7 +242,7 @@ class RenderWorker(SimpleWorker):
     def _count(self, name: str, seconds: float) -> None:
         """Report the jobs so far to the supervisor, which outlives this process, however it ends."""
         done = not self._failed
-        self._tally += Tally(done, not done, self._samples(name) if done else 0, seconds)
+        self._tally += JobCounts(done, not done, self._samples(name) if done else 0, seconds)
         if self._words is not None:
             _leave_word(self._words, self._tally.line)
 

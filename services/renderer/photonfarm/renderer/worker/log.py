@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class JobCounts:
     """Counts of jobs and samples."""
 
     jobs: int = 0  # done
@@ -22,9 +22,9 @@ class Tally:
     samples: int = 0  # of those that are done
     seconds: float = 0.0  # of all
 
-    def __add__(self, other: Tally) -> Tally:
+    def __add__(self, other: JobCounts) -> JobCounts:
         """The sum of both."""
-        return Tally(
+        return JobCounts(
             self.jobs + other.jobs,
             self.failed + other.failed,
             self.samples + other.samples,
@@ -37,7 +37,7 @@ class Tally:
         return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
 
     @classmethod
-    def of(cls, line: str) -> Tally:
+    def of(cls, line: str) -> JobCounts:
         """The counts in a line of a child."""
         jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
         return cls(int(jobs), int(failed), int(samples), float(seconds))

@@ -15,7 +15,7 @@ from types import FrameType
 
 import redis
 
-from photonfarm.renderer.worker.log import Tally
+from photonfarm.renderer.worker.log import JobCounts
 from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, RECYCLED, TALLY, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
@@ -40,7 +40,7 @@ class Words:
     last: str  # why it ended, if it stated that
     job: str | None  # the job that it began last
     hung: str  # the stack where the deadline ended that job; "" if it did not
-    tally: Tally  # of the jobs that ended
+    tally: JobCounts  # of the jobs that ended
 
     @classmethod
     def of(cls, told: str) -> Words:
@@ -51,7 +51,7 @@ class Words:
         tallies = [line for line in lines if line.startswith(TALLY)]
         others = [line for line in lines if line.strip() and not line.startswith((JOB_IN_HAND, TALLY))]
         stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
-        tally = Tally.of(tallies[-1]) if tallies else Tally()
+        tally = JobCounts.of(tallies[-1]) if tallies else JobCounts()
         return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]), tally)
 
     @property
@@ -70,7 +70,7 @@ class Supervisor:
         self._say = say
         self._stop = Stop()
         self._child: subprocess.Popen[bytes] | None = None
-        self._tally = Tally()
+        self._tally = JobCounts()
 
     def run(self) -> None:
         """Supervise; raises the errors that a new child would meet again."""

@@ -25,7 +25,7 @@ from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
 
 if TYPE_CHECKING:
-    from photonfarm.trainer.runs.distributed import Group
+    from photonfarm.trainer.runs.distributed import TrainingGroup
 
 T = TypeVar("T")
 
@@ -74,7 +74,7 @@ def _lead(
     settings: TrainSettings,
     redis_url: str | None,
     stop: Stop,
-    group: Group,
+    group: TrainingGroup,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.trainer.data.store_source import StoreSource

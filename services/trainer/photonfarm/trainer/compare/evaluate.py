@@ -22,7 +22,7 @@ from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
-from photonfarm.trainer.data.dataset import Batch, kept_count
+from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import (
@@ -63,7 +63,7 @@ Tell = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class PredictorRow:
     """One predictor's results on the held-out samples."""
 
     name: str
@@ -73,14 +73,14 @@ class Row:
     metrics: ImageMetrics | None  # in the metric space; None if no view has a reference
     shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
 
-    def behind(self, first: Row) -> Estimate | None:
+    def behind(self, first: PredictorRow) -> Estimate | None:
         """The excess of its linear error over another's, in pairs of configurations; None for other samples."""
         if self.held_out.units != first.held_out.units:
             return None
         difference = self.held_out.per_sample - first.held_out.per_sample
         return Estimate.of(group_means(difference, self.held_out.units))
 
-    def document(self, first: Row) -> dict[str, Any]:
+    def document(self, first: PredictorRow) -> dict[str, Any]:
         """Its part of evaluation.json, with its excess over the first row."""
         error, behind = self.held_out.error, self.behind(first)
         return {
@@ -110,7 +110,7 @@ class Evaluation:
     device: str  # of the networks
     threads: int  # of torch on the CPU
     references: References | None
-    rows: tuple[Row, ...]
+    rows: tuple[PredictorRow, ...]
     shown: tuple[Target, ...]
 
     @property
@@ -230,7 +230,7 @@ class _Watched:
     units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
     samples: int = 0
 
-    def __call__(self, batch: Batch) -> F32:
+    def __call__(self, batch: TrainingBatch) -> F32:
         images = self.predict(batch)
         for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
             if row in self.wanted:
@@ -258,11 +258,11 @@ class _Measured:
     metrics: ImageMetrics | None
     images: dict[int, F32]
 
-    def row(self, shown: Sequence[int]) -> Row:
+    def row(self, shown: Sequence[int]) -> PredictorRow:
         """Its results, with the images of some rows of the store."""
         images = {row: self.images[row] for row in shown if row in self.images}
         predictor, seconds = self.timed.predictor, self.timed.seconds
-        return Row(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
+        return PredictorRow(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

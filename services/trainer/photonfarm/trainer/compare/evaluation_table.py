@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from photonfarm.shared.core.estimate import Estimate
-from photonfarm.trainer.compare.evaluate import Evaluation, Row
+from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
@@ -111,7 +111,7 @@ def _table(evaluation: Evaluation) -> str:
     return markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
 
 
-def _cells(row: Row, first: Row, columns: list[str]) -> list[str]:
+def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[str]:
     behind = None if row is first else row.behind(first)
     metrics = {} if row.metrics is None else row.metrics.columns()
     return [

@@ -45,7 +45,7 @@ from photonfarm.trainer.networks.inputs import (
 )
 
 
-class Sample(Protocol):
+class SourceSample(Protocol):
     """One sample as it is read; its images have their stored types."""
 
     @property
@@ -103,7 +103,7 @@ class SampleSource(Protocol):
     def taken_back(self) -> NDArray[np.int64]:
         """The rows that were complete before the last `refresh` and not after it; workers render them again."""
 
-    def read_batch(self, rows: Sequence[int]) -> Sequence[Sample]:
+    def read_batch(self, rows: Sequence[int]) -> Sequence[SourceSample]:
         """The samples of complete rows, valid until the next call; StoreError if one is incomplete or unreadable."""
 
     def read_photons(self, row: int) -> Photons:
@@ -137,7 +137,7 @@ def units_of(source: SampleSource, rows: Sequence[int]) -> list[Key]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Batch:
+class TrainingBatch:
     """Samples as tensors; valid until the next batch is taken. Incomplete samples are left out, possibly all."""
 
     rows: tuple[int, ...]
@@ -148,7 +148,7 @@ class Batch:
     @classmethod
     def empty(
         cls, size: int, points: int, spec: SceneSpec, needs: Needs = POINTS_ONLY, *, pinned: bool = False
-    ) -> Batch:
+    ) -> TrainingBatch:
         """Memory for the needed parts of `size` samples, which is reused for every batch."""
 
         def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -160,17 +160,17 @@ class Batch:
         target = memory(2, spec.film.height, spec.film.width, 3)
         return cls((), (), Inputs.empty(memory, points, spec, needs), target)
 
-    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> Batch:
+    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> TrainingBatch:
         """The first samples of this memory, with their rows and the units by which they are held out."""
         n = len(rows)
-        return Batch(rows, units, map_tensors(lambda tensor: tensor[:n], self.inputs), self.target[:n])
+        return TrainingBatch(rows, units, map_tensors(lambda tensor: tensor[:n], self.inputs), self.target[:n])
 
-    def to(self, device: torch.device) -> Batch:
+    def to(self, device: torch.device) -> TrainingBatch:
         """The same batch on a device; itself on the CPU."""
         inputs = map_tensors(lambda tensor: tensor.to(device), self.inputs)
-        return Batch(self.rows, self.units, inputs, self.target.to(device))
+        return TrainingBatch(self.rows, self.units, inputs, self.target.to(device))
 
-    def for_training(self) -> Batch:
+    def for_training(self) -> TrainingBatch:
         """The batch with targets that no input depends on: itself, unless its inputs hold noisy colour.
 
         Otherwise it is twice as long: the samples with A in the inputs and B as the target, (B, 1, H, W, 3), then the
@@ -182,7 +182,7 @@ class Batch:
         half_b = NoisyColour(self.target[:, 1] * noisy.kept[..., None], noisy.kept)
         inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=half_b))
         target = torch.cat([self.target[:, 1:], self.target[:, :1]])
-        return Batch(2 * self.rows, 2 * self.units, inputs, target)
+        return TrainingBatch(2 * self.rows, 2 * self.units, inputs, target)
 
 
 def kept_count(spec: SceneSpec, of: int) -> int:
@@ -196,7 +196,7 @@ def kept_count(spec: SceneSpec, of: int) -> int:
     return pixels // of
 
 
-def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+def kept_pixels(sample: SourceSample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from the sample's content key.
 
     So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
@@ -210,7 +210,9 @@ def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     return kept
 
 
-def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: Needs, cloud: BasePointCloud) -> Batch:
+def read_into(
+    memory: TrainingBatch, source: SampleSource, rows: Sequence[int], needs: Needs, cloud: BasePointCloud
+) -> TrainingBatch:
     """Read complete rows of a source into the first places of a batch's memory; StoreError if one cannot be read."""
     spec = source.spec
     units = []
@@ -224,7 +226,7 @@ def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: N
     return memory.filled(tuple(rows), tuple(units))
 
 
-def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BasePointCloud) -> None:
+def fill(batch: TrainingBatch, place: int, sample: SourceSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
     """Write one sample into a batch's memory, except its photons and its noisy colour.
 
     That is its camera, its buffers, its exposed targets; if needed, its points; and which points and photons the view
@@ -272,7 +274,7 @@ def _fill_points(
     memory.seen[place] = torch.from_numpy(seen[:points])
 
 
-def _fill_noisy(batch: Batch, place: int, kept: NDArray[np.bool_]) -> None:
+def _fill_noisy(batch: TrainingBatch, place: int, kept: NDArray[np.bool_]) -> None:
     noisy = given(batch.inputs.noisy)
     noisy.kept[place] = torch.from_numpy(kept)
     torch.mul(batch.target[place, 0], noisy.kept[place, ..., None], out=noisy.colour[place])

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.trainer.data.dataset import Batch, SampleSource, read_into, rows_held_out
+from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into, rows_held_out
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
@@ -53,11 +53,11 @@ class Feed:
         points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
         pinned = usable_device(settings.device).type == "cuda"
         self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
-        self._ready: queue.SimpleQueue[tuple[Batch, Batch] | None] = queue.SimpleQueue()
-        self._free: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[TrainingBatch, TrainingBatch] | None] = queue.SimpleQueue()
+        self._free: queue.SimpleQueue[TrainingBatch | None] = queue.SimpleQueue()
         for _ in range(settings.prefetch + 1):
-            self._free.put(Batch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
-        self._lent: Batch | None = None
+            self._free.put(TrainingBatch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
+        self._lent: TrainingBatch | None = None
         self._polled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
@@ -77,7 +77,7 @@ class Feed:
         """Request a batch of these rows, at most `batch` of them."""
         self._asked.put(tuple(rows))
 
-    def take(self) -> Batch:
+    def take(self) -> TrainingBatch:
         """The next requested batch. The one taken before is then no longer valid. Raises the errors of reading."""
         if self._lent is not None:
             self._free.put(self._lent)
@@ -145,7 +145,7 @@ class Feed:
             self._complete = 0 < self._source.planned() <= len(self._known)
         self._polled.set()
 
-    def _read(self, rows: Sequence[int], memory: Batch) -> Batch:
+    def _read(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
         """Read those of the rows that are complete."""
         if not self._known.issuperset(rows):
             self._poll()  # another reader has seen them arrive
@@ -155,6 +155,6 @@ class Feed:
             self._poll()  # since then a repair may have set some aside, and a worker may have rendered them again
             return self._read_complete(rows, memory)
 
-    def _read_complete(self, rows: Sequence[int], memory: Batch) -> Batch:
+    def _read_complete(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
         there = [row for row in rows if row in self._here]
         return read_into(memory, self._source, there, self._needs, self.cloud)

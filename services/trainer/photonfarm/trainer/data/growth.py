@@ -9,10 +9,10 @@ from typing import Any, Self
 
 import torch
 
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 
 
@@ -43,7 +43,9 @@ class Growth:
 class Following:
     """Draws batches ahead of training, while they are being read. A `script` repeats the growth of an earlier run."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: Group = ALONE) -> None:
+    def __init__(
+        self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = ALONE
+    ) -> None:
         """Draw for all processes of a group, and read this one's part."""
         self._feed, self._settings, self._group = feed, settings, group
         self._script = script or Growth()
@@ -117,7 +119,7 @@ class Following:
         self._group.tell("rows", rows)
         self._feed.ask(self._group.part(rows))
 
-    def take(self) -> Batch | None:
+    def take(self) -> TrainingBatch | None:
         """The next drawn batch, this process' part of it read; draws of rows that are incomplete now do not count.
 
         None if no row is left in it: another batch is drawn instead, at the end.

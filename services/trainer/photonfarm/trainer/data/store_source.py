@@ -20,7 +20,7 @@ from photonfarm.shared.store.read.reader import SceneReader
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredSample:
+class RawSample:
     """One sample in its stored types; its images are in memory that the next batch reuses."""
 
     modification: Modification
@@ -67,14 +67,14 @@ class StoreSource:
         """The rows that were complete before the last `refresh` and not after it: a repair has set their jobs aside."""
         return self._reader.taken_back
 
-    def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
+    def read_batch(self, rows: Sequence[int]) -> list[RawSample]:
         """The samples of complete rows, valid until the next call; CorruptError if bytes are not what was committed."""
         if self._memory is None or len(rows) > len(self._memory):
             self._memory = Batch.empty(self.spec, len(rows), guides=self._has_guides)
         read = self._reader.read_batch(rows, self._memory)
         return [self._sample(read, place, row) for place, row in enumerate(rows)]
 
-    def _sample(self, read: Batch, place: int, row: int) -> StoredSample:
+    def _sample(self, read: Batch, place: int, row: int) -> RawSample:
         modification, view, pass_ = self._reader.inputs(row)
         radiance, scale = read.radiance[place], 2.0**-read.radiance_exponent
         if place in read.wide:
@@ -82,7 +82,7 @@ class StoreSource:
         buffers = ViewBuffers(**{name: values[place] for name, values in read.buffers.items()})
         known = {name: values[place] for name, values in read.guides.items()}
         guides = Guides(**known) if known else None
-        return StoredSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_, guides)
+        return RawSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_, guides)
 
     def read_photons(self, row: int) -> Photons:
         """The photons of a complete row's configuration; raises StoreError for a scene without photons."""

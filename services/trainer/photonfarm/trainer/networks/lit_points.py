@@ -58,7 +58,7 @@ OPEN = 2.0
 """The initial b: before anything is learned most surfaces see each other."""
 
 
-class Visibility(nn.Module):
+class LearnedVisibility(nn.Module):
     """The learned visibility between two surfaces, in (0, 1)."""
 
     centre: Tensor
@@ -101,7 +101,7 @@ class LitPoints(nn.Module):
         self._optics = frame.optics
         self._count = min(count, len(frame.appearance))
         self._area = frame.area / self._count
-        self.visibility = Visibility(frame)
+        self.visibility = LearnedVisibility(frame)
         self.register_buffer("normal", torch.from_numpy(frame.appearance[: self._count, 0:3].copy()), persistent=False)
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 

@@ -16,12 +16,12 @@ from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_h
 from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
 
-Predictor = Callable[[Batch], F32]
+Predictor = Callable[[TrainingBatch], F32]
 """A function from a batch to its images, (B, H, W, 3), linear radiance × exposure."""
 
 
@@ -57,7 +57,7 @@ class DevicePredictor:
     device: torch.device
 
     @torch.no_grad()
-    def __call__(self, batch: Batch) -> F32:
+    def __call__(self, batch: TrainingBatch) -> F32:
         """A batch's images."""
         images: F32 = self.images(self._there(batch.inputs)).cpu().numpy()
         return images
@@ -89,7 +89,7 @@ def by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
     return [Seconds.of(times) for times in np.array(rounds[WARM_ROUNDS:]).T]
 
 
-def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
+def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatch]:
     """The rows as batches, read through the feed, in their order; without those that are no longer complete."""
     for start in range(0, len(rows), size):
         feed.ask(rows[start : start + size])
@@ -102,7 +102,7 @@ def network_predictor(network: Network) -> DevicePredictor:
     return DevicePredictor(network, next(network.parameters()).device)
 
 
-def mean_colour(found: Iterator[Batch]) -> F32:
+def mean_colour(found: Iterator[TrainingBatch]) -> F32:
     """The mean exposed colour over samples and pixels, (3,): the best prediction without any input."""
     means = [batch.target.double().mean(dim=(1, 2, 3)).numpy() for batch in found]
     colour: F32 = np.concatenate(means).mean(axis=0).astype(np.float32)
@@ -114,7 +114,7 @@ def constant_predictor(colour: F32) -> Predictor:
     return lambda batch: np.broadcast_to(colour, batch.inputs.albedo.shape)
 
 
-def error_of(batch: Batch) -> Callable[[F32, F32, F32], float]:
+def error_of(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
     """The noise-free error of predictions for this batch, given A and B; the formula depends on whether A is input."""
     return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
 
@@ -129,7 +129,7 @@ def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
     return error(prediction, half_a, half_b)
 
 
-def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
+def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOut:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
 
     For a predictor whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB.

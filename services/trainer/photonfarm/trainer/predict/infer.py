@@ -25,7 +25,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, rows_held_out
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import given
@@ -87,7 +87,7 @@ def _missing(source: StoreSource, row: int) -> str:
     return f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers"
 
 
-def _judged(image: F32, batch: Batch) -> str:
+def _judged(image: F32, batch: TrainingBatch) -> str:
     half_a, half_b = batch.target[0].numpy()
     return f"held out; squared error {error_of(batch)(image, half_a, half_b):.5f}, the noise taken out"
 
@@ -190,10 +190,10 @@ class _Unrendered:
     pass_: int = 0
 
 
-def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[Batch]:
+def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
     points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
-    memory = Batch.empty(1, points, spec, run.needs)
+    memory = TrainingBatch.empty(1, points, spec, run.needs)
     if memory.inputs.photons is not None:
         fill_photons(memory.inputs.photons, 0, given(frames.photons))
     black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)

@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, Row, Tell
+from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -23,7 +23,7 @@ from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measure
 from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
-from photonfarm.trainer.report.worst_cases import View, WorstCase, worst_cases
+from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, worst_cases
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
@@ -33,7 +33,7 @@ class Entry:
 
     name: str
     architecture: str | None  # of a network; None for an untrained denoiser
-    row: Row
+    row: PredictorRow
     time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
 
@@ -163,7 +163,7 @@ class _CloseLook:
         self.worst = worst_cases(self._views(images, references))
         return [case.row for case in self.worst]
 
-    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[View]:
+    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
         """The views that have references, with the first network's images of them."""
         source = StoreSource(self._store, self._scene_id)
         source.refresh()
@@ -173,5 +173,5 @@ class _CloseLook:
             (sample,) = source.read_batch([row])
             read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
             a, b = references[row].half_a, references[row].half_b
-            views.append(View(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
+            views.append(HeldOutView(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
         return sorted(views, key=lambda view: view.row)

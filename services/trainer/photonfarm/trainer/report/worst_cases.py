@@ -27,7 +27,7 @@ SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to this difference
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class HeldOutView:
     """One held-out view: its reference and buffers, and the network's image of it."""
 
     row: int
@@ -48,7 +48,7 @@ class WorstCase:
     mse: float  # of these pixels, in the metric space, the reference's noise taken out
 
 
-def worst_cases(views: list[View]) -> list[WorstCase]:
+def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
     """The view with the largest error for each kind of pixels, in the order of `KINDS`; views may repeat.
 
     Errors are summed over the pixels: of two views with one wrong mirror, the one with the larger mirror is worse.
@@ -67,14 +67,14 @@ def worst_cases(views: list[View]) -> list[WorstCase]:
     return [max(scored[kind], key=lambda each: each[0])[1] for kind in KINDS if kind in scored]
 
 
-def squared_error(view: View) -> NDArray[np.float64]:
+def squared_error(view: HeldOutView) -> NDArray[np.float64]:
     """The error of each pixel (H, W), over channels, in the metric space: (f − A)(f − B), whose noise averages out."""
     shown, a, b = (display_values(image).astype(np.float64) for image in (view.image, view.half_a, view.half_b))
     product: NDArray[np.float64] = ((shown - a) * (shown - b)).mean(axis=-1)
     return product
 
 
-def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
+def kinds(view: HeldOutView, close: float) -> Iterator[tuple[str, Mask]]:
     """The kinds of pixels, each with its mask (H, W)."""
     if view.surface is not None:
         yield MIRRORS, view.surface == Surface.MIRROR
@@ -84,7 +84,7 @@ def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
     yield ALL, np.ones_like(view.buffers.depth, np.bool_)
 
 
-def shadow_edges(view: View) -> Mask:
+def shadow_edges(view: HeldOutView) -> Mask:
     """The pixels where the irradiance steps between neighbours that are otherwise alike, (H, W).
 
     It must step the same way in both halves of the reference: their noise is independent, and agrees only by chance.

@@ -32,7 +32,7 @@ Reading a part of a batch may take minutes if the store is in a bucket; a rank t
 """
 
 
-class Group(Protocol):
+class TrainingGroup(Protocol):
     """The processes that share each batch, seen from one of them."""
 
     within_step: bool  # the others wait for this one's gradient, and take no command before they have it
@@ -147,7 +147,7 @@ def processes() -> int:
 
 
 @contextmanager
-def leading(group: Group) -> Iterator[None]:
+def leading(group: TrainingGroup) -> Iterator[None]:
     """Run rank 0's training inside; however it ends, the others get the command to end, or notice that it is gone."""
     try:
         yield

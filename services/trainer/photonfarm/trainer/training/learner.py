@@ -8,12 +8,12 @@ from typing import Any
 import torch
 
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.average import WeightAverage
 from photonfarm.trainer.training.losses import loss_of
@@ -38,7 +38,7 @@ class DivergedError(IncompleteError):
 class Learner:
     """The network of a scene, equal in all processes of a group, before and after each step."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, group: Group = ALONE) -> None:
+    def __init__(self, feed: Feed, settings: TrainSettings, group: TrainingGroup = ALONE) -> None:
         """Make the untrained network of the feed's scene, on the device of this process."""
         frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
         self._settings, self._group = settings, group
@@ -58,7 +58,7 @@ class Learner:
         """The learning rate of step `number`."""
         return self.rate_factor * rate_at(number, self._settings)
 
-    def step(self, number: int, batch: Batch) -> float:
+    def step(self, number: int, batch: TrainingBatch) -> float:
         """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss.
 
         The loss is the same in all processes. If it is not finite, nothing has changed.

@@ -16,13 +16,13 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.processes import Stop
-from photonfarm.trainer.data.dataset import Batch, SampleSource
+from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.growth import Following, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -66,7 +66,7 @@ class Surroundings:
     run: Path
     watch: Stopwatch
     stop: Stop
-    group: Group
+    group: TrainingGroup
     script: Growth | None
     listen: Callable[[dict[str, Any]], object] | None
     count: Callable[[int, int], None] | None
@@ -84,7 +84,7 @@ def train(
     listen: Callable[[dict[str, Any]], object] | None = None,
     count: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
-    group: Group = ALONE,
+    group: TrainingGroup = ALONE,
     show: Show | None = None,
 ) -> Outcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
@@ -229,7 +229,7 @@ class Session:
                 self._stop.wait(NAP_SECONDS)
         return found
 
-    def _next_batch(self) -> Batch | None:
+    def _next_batch(self) -> TrainingBatch | None:
         if not self._following.draw_ahead(self._settings.max_steps):
             return None
         with self._watch.on("wait_read"):
@@ -342,7 +342,7 @@ class Session:
         seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
         return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}
 
-    def _train_step(self, batch: Batch) -> None:
+    def _train_step(self, batch: TrainingBatch) -> None:
         with self._watch.on("train"):
             value = self._good.step_or_go_back(self._step, batch)
         if value is None:

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from photonfarm.shared.core.errors import store_errors
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.training.learner import DivergedError, Learner
 
@@ -40,7 +40,7 @@ class GoodState:
         """Keep the learner's state at a step."""
         self._kept, self.step, self._is_new = _copied(self._learner.state()), step, True
 
-    def step_or_go_back(self, number: int, batch: Batch) -> float | None:
+    def step_or_go_back(self, number: int, batch: TrainingBatch) -> float | None:
         """Take a step; returns the loss, or None if it was not finite and the learner went back.
 
         Raises DivergedError as `go_back` does.

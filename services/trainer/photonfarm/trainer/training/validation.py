@@ -12,7 +12,7 @@ import torch
 
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.predict.evaluation import HeldOut, Predictor, measure
 
 Show = Callable[[int, F32, F32], None]
@@ -49,7 +49,7 @@ class Validation:
 
 
 def validate(
-    predict: Predictor, step: int, found: Iterator[Batch], show: Show | None = None, *, loss: str = "linear"
+    predict: Predictor, step: int, found: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
 ) -> Validation:
     """Measure a network over held-out samples; `show` gets targets and predictions of the first batch.
 
@@ -60,12 +60,12 @@ def validate(
     """
     rows: list[int] = []
 
-    def noted() -> Iterator[Batch]:
+    def noted() -> Iterator[TrainingBatch]:
         for batch in found:
             rows.extend(batch.rows)
             yield batch
 
-    def predict_and_show(batch: Batch) -> F32:
+    def predict_and_show(batch: TrainingBatch) -> F32:
         images = predict(batch)
         if show is not None and rows == list(batch.rows):
             show(step, batch.target.mean(dim=1).cpu().numpy(), images)

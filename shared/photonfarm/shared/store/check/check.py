@@ -13,7 +13,7 @@ from math import ceil
 
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.guide_check import GuideCheck
 from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.check.job_check import Checked
@@ -25,7 +25,7 @@ from photonfarm.shared.store.check.unplanned_files import strangers
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.findings import Cause, Finding, Findings, Group, JobPart, Remedy
+from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, JobPart, Remedy
 from photonfarm.shared.store.write.guides import GUIDES
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
@@ -51,7 +51,7 @@ class SceneReport:
     size_bytes: int
     back_facing_share: float | None  # of the pixels that meet something; None if none does
     halves: HalvesResult | None
-    groups: tuple[Group, ...]
+    groups: tuple[FindingGroup, ...]
     set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
 
 
@@ -118,7 +118,7 @@ class _SceneChecking:
         self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
         self._scenes = scenes
-        self._tally, self._guide_tally = Tally(HalvesTest(scenes)), Tally(HalvesTest(scenes))
+        self._tally, self._guide_tally = CheckTotals(HalvesTest(scenes)), CheckTotals(HalvesTest(scenes))
 
     def run(self, quarantine: Quarantine | None) -> SceneReport:
         """Check everything; set aside what is damaged, unless `quarantine` is None."""
@@ -180,7 +180,7 @@ class _SceneChecking:
         self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
         return check.repair(quarantine, found) if quarantine else []
 
-    def _read(self, scene: Checked, committed: list[int], total: Tally, called: str) -> None:
+    def _read(self, scene: Checked, committed: list[int], total: CheckTotals, called: str) -> None:
         """Read everything that committed jobs stored there, and look for what is missing."""
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):

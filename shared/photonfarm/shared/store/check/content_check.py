@@ -23,7 +23,7 @@ _FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)
 
 
 @dataclass(slots=True)
-class Tally:
+class CheckTotals:
     """Totals over the jobs of a scene."""
 
     halves: HalvesTest
@@ -34,7 +34,7 @@ class Tally:
     hit_pixels: int = 0  # first hits, of all views
     back_facing_pixels: int = 0  # of these, seen from behind
 
-    def add(self, other: Tally) -> None:
+    def add(self, other: CheckTotals) -> None:
         """Add the totals of other jobs of the scene."""
         self.halves.merge(other.halves)
         self.fingerprints.merge(other.fingerprints)
@@ -49,7 +49,7 @@ class ContentCheck:
         self._spec = spec
         self._rays: NDArray[np.float32] | None = None
 
-    def radiance(self, row: int, halves: NDArray[Any], tally: Tally) -> Iterator[tuple[Cause, str]]:
+    def radiance(self, row: int, halves: NDArray[Any], tally: CheckTotals) -> Iterator[tuple[Cause, str]]:
         """Check the halves of a sample, (2, H, W, 3) finite, scaled as they are stored."""
         tally.samples += 1
         tally.halves.add(halves)
@@ -63,7 +63,7 @@ class ContentCheck:
             yield Cause.EQUAL_HALVES, "A = B in every pixel"
 
     def view(
-        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: Tally
+        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: CheckTotals
     ) -> Iterator[tuple[Cause, str]]:
         """Check the buffers of a view: depth (H, W), normals (H, W, 3) as modelled.
 

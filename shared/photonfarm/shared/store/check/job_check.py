@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.check.content_check import ContentCheck, Tally, is_finite
+from photonfarm.shared.store.check.content_check import CheckTotals, ContentCheck, is_finite
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import Storage
@@ -86,7 +86,7 @@ class JobCheck:
         self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
         self._contents = ContentCheck(scene.spec)
 
-    def run(self, job: int, tally: Tally) -> tuple[list[Finding], bytes]:
+    def run(self, job: int, tally: CheckTotals) -> tuple[list[Finding], bytes]:
         """The findings of a job, and its marker; nothing if the marker is removed in the meantime.
 
         The totals of the job are added to `tally`.

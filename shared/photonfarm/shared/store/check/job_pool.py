@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from photonfarm.shared.core.processes import usable_cores
-from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.halves import HalvesTest
 from photonfarm.shared.store.check.job_check import Checked, JobCheck
 from photonfarm.shared.store.io.storage import renew_copy
@@ -23,7 +23,7 @@ class JobPool:
     """Threads that check jobs, each with memory of its own; a context manager."""
 
     def __init__(self, scene: Checked, scenes: int) -> None:
-        self.tallies: list[Tally] = []
+        self.tallies: list[CheckTotals] = []
         self._own = threading.local()
         self._scene = scene
         self._scenes = scenes
@@ -58,7 +58,7 @@ class _Checker:
     """Checks jobs of a scene one after the other; tells damage of the store from that of this machine's copies."""
 
     def __init__(self, scene: Checked, scenes: int) -> None:
-        self.tally = Tally(HalvesTest(scenes))
+        self.tally = CheckTotals(HalvesTest(scenes))
         self._scene = scene
         self._scenes = scenes
         self._check = JobCheck(scene)
@@ -71,8 +71,8 @@ class _Checker:
         self.tally.add(tally)
         return found, marker
 
-    def _run(self, job: int) -> tuple[list[Finding], bytes, Tally]:
-        tally = Tally(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
+    def _run(self, job: int) -> tuple[list[Finding], bytes, CheckTotals]:
+        tally = CheckTotals(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
         return *self._check.run(job, tally), tally
 
     def _renewed(self, found: list[Finding]) -> bool:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.keys import seed_of
-from photonfarm.shared.store.check.content_check import Tally, is_constant
+from photonfarm.shared.store.check.content_check import CheckTotals, is_constant
 from photonfarm.shared.store.check.job_check import Checked
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.format.shards import Shard
@@ -24,7 +24,7 @@ DRAWN = 4
 """The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""
 
 
-def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
+def equal_samples(scene: Checked, tally: CheckTotals) -> Iterator[Finding]:
     """Samples that have a half in common. Constant halves may rightly be equal: there is no noise in them."""
     for rows in tally.fingerprints.suspects():
         read = ((row, halves) for row in rows if (halves := _halves(scene, row)) is not None)

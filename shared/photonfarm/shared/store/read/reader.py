@@ -37,7 +37,7 @@ from photonfarm.shared.store.write.store import check_format
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sample:
+class StoredSample:
     """One complete sample, as the trainer uses it."""
 
     row: int
@@ -187,7 +187,7 @@ class SceneReader:
                     self._read_into(name, row, memory[place])
         return batch
 
-    def read(self, row: int) -> Sample:
+    def read(self, row: int) -> StoredSample:
         """Read one complete sample; raises CorruptError if its bytes are not what was committed."""
         batch = self.read_batch([row])
         buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
@@ -195,7 +195,7 @@ class SceneReader:
         known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
         guides = Guides(**known) if known else None
         seen = ViewBuffers(**buffers), batch.visibility(0)
-        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_, guides)
+        sample = StoredSample(row, modification, view, batch.linear(0), *seen, pass_, guides)
         if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
             raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
         return sample

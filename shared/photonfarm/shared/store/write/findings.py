@@ -128,7 +128,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class FindingGroup:
     """All findings of one cause."""
 
     cause: Cause
@@ -156,9 +156,11 @@ class Findings:
         """The first findings of a cause."""
         return self._first.get(cause, [])
 
-    def groups(self) -> tuple[Group, ...]:
+    def groups(self) -> tuple[FindingGroup, ...]:
         """All findings, by cause."""
-        return tuple(Group(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause])
+        return tuple(
+            FindingGroup(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause]
+        )
 
 
 def _keep(kept: list[Finding], finding: Finding, most: int) -> None:

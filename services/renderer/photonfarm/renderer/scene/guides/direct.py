@@ -18,7 +18,7 @@ from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted
-from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.shared.core.keys import Key, Stream
 from photonfarm.shared.core.records import F32
@@ -107,11 +107,11 @@ class _Surface:
     direction: Any  # Vector3f: of that ray
     diffuse: Any  # Bool: its diffuse lobe reflects
     other: Any  # Bool: it has other lobes
-    settings: Settings
+    settings: GuideSettings
 
 
 def lit(
-    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: Settings
+    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: GuideSettings
 ) -> Arrives:
     """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
     nothing = Arrives(mi.Color3f(0), mi.Color3f(0))

@@ -15,7 +15,7 @@ from photonfarm.renderer.bdpt.emission import read_lights
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import GRID, RAYS
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, pattern_of
-from photonfarm.renderer.scene.guides.settings import FOLLOWED, NO_LIMIT, Settings
+from photonfarm.renderer.scene.guides.settings import FOLLOWED, NO_LIMIT, GuideSettings
 from photonfarm.renderer.scene.guides.specular_paths import trace
 from photonfarm.renderer.scene.materials import Materials
 from photonfarm.shared.core.keys import Key, Stream
@@ -65,7 +65,7 @@ def _traced(
     near, far = spec.view.near / along, spec.view.far / along
     rays = points(camera.origin + directions * near[:, None]), mi.Vector3f(points(directions)), floats(far - near)
     lights = read_lights(scene) if scene.emitters() else None
-    settings = Settings(
+    settings = GuideSettings(
         spec.guides.light_samples if lights is not None else 0,
         FOLLOWED if materials.has_pure_deltas else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,

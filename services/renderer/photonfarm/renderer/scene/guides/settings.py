@@ -12,7 +12,7 @@ NO_LIMIT = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class GuideSettings:
     """The numbers that a kernel is compiled for."""
 
     light_samples: int  # of each ray

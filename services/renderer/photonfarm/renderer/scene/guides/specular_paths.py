@@ -12,14 +12,14 @@ from photonfarm.renderer.bdpt.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.guides.direct import Seen, lit, turned
-from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.guides.specular import specular_of
 from photonfarm.renderer.scene.materials import is_pure_delta
 
 
 def trace(
     scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
-    settings: Settings,
+    settings: GuideSettings,
 ) -> dict[str, Any]:  # fmt: skip
     """The quantities that `images` averages, by name, for each ray; zeros where there is nothing.
 
@@ -66,7 +66,7 @@ class _Path:
     followed: Any  # UInt32: surfaces passed on the way
 
 
-def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings) -> tuple[_Path, Any]:
+def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
     """The path of each ray, which meets `first`, to a surface that is no pure mirror, glass or null; that surface."""
     active = dr.full(mi.Bool, True, dr.width(ray))
     start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
@@ -84,7 +84,7 @@ def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings)
     return path, dr.select(led_on, scene.ray_intersect(path.ray, active=led_on), first)
 
 
-def _follow(scene: Any, s: _Path, si: Any, settings: Settings) -> _Path:
+def _follow(scene: Any, s: _Path, si: Any, settings: GuideSettings) -> _Path:
     """Process one surface `si` on the way: its emission, and the ray that leaves it if it has delta lobes alone.
 
     Sampled at 1/2, glass gives the lobe that takes more than half of the light, with a probability equal to its share.

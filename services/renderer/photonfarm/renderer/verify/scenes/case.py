@@ -19,7 +19,7 @@ Images = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class BdptSettings:
     """Technique counts of `bdpt`."""
 
     connections: int
@@ -29,11 +29,11 @@ class Settings:
         return f"{self.connections},{self.light_ratio:g}"
 
 
-FIRST = Settings(1, 1.0)
+FIRST = BdptSettings(1, 1.0)
 """The settings of the quick version."""
-ALL = (FIRST, Settings(0, 0.0), Settings(0, 1.0), Settings(4, 0.25), Settings(1, 1.5))
+ALL = (FIRST, BdptSettings(0, 0.0), BdptSettings(0, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.5))
 """The settings of the long version; each is complete if paths from the eye find everything."""
-EYE_ALONE = (Settings(0, 0.0),)
+EYE_ALONE = (BdptSettings(0, 0.0),)
 """A path tracer, for scenes in which nothing can be done from the light side."""
 WITH_LIGHT_PATHS = tuple(settings for settings in ALL if settings.light_ratio > 0)
 """The settings that are complete also if light must be followed from its source."""
@@ -74,8 +74,8 @@ class HardScene:
     truth: Truth
     max_depth: int = 6
     rr_depth: int = 5
-    settings: tuple[Settings, ...] = ALL
-    quick_settings: tuple[Settings, ...] = (FIRST,)  # some of them
+    settings: tuple[BdptSettings, ...] = ALL
+    quick_settings: tuple[BdptSettings, ...] = (FIRST,)  # some of them
     quick: Effort | None = QUICK  # None: the long version only
     long: Effort = LONG
     edit: Callable[[Any], None] | None = None  # changes the loaded scene in place before it is rendered
@@ -95,8 +95,8 @@ class Refusal:
     name: str
     build: Callable[[int], Scene]
     sentence: str  # a part of the required message
-    settings: Settings = FIRST
-    allowed: Settings | None = None  # settings with which it is rendered nevertheless
+    settings: BdptSettings = FIRST
+    allowed: BdptSettings | None = None  # settings with which it is rendered nevertheless
 
     @property
     def label(self) -> str:

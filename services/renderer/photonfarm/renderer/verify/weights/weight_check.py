@@ -11,7 +11,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt.emission import read_lights
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import Scene, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, Scene
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
@@ -76,7 +76,7 @@ LONG_SCENES = {**SCENES, **{name.replace("_", "-"): build for name, build in har
 
 
 @dataclass(slots=True)
-class Comparison:
+class WeightComparison:
     """The errors of the weights in one scene."""
 
     paths: int = 0
@@ -98,12 +98,14 @@ class Comparison:
         )
 
 
-def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0) -> Comparison:
+def compare_weights(
+    build: Callable[[int], Scene], settings: BdptSettings, *, lanes: int, seed: int = 0
+) -> WeightComparison:
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     count = connection_count(settings.connections, EDGES)
-    result = Comparison()
+    result = WeightComparison()
     for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
         complete = np.array(joined.complete)
         if not complete.any():

@@ -25,7 +25,7 @@ from photonfarm.trainer.networks.inputs import POINTS_ONLY
 from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.settings import preset
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 HOLD_OUT = 0.5
 SIZE = 16
@@ -63,7 +63,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stop = Stop()
         if name == "cut":
             stop.set()
-        train(StoreSource(store.root, spec.scene_id), settings, folder / "runs" / name, stop=stop)
+        train(StoreSource(store.root, spec.scene_id), settings, folder / "runs" / name, Hooks(stop=stop))
     return folder.parent
 
 

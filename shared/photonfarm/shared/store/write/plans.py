@@ -81,7 +81,7 @@ class StoredPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class PlanAttributes:
     """The attributes of a plan's group."""
 
     request: Request | TopUp
@@ -211,10 +211,10 @@ def check_version(attributes: Mapping[str, Any], where: str) -> None:
     declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
 
 
-def about_plan(attributes: dict[str, Any]) -> About:
+def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
     """Read the attributes of a plan's group; raises ValueError or KeyError."""
     request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
-    return About(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
+    return PlanAttributes(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

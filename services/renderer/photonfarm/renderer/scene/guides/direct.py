@@ -86,14 +86,14 @@ class _Sum:
 
 
 @dataclass(slots=True)
-class Arrives:
+class ReflectedLight:
     """Reflected direct light."""
 
     diffuse: Any  # Color3f: by a white diffuse surface
     whole: Any  # Color3f: by the surface as it is
 
-    def __add__(self, more: Arrives) -> Arrives:
-        return Arrives(self.diffuse + more.diffuse, self.whole + more.whole)
+    def __add__(self, more: ReflectedLight) -> ReflectedLight:
+        return ReflectedLight(self.diffuse + more.diffuse, self.whole + more.whole)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +112,9 @@ class _Surface:
 
 def lit(
     scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: GuideSettings
-) -> Arrives:
+) -> ReflectedLight:
     """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
-    nothing = Arrives(mi.Color3f(0), mi.Color3f(0))
+    nothing = ReflectedLight(mi.Color3f(0), mi.Color3f(0))
     if lights is None or not settings.light_samples:
         return nothing
     flags = si.bsdf().flags()
@@ -127,7 +127,7 @@ def lit(
     return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
 
 
-def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
     count = at.settings.light_samples
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
@@ -153,10 +153,10 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     )
     diffuse = sums.diffuse / count
     of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
-    return Arrives(diffuse, sums.whole / count + of_diffuse)
+    return ReflectedLight(diffuse, sums.whole / count + of_diffuse)
 
 
-def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
     u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
@@ -167,7 +167,7 @@ def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
     emitted = emitter.eval(found, at.other)
-    return Arrives(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+    return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
 
 
 def turned(normal: Any, direction: Any) -> Any:

@@ -68,7 +68,7 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class RayArrival:
     """How rays reached a surface."""
 
     met: Any  # Bool: there is a surface
@@ -111,7 +111,7 @@ class _Surface:
 
 
 def lit(
-    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: GuideSettings
+    scene: Any, lights: Lights | None, si: Any, seen: RayArrival, pattern: Any, shift: Any, settings: GuideSettings
 ) -> ReflectedLight:
     """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
     nothing = ReflectedLight(mi.Color3f(0), mi.Color3f(0))

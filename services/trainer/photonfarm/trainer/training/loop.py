@@ -29,7 +29,7 @@ from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, waits
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
-from photonfarm.trainer.training.validation import Best, Comparison, Show, Validation, compared, validate
+from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 
 T = TypeVar("T")
 
@@ -122,7 +122,7 @@ class Session:
         self._log = MetricsLog(around.run / METRICS, around.listen)
         self._learner = Learner(feed, settings, around.group)
         self._good = GoodState(self._learner)
-        self._best: Best | None = None
+        self._best: BestValidation | None = None
         self._following = Following(feed, settings, around.script, around.group)
         self._step = 0
         self._last_error: float | None = None
@@ -177,7 +177,7 @@ class Session:
         settle(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
         if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
-            self._best = Best.of(recovery["best"])
+            self._best = BestValidation.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
         self._seconds_told = dict(state["seconds"])
@@ -290,7 +290,7 @@ class Session:
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
         if self._compared.is_best:
-            self._best = Best(now.step, now.errors, now.by_shown)
+            self._best = BestValidation(now.step, now.errors, now.by_shown)
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""

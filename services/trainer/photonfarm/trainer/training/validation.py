@@ -77,7 +77,7 @@ def validate(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Best:
+class BestValidation:
     """The best validation of a run so far."""
 
     step: int
@@ -135,7 +135,7 @@ class Comparison:
         return {name: error if math.isfinite(error) else None for name, error in errors.items()}
 
 
-def compared(now: Validation, best: Best | None) -> Comparison:
+def compared(now: Validation, best: BestValidation | None) -> Comparison:
     """Compare a validation with the best one; with itself if there is none of the same rows and the same error.
 
     The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows

@@ -23,7 +23,7 @@ from photonfarm.shared.core.errors import CorruptError, SpecError
 from photonfarm.shared.plan.request import UNUSED, PlannedRows
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.format.declarations import Declared
+from photonfarm.shared.store.format.declarations import ArrayDeclaration
 from photonfarm.shared.store.io.storage import Storage, read_or_none
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Finding
@@ -116,7 +116,7 @@ class PlanRepair:
             raise self._hopeless(folder, "too little of it can be read to tell that its request gives the same")
 
     def _intact_chunks(
-        self, folder: str, declared: Declared, values: NDArray[Any]
+        self, folder: str, declared: ArrayDeclaration, values: NDArray[Any]
     ) -> Iterator[tuple[int, NDArray[Any]]]:
         """The chunks that are whole by their checksum, each with its first row; read without the array's zarr.json."""
         length = min(max(len(values), 1), schema.INPUT_ROWS_PER_CHUNK)

@@ -24,7 +24,7 @@ from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
-from photonfarm.renderer.worker.heartbeat import Heart
+from photonfarm.renderer.worker.heartbeat import HeartbeatThread
 from photonfarm.renderer.worker.log import JobCounts, Talk
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
@@ -111,7 +111,7 @@ class RenderWorker(SimpleWorker):
         self._failed = False  # the job in hand
         self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
-        self._heart = Heart(settings, store, words)
+        self._heart = HeartbeatThread(settings, store, words)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None

@@ -25,7 +25,7 @@ from rq.worker.base import StopRequested, WorkerStatus
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
 from photonfarm.renderer.worker.heartbeat import HeartbeatThread
-from photonfarm.renderer.worker.log import JobCounts, Talk
+from photonfarm.renderer.worker.log import JobCounts, WorkerLog
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import (
@@ -118,7 +118,7 @@ class RenderWorker(SimpleWorker):
             if settings.ahead is None
             else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
         )
-        self._talk = Talk(settings)
+        self._talk = WorkerLog(settings)
         self._words = words
         self._tally = JobCounts()
 

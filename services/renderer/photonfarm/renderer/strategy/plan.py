@@ -9,7 +9,7 @@ from typing import Any
 
 from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.choices import Offer, offers, settled
+from photonfarm.renderer.strategy.choices import CandidateAtCost, offers, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Measurement, Talk, measure, present
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
@@ -36,7 +36,7 @@ class Plan:
     half_spp: int  # of about the cost of the spec's settings now
     photons: PhotonSpec
     photons_reason: str
-    offers: Mapping[Candidate, Offer]  # all measured candidates, at that cost; empty if every view is black
+    offers: Mapping[Candidate, CandidateAtCost]  # all measured candidates, at that cost; empty if every view is black
     halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from photonfarm.renderer.strategy.candidate import Candidate
-from photonfarm.renderer.strategy.choices import Offer, best
+from photonfarm.renderer.strategy.choices import CandidateAtCost, best
 from photonfarm.renderer.strategy.comparison import CLEAR, WORTHWHILE, saving
 from photonfarm.renderer.strategy.measurement import present
 from photonfarm.renderer.strategy.output.table import legend, table
@@ -53,7 +53,7 @@ def _verdict(plan: Plan) -> str:
 _NO_GAIN = "no significant gain over the spec's settings"
 
 
-def _fitting(plan: Plan) -> dict[Candidate, Offer]:
+def _fitting(plan: Plan) -> dict[Candidate, CandidateAtCost]:
     return {c: offer for c, offer in plan.offers.items() if offer.fits}
 
 

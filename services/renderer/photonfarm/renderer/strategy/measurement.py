@@ -13,7 +13,7 @@ from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
 from photonfarm.renderer.strategy.comparison import Errors, Measured
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
-from photonfarm.renderer.strategy.pilot_scene import SEED, Stage
+from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.scene.spec import Film, Frozen, SceneSpec
 
@@ -109,7 +109,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     """
     begun = time.process_time()
     talk(f"loading {spec.name}")
-    stage = Stage(spec, beside)
+    stage = PilotScene(spec, beside)
     found = content.read(stage.loaded.scene, stage.camera())
     reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
@@ -135,14 +135,16 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     )
 
 
-def _compare(stage: Stage, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk) -> _Compared:
+def _compare(
+    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk
+) -> _Compared:
     spec = stage.spec
     now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
     costs = time_images(stage.renders(1)[0], candidates, half_spp, TIMING * seconds, stage.clock)
     half_s = costs[now].time_s(half_spp)
     film, spp, views = _pilot_film(spec, costs, left_s)
     if film != spec.film:
-        stage = Stage(spec.model_copy(update={"film": film}), beside)
+        stage = PilotScene(spec.model_copy(update={"film": film}), beside)
     talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
     pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
     choice = pilot.choose(

@@ -16,7 +16,7 @@ from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E40
 from photonfarm.renderer.strategy.comparison import Errors  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, CandidateRow, Measurement  # noqa: E402
 from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
-from photonfarm.renderer.strategy.plan import Plan, _knows, plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
 from photonfarm.shared.cli.main import main  # noqa: E402
 from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
@@ -67,7 +67,7 @@ def measurement(*rows: CandidateRow) -> Measurement:
     )  # fmt: skip
 
 
-def text_of(found: Plan) -> str:
+def text_of(found: TransportPlan) -> str:
     return "\n".join(lines(found))
 
 

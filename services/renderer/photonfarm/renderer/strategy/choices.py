@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import Measured, saving
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, saving
 from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement
 from photonfarm.renderer.strategy.pilot import longest
 
 
 @dataclass(frozen=True, slots=True)
-class CandidateAtCost(Measured):
+class CandidateAtCost(MeasuredCandidate):
     """A candidate at the samples per pixel that fit the time; `time_s` is that of such a half-estimate."""
 
     half_spp: int

@@ -67,7 +67,7 @@ def _standard_error(residuals: NDArray[np.float64]) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredCandidate:
     """The measurement of one candidate."""
 
     candidate: Candidate
@@ -104,13 +104,13 @@ class Saving:
         return self.factor >= 1 + WORTHWHILE and self.deviations >= CLEAR
 
 
-def saving(one: Measured, over: Measured) -> Saving:
+def saving(one: MeasuredCandidate, over: MeasuredCandidate) -> Saving:
     """The saving of one candidate over another, both at their cost."""
     factor = over.relative_cost / one.relative_cost
     relative = over.errors.relative_spread(one.errors)
     return Saving(over.candidate, factor, None if relative is None else factor * relative)
 
 
-def is_alike(one: Measured, other: Measured) -> bool:
+def is_alike(one: MeasuredCandidate, other: MeasuredCandidate) -> bool:
     """Whether the difference of two candidates is not significant."""
     return abs(saving(one, other).deviations) < CLEAR

@@ -11,7 +11,7 @@ import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.comparison import Errors, MeasuredCandidate
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
 from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
@@ -43,12 +43,12 @@ Talk = Callable[[str], None]
 
 
 class CandidateRow(Frozen):
-    """One candidate: the values of `Measured`, and the two parts of its time."""
+    """One candidate: the values of `MeasuredCandidate`, and the two parts of its time."""
 
     connections: int
     light_ratio: float
     errors: Errors  # of images of `Measurement.spp`
-    missed: float  # as in `Measured`
+    missed: float  # as in `MeasuredCandidate`
     fixed_s: float  # as in `ImageCost`, on the spec's film
     sample_s: float
 
@@ -189,7 +189,7 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
+def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
     """The cost that was timed beforehand, corrected by the many images of the pilot.
 
     If the pilot's images have far fewer samples, they are not used: their fixed part hides the time of their samples.

@@ -5,13 +5,13 @@ import math
 import pytest
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, MeasuredCandidate, is_alike, saving
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors, is_alike, saving
 
 
 def measured(
     own: tuple[float, ...], plain: tuple[float, ...], images: int = 12, time: float = 1.0
 ) -> MeasuredCandidate:
-    errors = Errors(images=images, own=own, plain=plain)
+    errors = RelativeErrors(images=images, own=own, plain=plain)
     return MeasuredCandidate(Candidate(0, 1.0), errors, 0.0, 1.0, errors.ratio * time, None)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, MeasuredCandidate
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
 from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
@@ -47,7 +47,7 @@ class CandidateRow(Frozen):
 
     connections: int
     light_ratio: float
-    errors: Errors  # of images of `Measurement.spp`
+    errors: RelativeErrors  # of images of `Measurement.spp`
     missed: float  # as in `MeasuredCandidate`
     fixed_s: float  # as in `ImageCost`, on the spec's film
     sample_s: float

@@ -17,7 +17,7 @@ from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.predict.untrained import Untrained
-from photonfarm.trainer.report.baselines import Gauges
+from photonfarm.trainer.report.baselines import Baselines
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
 from photonfarm.trainer.report.machine import Machine
@@ -44,7 +44,7 @@ class Contents:
 
     card: DatasetCard
     stories: tuple[RunStory, ...]
-    gauges: Gauges
+    gauges: Baselines
     evaluation: Evaluation
     entries: tuple[Entry, ...]
     costs: FrameCosts | None
@@ -108,7 +108,7 @@ def gathered(
     return Contents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        gauges=Gauges.of(StoreSource(store, first.scene_id), first, evaluation.measured),
+        gauges=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,

@@ -39,7 +39,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contents:
+class ReportContents:
     """A report: the data, the runs, the errors of their networks, and the worst cases of the first one."""
 
     card: DatasetCard
@@ -92,7 +92,7 @@ def gathered(
     device: str = "auto",
     tell: Tell | None = None,
     timed: bool = True,
-) -> Contents:
+) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
@@ -105,7 +105,7 @@ def gathered(
     costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
-    return Contents(
+    return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
         gauges=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),

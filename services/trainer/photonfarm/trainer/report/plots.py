@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.report.contents import Contents, Entry
+from photonfarm.trainer.report.contents import Entry, ReportContents
 from photonfarm.trainer.report.trained_runs import Point, RunStory
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
     return [each for each in found if each[2]]
 
 
-def plots(contents: Contents) -> list[Plot]:
+def plots(contents: ReportContents) -> list[Plot]:
     """Learning curves, then each metric over the time of a frame if that is known."""
     return [*_curves(contents), *_over_time(contents)]
 
@@ -88,7 +88,7 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
 # -------------------------------------------------------------------------------------------------------------- curves
 
 
-def _curves(contents: Contents) -> Iterator[Plot]:
+def _curves(contents: ReportContents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
     axes: tuple[tuple[str, str, Callable[[RunStory, Point], float]], ...] = (
@@ -106,7 +106,7 @@ def _curves(contents: Contents) -> Iterator[Plot]:
         yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
-def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float], label: str) -> None:
+def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, Point], float], label: str) -> None:
     for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
         places = [(x(story, point), point.error) for point in shown]
@@ -181,7 +181,7 @@ class Placed:
     value: Estimate
 
 
-def _over_time(contents: Contents) -> Iterator[Plot]:
+def _over_time(contents: ReportContents) -> Iterator[Plot]:
     for measure in measures():
         points = [
             Placed(1e3 * entry.time.total, entry.name, _group(entry), colour, value)

@@ -28,7 +28,7 @@ from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entry:
+class ReportEntry:
     """A row of the report's tables."""
 
     name: str
@@ -46,7 +46,7 @@ class ReportContents:
     stories: tuple[RunStory, ...]
     gauges: Baselines
     evaluation: Evaluation
-    entries: tuple[Entry, ...]
+    entries: tuple[ReportEntry, ...]
     costs: FrameCosts | None
     untimed: str  # why there are no costs
     machine: Machine  # on which times were taken
@@ -54,7 +54,7 @@ class ReportContents:
     published: str | None  # the name of the paper's table beside ours
 
     @property
-    def measure(self) -> Entry:
+    def measure(self) -> ReportEntry:
         """The entry that ratios of times refer to: light_transport, or else the first."""
         return next((entry for entry in self.entries if entry.architecture == "light_transport"), self.entries[0])
 
@@ -125,7 +125,7 @@ def _entries(
     measured: tuple[Sequence[TrainedRun], Sequence[tuple[UntrainedDenoiser, int]]],
     costs: FrameCosts | None,
     table: Mapping[str, Published],
-) -> list[Entry]:
+) -> list[ReportEntry]:
     runs, denoisers = measured
     untrained = [Untrained(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
     predictors: list[TrainedRun | Untrained] = [*runs, *untrained]
@@ -135,7 +135,7 @@ def _entries(
         if isinstance(predictor, TrainedRun):
             name, architecture = names[place], predictor.settings.network.architecture
         time = None if costs is None else frame_time(predictor, row.seconds, costs)
-        entries.append(Entry(name, architecture, row, time, table.get(architecture or "")))
+        entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return entries
 
 

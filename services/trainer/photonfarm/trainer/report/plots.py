@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.report.contents import Entry, ReportContents
+from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 from photonfarm.trainer.report.trained_runs import Point, RunStory
 
 if TYPE_CHECKING:
@@ -140,23 +140,23 @@ class Measure:
 
     name: str
     title: str
-    of: Callable[[Entry], Estimate | None]
+    of: Callable[[ReportEntry], Estimate | None]
 
 
 def measures() -> list[Measure]:
     """The metrics of Fig. 5, and further ones of ours."""
 
     def feature(block: int) -> Measure:
-        def value(entry: Entry) -> Estimate | None:
+        def value(entry: ReportEntry) -> Estimate | None:
             found = entry.row.metrics
             return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate
 
         return Measure(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
 
-    def of(field: str) -> Callable[[Entry], Estimate | None]:
+    def of(field: str) -> Callable[[ReportEntry], Estimate | None]:
         return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate
 
-    def fid(entry: Entry) -> Estimate | None:
+    def fid(entry: ReportEntry) -> Estimate | None:
         found = entry.row.metrics
         return None if found is None or found.fid is None else Estimate(found.fid.value, None, found.fid.predictions)
 
@@ -203,7 +203,7 @@ OF_TIME = (
 )
 
 
-def _group(entry: Entry) -> str:
+def _group(entry: ReportEntry) -> str:
     networks, trained, untrained = GROUPS
     if not entry.row.kept:
         return networks

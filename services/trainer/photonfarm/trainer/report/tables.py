@@ -10,7 +10,7 @@ from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
-from photonfarm.trainer.report.contents import Entry, ReportContents
+from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 from photonfarm.trainer.report.plots import measures
 
 
@@ -157,7 +157,7 @@ def _of_paper(contents: ReportContents) -> str:
     )
 
 
-def _paper_row(contents: ReportContents, entry: Entry, *, beside: bool) -> tuple[str, ...]:
+def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
     metrics, paper, unit = entry.row.metrics, entry.published, contents.measure
     headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[HEADLINE_BLOCK].estimate
     cells = [
@@ -176,11 +176,11 @@ def _paper_row(contents: ReportContents, entry: Entry, *, beside: bool) -> tuple
     return tuple(row)
 
 
-def _ratio(entry: Entry, unit: Entry) -> str:
+def _ratio(entry: ReportEntry, unit: ReportEntry) -> str:
     return NOT_AVAILABLE if entry.time is None or unit.time is None else f"{entry.time.total / unit.time.total:.2f}"
 
 
-def _published_ratio(entry: Entry, unit: Entry) -> str:
+def _published_ratio(entry: ReportEntry, unit: ReportEntry) -> str:
     if entry.published is None or unit.published is None:
         return ""
     return f"{entry.published.seconds / unit.published.seconds:.2f}"

@@ -135,7 +135,7 @@ def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 @dataclass(frozen=True, slots=True)
-class Measure:
+class PlottedMetric:
     """A metric of the tables."""
 
     name: str
@@ -143,15 +143,15 @@ class Measure:
     of: Callable[[ReportEntry], Estimate | None]
 
 
-def measures() -> list[Measure]:
+def measures() -> list[PlottedMetric]:
     """The metrics of Fig. 5, and further ones of ours."""
 
-    def feature(block: int) -> Measure:
+    def feature(block: int) -> PlottedMetric:
         def value(entry: ReportEntry) -> Estimate | None:
             found = entry.row.metrics
             return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate
 
-        return Measure(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
+        return PlottedMetric(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
 
     def of(field: str) -> Callable[[ReportEntry], Estimate | None]:
         return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate
@@ -161,12 +161,12 @@ def measures() -> list[Measure]:
         return None if found is None or found.fid is None else Estimate(found.fid.value, None, found.fid.predictions)
 
     return [
-        Measure("mse", "MSE", of("mse")),
-        Measure(MSSIM, "MSSIM", of("mssim")),
-        Measure("fid", "FID", fid),
+        PlottedMetric("mse", "MSE", of("mse")),
+        PlottedMetric(MSSIM, "MSSIM", of("mssim")),
+        PlottedMetric("fid", "FID", fid),
         *(feature(block) for block in range(4)),
-        Measure(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
-        Measure("flip", "FLIP", of("flip")),
+        PlottedMetric(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
+        PlottedMetric("flip", "FLIP", of("flip")),
     ]
 
 
@@ -210,7 +210,7 @@ def _group(entry: ReportEntry) -> str:
     return untrained if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: Measure, points: Sequence[Placed]) -> None:
+def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[Placed]) -> None:
     least = min(point.value.mean for point in points)
     logarithmic = measure.name not in (MSSIM, KID) and least > 0
     floor = least / 2 if logarithmic else -math.inf

@@ -171,7 +171,7 @@ def measures() -> list[PlottedMetric]:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PlottedPredictor:
     """A predictor in a plot over the time of a frame."""
 
     milliseconds: float
@@ -184,7 +184,7 @@ class Placed:
 def _over_time(contents: ReportContents) -> Iterator[Plot]:
     for measure in measures():
         points = [
-            Placed(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
+            PlottedPredictor(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
             for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
             if entry.time is not None and (value := measure.of(entry)) is not None
         ]
@@ -210,7 +210,7 @@ def _group(entry: ReportEntry) -> str:
     return untrained if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[Placed]) -> None:
+def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[PlottedPredictor]) -> None:
     least = min(point.value.mean for point in points)
     logarithmic = measure.name not in (MSSIM, KID) and least > 0
     floor = least / 2 if logarithmic else -math.inf

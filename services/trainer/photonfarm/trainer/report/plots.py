@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
-from photonfarm.trainer.report.trained_runs import Point, RunStory
+from photonfarm.trainer.report.trained_runs import CurvePoint, RunStory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,7 +91,7 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
 def _curves(contents: ReportContents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
-    axes: tuple[tuple[str, str, Callable[[RunStory, Point], float]], ...] = (
+    axes: tuple[tuple[str, str, Callable[[RunStory, CurvePoint], float]], ...] = (
         ("samples", "samples drawn, repeats counted", lambda _, point: point.draws),
         ("rendering", "core-seconds of rendering", lambda _, point: point.core_s(per_sample)),
         (
@@ -106,7 +106,7 @@ def _curves(contents: ReportContents) -> Iterator[Plot]:
         yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
-def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, Point], float], label: str) -> None:
+def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoint], float], label: str) -> None:
     for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
         places = [(x(story, point), point.error) for point in shown]

@@ -60,7 +60,7 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class SessionContext:
     """The environment of a session of training; `train` describes its parts."""
 
     run: Path
@@ -109,14 +109,14 @@ def train(
                 return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
         watch.turn("start")
         with Feed(source, settings, clock) as feed:
-            around = Surroundings(run, watch, stop, group, script, listen, count, show)
+            around = SessionContext(run, watch, stop, group, script, listen, count, show)
             return Session(feed, settings, around).run()
 
 
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, around: Surroundings) -> None:
+    def __init__(self, feed: Feed, settings: TrainSettings, around: SessionContext) -> None:
         self._feed, self._settings, self._around = feed, settings, around
         self._run, self._watch, self._stop = around.run, around.watch, around.stop
         self._log = MetricsLog(around.run / METRICS, around.listen)

@@ -38,7 +38,7 @@ NAP_SECONDS = 0.05  # between looks at the feed while there is nothing to train 
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
@@ -86,7 +86,7 @@ def train(
     waited: float = 0.0,
     group: TrainingGroup = ALONE,
     show: Show | None = None,
-) -> Outcome:
+) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
@@ -106,7 +106,7 @@ def train(
     with held(run):
         while not source.ready():
             if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
-                return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
+                return TrainingOutcome(0, "stopped" if stop.is_set() else "seconds", None)
         watch.turn("start")
         with Feed(source, settings, clock) as feed:
             around = SessionContext(run, watch, stop, group, script, listen, count, show)
@@ -130,7 +130,7 @@ class Session:
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
         self._seconds_told: dict[str, float] = {}  # at the last validation
 
-    def run(self) -> Outcome:
+    def run(self) -> TrainingOutcome:
         """Train until something ends it."""
         self._begin()
         self._watch.turn("other")
@@ -147,7 +147,7 @@ class Session:
             self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
-        return Outcome(self._step, reason, self._last_error)
+        return TrainingOutcome(self._step, reason, self._last_error)
 
     def _begin(self) -> None:
         path = self._run / CHECKPOINT

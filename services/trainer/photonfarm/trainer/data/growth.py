@@ -40,7 +40,7 @@ class Growth:
         return self.log[place - 1][1] if place else 0
 
 
-class Following:
+class BatchStream:
     """Draws batches ahead of training, while they are being read. A `script` repeats the growth of an earlier run."""
 
     def __init__(

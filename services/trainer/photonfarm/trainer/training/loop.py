@@ -18,7 +18,7 @@ from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.processes import Stop
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.growth import Following, Growth
+from photonfarm.trainer.data.growth import BatchStream, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
@@ -123,7 +123,7 @@ class Session:
         self._learner = Learner(feed, settings, around.group)
         self._good = GoodState(self._learner)
         self._best: BestValidation | None = None
-        self._following = Following(feed, settings, around.script, around.group)
+        self._following = BatchStream(feed, settings, around.script, around.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation

@@ -46,7 +46,7 @@ from photonfarm.trainer.predict.evaluation import (
     measure,
 )
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.runs.device import described, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
@@ -177,7 +177,7 @@ def compare(
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found and not without_inception else None
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
-    untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    untrained = [UntrainedPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     leading, *others = test.timed([*runs, *untrained])
     first_of_all = test.measured(leading)
     if choose:
@@ -244,7 +244,7 @@ class _Watched:
 class _Timed:
     """A loaded predictor, and the time it takes for one image."""
 
-    predictor: TrainedRun | Untrained
+    predictor: TrainedRun | UntrainedPredictor
     predict: DevicePredictor
     seconds: Seconds
 
@@ -278,13 +278,13 @@ class _Test:
     tell: Tell
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def timed(self, predictors: Sequence[TrainedRun | Untrained]) -> list[_Timed]:
+    def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:
         """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
         ready = zip(predictors, calls, by_turns(calls), strict=True)
         return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
 
-    def _call(self, predictor: TrainedRun | Untrained) -> tuple[DevicePredictor, Inputs]:
+    def _call(self, predictor: TrainedRun | UntrainedPredictor) -> tuple[DevicePredictor, Inputs]:
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
             for batch in batches(feed, self.samples.rows, 1):
@@ -302,7 +302,7 @@ class _Test:
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
         return _Measured(timed, held_out, metrics, watched.images)
 
-    def _feed(self, predictor: TrainedRun | Untrained, *, batch: int) -> Feed:
+    def _feed(self, predictor: TrainedRun | UntrainedPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
         source = StoreSource(self.store, self.samples.source.spec.scene_id)
         return Feed(source, settings, needs=predictor.needs)

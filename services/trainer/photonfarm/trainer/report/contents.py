@@ -16,7 +16,7 @@ from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report.baselines import Baselines
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
@@ -127,8 +127,8 @@ def _entries(
     table: Mapping[str, Published],
 ) -> list[ReportEntry]:
     runs, denoisers = measured
-    untrained = [Untrained(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | Untrained] = [*runs, *untrained]
+    untrained = [UntrainedPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
+    predictors: list[TrainedRun | UntrainedPredictor] = [*runs, *untrained]
     entries = []
     for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
         name, architecture = row.name, None

@@ -21,7 +21,7 @@ from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
@@ -169,7 +169,7 @@ def compare(
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
-    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    samples = HeldOutSamples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
         kept_count(spec, kept)
@@ -270,7 +270,7 @@ class _Test:
     """The samples, references and metrics that all predictors are measured with."""
 
     store: str | Path
-    samples: Samples
+    samples: HeldOutSamples
     references: Mapping[int, Reference]  # by row
     shown: list[int]  # rows
     inception: Inception | None

@@ -69,7 +69,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class HeldOutSamples:
     """The held-out samples that all predictors are measured on: one of each view, however many passes there are."""
 
     source: StoreSource
@@ -77,7 +77,7 @@ class Samples:
     view_keys: list[Key]  # of each
 
     @classmethod
-    def of(cls, source: StoreSource, share: float, most: int) -> Samples:
+    def of(cls, source: StoreSource, share: float, most: int) -> HeldOutSamples:
         """The first sample of each view held out by the smallest share: as shares are nested, no run was trained on it.
 
         At most `most` views; IncompleteError if there is none.
@@ -109,7 +109,7 @@ class Samples:
         return Target(row, halves.mean(axis=0), 2 * half_spp, is_reference=False, half_a=halves[0])
 
 
-def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
+def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Reference]:
     """The references by the row of their view; raises SpecError if none can be used."""
     if not folder.is_dir():
         raise SpecError(f"{folder}: there is no such folder")

@@ -15,7 +15,7 @@ import torch
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.trainer.cli import service
-from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
@@ -36,7 +36,7 @@ def records(run: Path, kind: str) -> list[dict[str, Any]]:
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
     """Of rows, of which each `views` are of one configuration."""
     values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
-    held_out = HeldOut(Estimate.of(group_means(values, units)), 0.0, values, values, units)
+    held_out = HeldOutErrors(Estimate.of(group_means(values, units)), 0.0, values, values, units)
     return Validation(step, (*errors,), held_out)
 
 

@@ -39,7 +39,7 @@ from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.evaluation import (
     NONE_COMPLETE,
     DevicePredictor,
-    HeldOut,
+    HeldOutErrors,
     Predictor,
     batches,
     by_turns,
@@ -68,7 +68,7 @@ class PredictorRow:
 
     name: str
     kept: int | None  # it gets one of so many pixels of half A; None: no colour
-    held_out: HeldOut  # linear radiance × exposure, noise removed
+    held_out: HeldOutErrors  # linear radiance × exposure, noise removed
     seconds: Seconds  # of its network alone, for one image
     metrics: ImageMetrics | None  # in the metric space; None if no view has a reference
     shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
@@ -254,7 +254,7 @@ class _Measured:
     """A measured predictor, with its images of all rows that may be shown."""
 
     timed: _Timed
-    held_out: HeldOut
+    held_out: HeldOutErrors
     metrics: ImageMetrics | None
     images: dict[int, F32]
 

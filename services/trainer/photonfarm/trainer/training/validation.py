@@ -13,7 +13,7 @@ import torch
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.data.dataset import TrainingBatch
-from photonfarm.trainer.predict.evaluation import HeldOut, Predictor, measure
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 
 Show = Callable[[int, F32, F32], None]
 
@@ -33,7 +33,7 @@ class Validation:
 
     step: int
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
-    held_out: HeldOut
+    held_out: HeldOutErrors
     by_shown: bool = False  # compare the error of light up to white, and not that of all light
 
     @property

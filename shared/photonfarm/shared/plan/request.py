@@ -112,7 +112,7 @@ class PlannedRows:
         )
 
 
-class Known:
+class PlannedContent:
     """The content of a scene's older plans, for lookup; each table is built at its first use."""
 
     def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
@@ -196,7 +196,7 @@ class Expansion:
     extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
 
 
-def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_job: int, shard_rows: int) -> Expansion:
     """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
 
     Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
@@ -208,7 +208,7 @@ def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, s
     return Expansion(rows, new, named - new, candidates.extent())
 
 
-def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:
+def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[Candidates, int]:
     """The new samples of a request, and the number that it names, new or planned already."""
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)

@@ -21,7 +21,16 @@ from pydantic import Field, ValidationError
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, Candidates, Expansion, Known, PlannedRows, Request, pack
+from photonfarm.shared.plan.request import (
+    MAX_SAMPLES,
+    UNUSED,
+    Candidates,
+    Expansion,
+    PlannedContent,
+    PlannedRows,
+    Request,
+    pack,
+)
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 
@@ -66,7 +75,9 @@ def spp_per_pass(spec: SceneSpec) -> int:
     return 2 * spec.transport.half_spp
 
 
-def expand_top_up(spec: SceneSpec, request: TopUp, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand_top_up(
+    spec: SceneSpec, request: TopUp, known: PlannedContent, *, first_job: int, shard_rows: int
+) -> Expansion:
     """The rows of a request's new passes, by modification, view and pass, in jobs from number `first_job` on.
 
     Raises SpecError if nothing is planned or selected, or if it is too much for one request.
@@ -112,7 +123,7 @@ class _Planned:
     next_pass: Rows  # (V,)
 
     @classmethod
-    def of(cls, known: Known) -> _Planned:
+    def of(cls, known: PlannedContent) -> _Planned:
         """Count the passes of every view; raises SpecError if there is none."""
         if not known.plans:
             raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")

@@ -24,11 +24,11 @@ from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.plan.request import (
     MAX_SAMPLES,
     UNUSED,
-    Candidates,
     Expansion,
     PlannedContent,
     PlannedRows,
     Request,
+    SamplesToPlan,
     pack,
 )
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
@@ -95,7 +95,7 @@ def expand_top_up(
     return Expansion(rows, int(count.sum()), int(have.sum()))
 
 
-def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> Candidates:
+def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> SamplesToPlan:
     """The next `count` passes of each of some views."""
     modification_row, of_view = np.unique(planned.modification_row[views], return_inverse=True)
     modification = planned.vectors("modification", modification_row)
@@ -104,7 +104,7 @@ def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) ->
     number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
     keys = sample_keys(spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
-    return Candidates(
+    return SamplesToPlan(
         modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
     )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.store.read.merge import Merged
+from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.trainer.data.dataset import rows_held_out, units_of
 from photonfarm.trainer.data.store_source import StoreSource
 
@@ -28,7 +28,7 @@ class Reference:
     half_b: F32  # independent of `half_a`
 
     @classmethod
-    def of(cls, merged: Merged, exposure: float) -> Self:
+    def of(cls, merged: MergedView, exposure: float) -> Self:
         """The halves of a merged view, as float32: their noise is far above its steps, and there may be hundreds."""
         a, b = (np.float32(exposure) * half.astype(np.float32) for half in (merged.half_a, merged.half_b))
         return cls(merged.count, a, b)
@@ -118,7 +118,7 @@ def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Referenc
     found: dict[int, Reference] = {}
     for row, key in zip(samples.rows, samples.view_keys, strict=True):
         if (file := folder / f"{key.hex()}.npz").is_file():
-            found[row] = Reference.of(Merged.read(file), spec.exposure)
+            found[row] = Reference.of(MergedView.read(file), spec.exposure)
             if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:

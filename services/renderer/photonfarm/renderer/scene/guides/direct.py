@@ -17,7 +17,7 @@ from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted
+from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, PatternSampler, pattern_of, shifted
 from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.shared.core.keys import Key, Stream
@@ -54,7 +54,7 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
     si.sh_frame = mi.Frame3f(si.n)
-    light = sample_direct(lights, si, Points(u), dr.full(mi.Bool, True, count))
+    light = sample_direct(lights, si, PatternSampler(u), dr.full(mi.Bool, True, count))
     cosine = dr.dot(si.n, light.d)
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
     lit = light.valid & (cosine > 0)
@@ -133,7 +133,7 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(at.lights, si, Points(shifted(pattern, shift, s.index)), at.diffuse | at.other)
+        light = sample_direct(at.lights, si, PatternSampler(shifted(pattern, shift, s.index)), at.diffuse | at.other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
         lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
         cosine = dr.dot(at.normal, light.d)

@@ -31,7 +31,7 @@ from photonfarm.renderer.bdpt.emission import (
     sample_direct,
 )
 from photonfarm.renderer.bdpt.light_paths import start_weights
-from photonfarm.renderer.verify.weights.oracle import F64, Paths
+from photonfarm.renderer.verify.weights.oracle import F64, OraclePaths
 
 _FOUND = 1e-3  # a ray to a sampled point of a light must end this near to it, relative to the scene's size
 
@@ -293,7 +293,7 @@ def _light_tracing_weight(
 # ------------------------------------------------ As the oracle sees them ------------------------------------------
 
 
-def stored(lights: Lights, joined: JoinedPaths, lens: Pinhole) -> Paths:
+def stored(lights: Lights, joined: JoinedPaths, lens: Pinhole) -> OraclePaths:
     """The complete paths for the oracle: positions, normals and densities of Mitsuba, the rest from first principles.
 
     The rest: densities of light paths' starts from areas, cones and the scene's radius, the camera's from its field of
@@ -310,7 +310,7 @@ def stored(lights: Lights, joined: JoinedPaths, lens: Pinhole) -> Paths:
     infinite = _column(kept, joined.light.at_infinity)
     index = _column(kept, joined.index)
     next_event, emission = _light_densities(lights, joined, kept, index, position, normal)
-    return Paths(
+    return OraclePaths(
         position=position,
         normal=normal,
         to_light=_columns(kept, [*st.to_light, nothing]),

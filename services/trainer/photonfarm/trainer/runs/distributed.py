@@ -78,7 +78,7 @@ class SingleProcess:
         return loss.item()
 
 
-ALONE = SingleProcess()
+SINGLE_PROCESS = SingleProcess()
 
 
 class Ranks:

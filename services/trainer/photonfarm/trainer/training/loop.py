@@ -22,7 +22,7 @@ from photonfarm.trainer.data.growth import BatchStream, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -84,7 +84,7 @@ def train(
     listen: Callable[[dict[str, Any]], object] | None = None,
     count: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
-    group: TrainingGroup = ALONE,
+    group: TrainingGroup = SINGLE_PROCESS,
     show: Show | None = None,
 ) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.

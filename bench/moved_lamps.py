@@ -39,7 +39,7 @@ from photonfarm.shared.scene.modification import Modification, sample_modificati
 from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
-from photonfarm.trainer.compare.evaluation_samples import Samples
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
 from photonfarm.trainer.data.store_source import RawSample, StoreSource
 from photonfarm.trainer.metrics import metric_space
@@ -272,7 +272,7 @@ class Stage:
 
 def held_out(source: StoreSource, share: float, views: int) -> list[int]:
     """The first sample of each of so many held-out configurations; IncompleteError where they are fewer than two."""
-    rows = Samples.of(source, share, sys.maxsize).rows
+    rows = HeldOutSamples.of(source, share, sys.maxsize).rows
     first = dict(zip(reversed(units_of(source, rows)), reversed(rows), strict=True))
     if len(found := sorted(first.values())[:views]) < 2:
         raise IncompleteError(f"{len(found)} held-out configuration: an interval needs two; plan more, or look at more")

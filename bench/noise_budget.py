@@ -33,7 +33,7 @@ from budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from network_errors import F64, Errors, each_seed, of_intervals, stated, within
 from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.allocation import Allocation, Terms, seconds
+from photonfarm.shared.plan.allocation import Allocation, CostModel, seconds
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.plan.top_up import TopUp
@@ -203,9 +203,9 @@ def levels(room: Room, found: Fit) -> str:
 def optimum(room: Room, found: Fit, budget: float) -> str:
     """What was measured to be best in this room, and what the model says is, in words."""
     first, of_arms = room.errors.best()
-    terms = Terms(room.costs, found.kappa, found.rho)
+    terms = CostModel(room.costs, found.kappa, found.rho)
     best, real = terms.best(budget), terms.best_spp(1)
-    low, high = within(np.array([Terms(room.costs, kappa, rho).best_spp(1) for kappa, rho in found.constants]))
+    low, high = within(np.array([CostModel(room.costs, kappa, rho).best_spp(1) for kappa, rho in found.constants]))
     bought = best_of_replicates(room, found, budget)
     return (
         f"Measured best: `{room.arms[first].share}`, the best in {of_arms[first]:.0%} of replicates. By the model the "
@@ -218,7 +218,7 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
 
 def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
     """What the model says is best in a room, by the constants of each replicate."""
-    best = cache(lambda kappa, rho: Terms(room.costs, kappa, rho).best(budget))
+    best = cache(lambda kappa, rho: CostModel(room.costs, kappa, rho).best(budget))
     return [best(kappa, rho) for kappa, rho in found.constants]
 
 

@@ -37,7 +37,7 @@ from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.merge import merge_view
 from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.trainer.compare.evaluation_samples import Samples
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
@@ -289,7 +289,7 @@ class References:
         """Those of held-out configurations that have `spp` at least; `share` of all are held out."""
         reader, source = SceneReader(store.root, spec.scene_id), StoreSource(store.root, spec.scene_id)
         reader.refresh()
-        first = {reader.view_row(row): row for row in reversed(Samples.of(source, share, sys.maxsize).rows)}
+        first = {reader.view_row(row): row for row in reversed(HeldOutSamples.of(source, share, sys.maxsize).rows)}
         passes = {view: len(reader.rows_of_view(view)) for view in sorted(first)}
         enough = [view for view, count in passes.items() if 2 * spec.transport.half_spp * count >= spp]
         merged = {first[view]: merge_view(reader, view) for view in enough}

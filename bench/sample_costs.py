@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 import results
 import room_study
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.allocation import KAPPA, RHO, Allocation, Terms
+from photonfarm.shared.plan.allocation import KAPPA, RHO, Allocation, CostModel
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SceneSpec
 
@@ -33,9 +33,9 @@ class Room:
     costs: SampleCosts
 
     @property
-    def terms(self) -> Terms:
+    def terms(self) -> CostModel:
         """What allocations are weighed by."""
-        return Terms.of(self.costs, static=not self.spec.groups)
+        return CostModel.of(self.costs, static=not self.spec.groups)
 
     def more_than_best(self, spp: int, budget: float) -> float:
         """By what factor the excess error is more where the budget is spent on single views of so many samples."""
@@ -72,7 +72,7 @@ def line(room: Room, budget: float) -> list[str]:
 
 
 def shared_out(found: Allocation, *, static: bool) -> str:
-    """An allocation in short; a static scene has one configuration, and stands as in `Terms.of`."""
+    """An allocation in short; a static scene has one configuration, and stands as in `CostModel.of`."""
     parts = (1, found.modifications) if static else (found.modifications, found.views)
     return " × ".join(map(str, parts)) + f" × {found.spp} spp"
 

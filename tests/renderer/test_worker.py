@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer.worker.heartbeat import Heart
+from photonfarm.renderer.worker.heartbeat import HeartbeatThread
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.shared import queue
@@ -192,7 +192,7 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
 ) -> None:
     connection = connect(redis_server.url)
     settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
-    heart = Heart(settings, Store(tmp_path / "store"), None)
+    heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
     heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
     heart.start()
     show.status(tmp_path / "store", redis_server.url, as_json=False)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from photonfarm.renderer.worker.log import JobCounts, Talk
+from photonfarm.renderer.worker.log import JobCounts, WorkerLog
 from photonfarm.renderer.worker.settings import WorkerSettings
 
 
@@ -11,7 +11,7 @@ def settings_of(**changes: object) -> WorkerSettings:
 
 
 def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:
-    talk = Talk(settings_of(report_s=3600))
+    talk = WorkerLog(settings_of(report_s=3600))
     for job in range(5):
         with talk.timing(f"job-{job}"):
             pass
@@ -19,7 +19,7 @@ def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: 
         "worker ada: 1 job in 0 s, 0.00 s each; the last was job-0"
     ]
     caplog.clear()
-    talk = Talk(settings_of(report_s=1e-9))
+    talk = WorkerLog(settings_of(report_s=1e-9))
     for job in range(5):
         with talk.timing(f"job-{job}"):
             pass
@@ -33,7 +33,7 @@ def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() ->
 
 
 def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:
-    talk = Talk(settings_of(quiet=True))
+    talk = WorkerLog(settings_of(quiet=True))
     with talk.timing("job"):
         pass
     for reason in (None, "the disk is full", "the disk is fuller", None, None):

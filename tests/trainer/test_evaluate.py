@@ -16,7 +16,7 @@ from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.pictures import display
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.read.merge import Merged, merge_view
+from photonfarm.shared.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References
@@ -94,7 +94,7 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(
     rows = held_out(store, scene, 0.4)[::2][:3]
     exposure = scene.spec.exposure
     images = [exposure * reader.read(row).radiance[0] for row in rows]
-    wanted = [Merged.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
+    wanted = [MergedView.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
     halves = (np.array([exposure * getattr(of, half) for of in wanted], np.float32) for half in ("half_a", "half_b"))
     expected = mse(metric_space(np.array(images, np.float32)), *map(metric_space, halves), having_seen_a=True)
     assert found.rows[1].name == "none 1/1"
@@ -182,7 +182,7 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
             radiance = reader.read(target.row).radiance
             wanted = radiance.mean(axis=0)
             if first == "reference":
-                wanted = Merged.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
+                wanted = MergedView.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
             for picture, image in zip(shown, (wanted, radiance[0]), strict=True):
                 assert np.abs(picture.astype(int) - display(image, scene.spec.exposure)).max() <= 1
 
@@ -289,7 +289,7 @@ def test_what_cannot_be_compared_is_refused(
     with pytest.raises(SpecError, match="holds no reference of the"):
         compare(store, [run], references=tmp_path / "empty")
     for file in references.iterdir():
-        Merged(1, *np.zeros((4, 8, 8, 3))).write(file)
+        MergedView(1, *np.zeros((4, 8, 8, 3))).write(file)
     with pytest.raises(SpecError, match=r"has the shape \(8, 8, 3\), and the scene's film \(16, 16, 3\)"):
         compare(store, [run], references=references)
 

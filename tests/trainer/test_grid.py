@@ -18,7 +18,7 @@ from photonfarm.trainer import grid
 from photonfarm.trainer.cli import service
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.grid import Cell, run_grid, table
-from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.training.learner import DivergedError
@@ -147,7 +147,7 @@ def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, t
 
     def halves(order: list[int]) -> tuple[set[float], set[float]]:
         errors = np.array([rows[i] // 2 for i in order], float)  # the number of its configuration stands for an error
-        found = HeldOut(Estimate.of(errors), 0.0, errors, errors, tuple(units[i] for i in order))
+        found = HeldOutErrors(Estimate.of(errors), 0.0, errors, errors, tuple(units[i] for i in order))
         first, second = grid._halves(found)
         assert len(first) == len(set(units)) // 2
         assert len(first) + len(second) == len(set(units))

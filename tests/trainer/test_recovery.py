@@ -15,7 +15,7 @@ import torch
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.trainer.cli import service
-from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
@@ -23,7 +23,7 @@ from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, train
 from photonfarm.trainer.training.recovery import GOOD, NEXT
-from photonfarm.trainer.training.validation import Best, Validation, compared, validate
+from photonfarm.trainer.training.validation import BestValidation, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
@@ -36,12 +36,12 @@ def records(run: Path, kind: str) -> list[dict[str, Any]]:
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
     """Of rows, of which each `views` are of one configuration."""
     values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
-    held_out = HeldOut(Estimate.of(group_means(values, units)), 0.0, values, values, units)
+    held_out = HeldOutErrors(Estimate.of(group_means(values, units)), 0.0, values, values, units)
     return Validation(step, (*errors,), held_out)
 
 
-def best(errors: dict[int, float]) -> Best:
-    return Best(0, errors)
+def best(errors: dict[int, float]) -> BestValidation:
+    return BestValidation(0, errors)
 
 
 def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
@@ -135,7 +135,7 @@ def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little
 
     for loss, worse in [("linear", True), ("relative", False), ("paired", False)]:
         was = at(before, loss)
-        assert compared(at(learned, loss), Best(0, was.errors, was.by_shown)).is_worse is worse
+        assert compared(at(learned, loss), BestValidation(0, was.errors, was.by_shown)).is_worse is worse
     assert at(learned, "relative").held_out.shown == pytest.approx(0.0)
     assert at(before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
 
@@ -143,8 +143,8 @@ def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little
 def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_white() -> None:
     older = {"step": 4, "rows": torch.tensor([0]), "errors": torch.tensor([0.5], dtype=torch.float64)}
     now = replace(validation({0: 50.0}), by_shown=True)
-    assert compared(now, Best.of(older)).is_best
-    assert compared(now, Best.of(Best(4, {0: 0.5}, by_shown=True).state())).is_worse
+    assert compared(now, BestValidation.of(older)).is_best
+    assert compared(now, BestValidation.of(BestValidation(4, {0: 0.5}, by_shown=True).state())).is_worse
 
 
 # ----------------------------------------------------------------------------------------------------------------- runs

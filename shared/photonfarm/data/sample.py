@@ -18,8 +18,7 @@ from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.shared.store.read.reader import StoredSample as StoredSample
+from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 IMAGES = ("radiance", "albedo", "normal", "depth")
 """The images that every sample has. Samples of a scene with guides also have the images that `Guides` names."""

@@ -13,10 +13,10 @@ backend.load(threads=1)
 
 from photonfarm.renderer.strategy import cache, plan  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
-from photonfarm.renderer.strategy.comparison import Errors  # noqa: E402
+from photonfarm.renderer.strategy.comparison import RelativeErrors  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, CandidateRow, Measurement  # noqa: E402
 from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
-from photonfarm.renderer.strategy.plan import Plan, _knows, plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
 from photonfarm.shared.cli.main import main  # noqa: E402
 from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
@@ -53,7 +53,7 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
     return CandidateRow(
         connections=candidate.connections, light_ratio=candidate.light_ratio, missed=0.0,
-        errors=Errors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
+        errors=RelativeErrors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
     )  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def measurement(*rows: CandidateRow) -> Measurement:
     )  # fmt: skip
 
 
-def text_of(found: Plan) -> str:
+def text_of(found: TransportPlan) -> str:
     return "\n".join(lines(found))
 
 

@@ -27,7 +27,7 @@ from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.predict.evaluation import HeldOut, batches, measure
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings
@@ -184,7 +184,7 @@ def _run_cell(
     return Cell(changes, picked_by, per_unit) if np.isfinite([*picked_by, *per_unit]).all() else Cell(changes, (), ())
 
 
-def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldOut:
+def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldOutErrors:
     """The held-out error of a run's last network."""
     with Feed(source, settings) as feed:
         arrived, _ = feed.arrivals()
@@ -193,7 +193,7 @@ def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldO
         return measure(predict, batches(feed, rows, settings.batch))
 
 
-def _halves(found: HeldOut) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _halves(found: HeldOutErrors) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """The errors of the configurations, in two halves by a hash of their keys; the second has the odd one."""
     errors = group_means(found.per_sample, found.units).tolist()
     ordered = sorted(zip(map(_place, dict.fromkeys(found.units)), errors, strict=True))

@@ -18,7 +18,7 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.store.check.check import Progress as Tell
 from photonfarm.shared.store.check.check import SceneReport, StoreReport, said
 from photonfarm.shared.store.read.find import FoundSample, Matches
-from photonfarm.shared.store.read.merge import Merged
+from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
         click.echo(f"no sample fits{near}", err=True)
 
 
-def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_json: bool) -> None:
+def merged(views: Iterable[tuple[str, MergedView]], folder: Path, least: int, as_json: bool) -> None:
     """Write merged views of at least `least` passes into `folder`, which is created, and print a line for each.
 
     Raises StoreError if there is no such view, or if they cannot be written.

@@ -11,7 +11,7 @@ from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.processes import usable_cores
 from photonfarm.shared.farm.submission import Submission
-from photonfarm.shared.plan.allocation import Allocation, Terms
+from photonfarm.shared.plan.allocation import Allocation, CostModel
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
@@ -117,7 +117,7 @@ def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCos
 
 def _best(spec: SceneSpec, wanted: Request, costs: SampleCosts) -> tuple[float, Allocation]:
     """The best allocation of the request's cost, after the share of the excess error that it saves, at least 0."""
-    terms = Terms.of(costs, static=not spec.groups)
+    terms = CostModel.of(costs, static=not spec.groups)
     spp = 2 * spec.transport.half_spp
     asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
     if not spec.groups:

@@ -10,7 +10,7 @@ import numpy as np
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import SHARD_ROWS, Known, PlannedRows, Request, expand
+from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.plan.sampling import modification_keys, view_keys
 from photonfarm.shared.scene.modification import rest
 from photonfarm.shared.scene.spec import SceneSpec
@@ -39,7 +39,7 @@ def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> Iterator[Pl
     """The rows of a scene's plans, and those of a request."""
     if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
         yield from (plan.rows for plan in opened.scene(spec.scene_id).plans())
-    new = expand(spec, wanted, Known(), first_job=0, shard_rows=SHARD_ROWS).rows
+    new = expand(spec, wanted, PlannedContent(), first_job=0, shard_rows=SHARD_ROWS).rows
     if new is not None:
         yield new
 

@@ -41,7 +41,7 @@ RHO = 1.8
 """ρ, how much configurations differ beside what their views show: fitted with κ; its range is 0.43 … 8.7."""
 
 MOST_SPP, MOST_VIEWS = 1024, 16
-"""The largest samples per pixel and views per configuration that `Terms.best` considers."""
+"""The largest samples per pixel and views per configuration that `CostModel.best` considers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def excess(noise: float, of: Allocation, *, kappa: float = KAPPA, rho: float = R
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class CostModel:
     """The costs of a scene's samples, and the constants of its predicted error."""
 
     costs: SampleCosts

@@ -112,7 +112,7 @@ class PlannedRows:
         )
 
 
-class Known:
+class PlannedContent:
     """The content of a scene's older plans, for lookup; each table is built at its first use."""
 
     def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
@@ -166,7 +166,7 @@ def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[byte
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
+class SamplesToPlan:
     """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
 
     modification: F32  # (M, G, 4)
@@ -196,7 +196,7 @@ class Expansion:
     extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
 
 
-def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_job: int, shard_rows: int) -> Expansion:
     """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
 
     Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
@@ -208,7 +208,7 @@ def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, s
     return Expansion(rows, new, named - new, candidates.extent())
 
 
-def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:
+def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[SamplesToPlan, int]:
     """The new samples of a request, and the number that it names, new or planned already."""
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)
@@ -223,7 +223,7 @@ def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candid
     keys = sample_keys(spec.scene_id, modifications[of_view[view]], views[view], pass_)
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
-    found = Candidates(
+    found = SamplesToPlan(
         modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
     )  # fmt: skip
@@ -249,7 +249,7 @@ def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.
     return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
 
 
-def pack(candidates: Candidates, *, first_row: int, shard_rows: int) -> PlannedRows | None:
+def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> PlannedRows | None:
     """Samples as rows from `first_row` on, in their order; None if there are none."""
     count = len(candidates.sample_pass)
     if not count:

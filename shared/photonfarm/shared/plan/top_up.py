@@ -21,7 +21,16 @@ from pydantic import Field, ValidationError
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, Candidates, Expansion, Known, PlannedRows, Request, pack
+from photonfarm.shared.plan.request import (
+    MAX_SAMPLES,
+    UNUSED,
+    Expansion,
+    PlannedContent,
+    PlannedRows,
+    Request,
+    SamplesToPlan,
+    pack,
+)
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 
@@ -66,7 +75,9 @@ def spp_per_pass(spec: SceneSpec) -> int:
     return 2 * spec.transport.half_spp
 
 
-def expand_top_up(spec: SceneSpec, request: TopUp, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand_top_up(
+    spec: SceneSpec, request: TopUp, known: PlannedContent, *, first_job: int, shard_rows: int
+) -> Expansion:
     """The rows of a request's new passes, by modification, view and pass, in jobs from number `first_job` on.
 
     Raises SpecError if nothing is planned or selected, or if it is too much for one request.
@@ -84,7 +95,7 @@ def expand_top_up(spec: SceneSpec, request: TopUp, known: Known, *, first_job: i
     return Expansion(rows, int(count.sum()), int(have.sum()))
 
 
-def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> Candidates:
+def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> SamplesToPlan:
     """The next `count` passes of each of some views."""
     modification_row, of_view = np.unique(planned.modification_row[views], return_inverse=True)
     modification = planned.vectors("modification", modification_row)
@@ -93,7 +104,7 @@ def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) ->
     number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
     keys = sample_keys(spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
-    return Candidates(
+    return SamplesToPlan(
         modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
     )  # fmt: skip
@@ -112,7 +123,7 @@ class _Planned:
     next_pass: Rows  # (V,)
 
     @classmethod
-    def of(cls, known: Known) -> _Planned:
+    def of(cls, known: PlannedContent) -> _Planned:
         """Count the passes of every view; raises SpecError if there is none."""
         if not known.plans:
             raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")

@@ -34,7 +34,7 @@ from photonfarm.shared.queue.failures import (
     repeating_command,
 )
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
-from photonfarm.shared.queue.idle_workers import HeldUp, forget_held_up, tell_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, forget_held_up, tell_held_up
 from photonfarm.shared.queue.job import (
     FUNCTION,
     OVERDUE,
@@ -63,7 +63,7 @@ __all__ = [
     "WORKER",
     "Failure",
     "FailureCause",
-    "HeldUp",
+    "IdleReports",
     "OtherStoreError",
     "QueueStatus",
     "RenderArguments",

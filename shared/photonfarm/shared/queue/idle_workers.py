@@ -21,7 +21,7 @@ _SCENE_AND_WORKER = re.compile("([0-9a-f]{32}):(.+)", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
-class HeldUp:
+class IdleReports:
     """The workers' reports, by name; printable."""
 
     paused: dict[str, str]  # why a worker takes no jobs
@@ -46,13 +46,13 @@ def forget_held_up(connection: Redis, worker: str, left: Iterable[str]) -> None:
     connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
 
 
-def read_held_up(connection: Redis) -> HeldUp:
+def read_held_up(connection: Redis) -> IdleReports:
     """The reports that workers have made."""
     left: dict[str, dict[str, str]] = {}
     for name, reason in _said(connection, LEFT).items():
         if found := _SCENE_AND_WORKER.fullmatch(name):
             left.setdefault(found[1], {})[printable(found[2])] = reason
-    return HeldUp({printable(name): reason for name, reason in _said(connection, PAUSED).items()}, left)
+    return IdleReports({printable(name): reason for name, reason in _said(connection, PAUSED).items()}, left)
 
 
 def _said(connection: Redis, prefix: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
-from photonfarm.shared.queue.idle_workers import HeldUp, read_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, read_held_up
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
@@ -230,7 +230,7 @@ class QueueStatus:
     running: int  # jobs with a heartbeat
     workers: int  # with a heartbeat; those of this machine only if their process lives
     failed: dict[str, Failure]  # by job name
-    held_up: HeldUp
+    held_up: IdleReports
 
 
 def queue_status(connection: Redis) -> QueueStatus:

@@ -12,7 +12,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
-from photonfarm.renderer.bdpt.film import Images, Splat
+from photonfarm.renderer.bdpt.film import ImageStack, Splat
 from photonfarm.renderer.bdpt.launches import Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.recording import Recorder
@@ -110,7 +110,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
-    def _render(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> Images:
+    def _render(self, scene: Any, sensor: Any, seeds: Sequence[int], spp: int) -> ImageStack:
         sensor.sampler().seed(0, 1)  # or another integrator's state there would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
@@ -120,7 +120,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             pixels = width * height
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
-            images = Images.black(len(seeds) * pixels)
+            images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio):
                 options = self._options(launch, pixels)
                 own = seeds[launch.first_image : launch.first_image + launch.images]
@@ -130,7 +130,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 images.add(part, launch.first_image * pixels)
             return images
 
-    def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+    def _trace(self, scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
@@ -150,7 +150,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
     """Trace the light paths and the eye paths of a launch. If it is recorded, Python runs once for each kind."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
@@ -174,7 +174,7 @@ def trace(scene: Any, sensor: Any, lights: Lights | None, options: PathOptions, 
         connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
-    images = Images.black(lanes.images * lanes.pixels)
+    images = ImageStack.black(lanes.images * lanes.pixels)
     place = image * lanes.pixels + pixel
     dr.scatter_add(images.radiance, radiance * lanes.eye_scale, place)
     dr.scatter_add(images.hit, lanes.eye_scale, place, hit)

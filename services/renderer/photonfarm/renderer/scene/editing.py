@@ -75,7 +75,7 @@ class TransformPlacement:
         self._parameters.update()
 
 
-class Shine:
+class LightSwitch:
     """The radiance of one area light, switched on and off."""
 
     def __init__(self, emitter: Any) -> None:
@@ -107,12 +107,12 @@ class MovableGroup:
     """The shapes of one movable group."""
 
     placements: tuple[MeshPlacement | TransformPlacement, ...]
-    shines: tuple[Shine, ...]
+    shines: tuple[LightSwitch, ...]
 
     @classmethod
     def of(cls, shapes: list[Any]) -> MovableGroup:
         """The group of these shapes, which are placed as modelled."""
-        shines = tuple(Shine(shape.emitter()) for shape in shapes if shape.is_emitter())
+        shines = tuple(LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter())
         return cls(tuple(_placement(shape) for shape in shapes), shines)
 
     def move(self, translation: F32, *, was_present: bool) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import Measured, saving
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, saving
 from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement
 from photonfarm.renderer.strategy.pilot import longest
 
 
 @dataclass(frozen=True, slots=True)
-class Offer(Measured):
+class CandidateAtCost(MeasuredCandidate):
     """A candidate at the samples per pixel that fit the time; `time_s` is that of such a half-estimate."""
 
     half_spp: int
@@ -19,7 +19,7 @@ class Offer(Measured):
     fits: bool  # whether a sample per pixel costs about that time or less
 
 
-def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
+def offers(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
     """Every measured candidate, at the samples per pixel that fit `half_s`.
 
     The variance of an image is that of a sample over their number, so error × time is error a sample × time / samples.
@@ -28,11 +28,11 @@ def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
     return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
 
 
-def _offer(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> Offer:
+def _offer(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> CandidateAtCost:
     samples = row.cost.bought(half_s)
     cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
     relative = row.errors.relative_spread(plain.errors)
-    return Offer(
+    return CandidateAtCost(
         candidate=row.candidate,
         errors=row.errors,
         missed=row.missed,
@@ -50,12 +50,12 @@ def _per_sample_s(row: CandidateRow, half_s: float) -> float:
     return row.cost.time_s(samples) / samples
 
 
-def best(offered: dict[Candidate, Offer]) -> Offer:
+def best(offered: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:
     """The offer of least error × time, among those measured longest."""
     return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
 
 
-def _cost(offer: Offer) -> float:
+def _cost(offer: CandidateAtCost) -> float:
     return offer.relative_cost
 
 

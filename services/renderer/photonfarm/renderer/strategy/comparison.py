@@ -19,7 +19,7 @@ WORTHWHILE = 0.05
 """The least gain that changes settings: a changed scene has another id, so all its samples are rendered again."""
 
 
-class Errors(Frozen):
+class RelativeErrors(Frozen):
     """The relMSE of one image of a candidate, by views, with its unseen noise; for a single view, by pairs.
 
     It is accompanied by that of plain path tracing over the images of the same seeds: both have the same rare bright
@@ -40,7 +40,7 @@ class Errors(Frozen):
         """The relMSE of one image over that of plain path tracing."""
         return self.mean / _mean(self.plain)
 
-    def relative_spread(self, other: Errors) -> float | None:
+    def relative_spread(self, other: RelativeErrors) -> float | None:
         """The standard error of the ratio of two candidates' ratios, over itself; None for a single value each.
 
         It is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over views: so it contains the
@@ -67,11 +67,11 @@ def _standard_error(residuals: NDArray[np.float64]) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredCandidate:
     """The measurement of one candidate."""
 
     candidate: Candidate
-    errors: Errors
+    errors: RelativeErrors
     missed: float  # the part of the error inferred from light in other candidates' images (see `noise`)
     time_s: float  # CPU time of one image
     relative_cost: float  # error × time over that of plain path tracing: the time to the same error
@@ -104,13 +104,13 @@ class Saving:
         return self.factor >= 1 + WORTHWHILE and self.deviations >= CLEAR
 
 
-def saving(one: Measured, over: Measured) -> Saving:
+def saving(one: MeasuredCandidate, over: MeasuredCandidate) -> Saving:
     """The saving of one candidate over another, both at their cost."""
     factor = over.relative_cost / one.relative_cost
     relative = over.errors.relative_spread(one.errors)
     return Saving(over.candidate, factor, None if relative is None else factor * relative)
 
 
-def is_alike(one: Measured, other: Measured) -> bool:
+def is_alike(one: MeasuredCandidate, other: MeasuredCandidate) -> bool:
     """Whether the difference of two candidates is not significant."""
     return abs(saving(one, other).deviations) < CLEAR

@@ -26,7 +26,7 @@ _CAMERAS = {"PerspectiveCamera": "pinhole", "ThinLensCamera": "thin lens"}
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
+class SceneContent:
     """The facts of one loaded scene in its present state."""
 
     lights: Mapping[str, int]  # lights that shine, by kind
@@ -47,11 +47,11 @@ class LeftOut:
         return f"{self.what}: {self.why}"
 
 
-def read(scene: Any, camera: Any) -> Content:
+def read(scene: Any, camera: Any) -> SceneContent:
     """Read the content of a Mitsuba scene, seen by one of Mitsuba's sensors."""
     shining = [emitter for emitter in scene.emitters() if _shines(emitter)]
     kinds = Counter(_LIGHTS.get(emitter.class_name(), emitter.class_name()) for emitter in shining)
-    return Content(
+    return SceneContent(
         lights=dict(kinds),
         dark=len(scene.emitters()) - len(shining),
         surfaces=len(scene.shapes()),
@@ -82,7 +82,7 @@ def _is_specular(shape: Any) -> bool:
 
 
 def restrict(
-    content: Content, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
+    content: SceneContent, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
 ) -> tuple[list[Candidate], list[LeftOut]]:
     """The candidates that may help, and what is left out; `hit_share`: the share of light paths that hit a surface."""
     candidates = list(candidates)
@@ -92,7 +92,7 @@ def restrict(
     return candidates, []
 
 
-def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> str | None:
+def _why_no_light_paths(content: SceneContent, max_depth: int, hit_share: float) -> str | None:
     if not content.lights:
         return "there is no light that shines"
     if max_depth in (0, 1):
@@ -108,7 +108,7 @@ def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> s
     return None
 
 
-def sentences(content: Content, max_depth: int) -> Sequence[str]:
+def sentences(content: SceneContent, max_depth: int) -> Sequence[str]:
     """What every plan models, and the lights that are off."""
     lights = ", ".join(f"{count} {kind}" for kind, count in sorted(content.lights.items())) or "none"
     found = [

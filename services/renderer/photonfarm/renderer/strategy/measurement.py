@@ -11,9 +11,9 @@ import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
-from photonfarm.renderer.strategy.pilot_scene import SEED, Stage
+from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.scene.spec import Film, Frozen, SceneSpec
 
@@ -43,12 +43,12 @@ Talk = Callable[[str], None]
 
 
 class CandidateRow(Frozen):
-    """One candidate: the values of `Measured`, and the two parts of its time."""
+    """One candidate: the values of `MeasuredCandidate`, and the two parts of its time."""
 
     connections: int
     light_ratio: float
-    errors: Errors  # of images of `Measurement.spp`
-    missed: float  # as in `Measured`
+    errors: RelativeErrors  # of images of `Measurement.spp`
+    missed: float  # as in `MeasuredCandidate`
     fixed_s: float  # as in `ImageCost`, on the spec's film
     sample_s: float
 
@@ -109,7 +109,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     """
     begun = time.process_time()
     talk(f"loading {spec.name}")
-    stage = Stage(spec, beside)
+    stage = PilotScene(spec, beside)
     found = content.read(stage.loaded.scene, stage.camera())
     reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
@@ -135,14 +135,16 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     )
 
 
-def _compare(stage: Stage, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk) -> _Compared:
+def _compare(
+    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk
+) -> _Compared:
     spec = stage.spec
     now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
     costs = time_images(stage.renders(1)[0], candidates, half_spp, TIMING * seconds, stage.clock)
     half_s = costs[now].time_s(half_spp)
     film, spp, views = _pilot_film(spec, costs, left_s)
     if film != spec.film:
-        stage = Stage(spec.model_copy(update={"film": film}), beside)
+        stage = PilotScene(spec.model_copy(update={"film": film}), beside)
     talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
     pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
     choice = pilot.choose(
@@ -187,7 +189,7 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
+def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
     """The cost that was timed beforehand, corrected by the many images of the pilot.
 
     If the pilot's images have far fewer samples, they are not used: their fixed part hides the time of their samples.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
-from photonfarm.renderer.strategy.comparison import Measured
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate
 from photonfarm.renderer.strategy.reasons import BLACK, reasons_for
 from photonfarm.renderer.strategy.rounds import Rounds
 
@@ -25,14 +25,14 @@ class Choice:
     """The chosen candidate, and its evidence."""
 
     candidate: Candidate
-    measured: tuple[Measured, ...]  # in the order of the candidates given
+    measured: tuple[MeasuredCandidate, ...]  # in the order of the candidates given
     reasons: tuple[str, ...]  # sentences
     shared: float  # relMSE of the rare bright samples that all candidates share: not in `error` (see `noise`)
     views: int  # the views that were not black
     spent_s: float  # CPU time of the whole pilot
     scouting_s: float  # the part before the first measurement: kernels, and the images that give the weights
 
-    def row(self, candidate: Candidate) -> Measured:
+    def row(self, candidate: Candidate) -> MeasuredCandidate:
         """The measurement of a candidate."""
         return next(row for row in self.measured if row.candidate == candidate)
 

@@ -20,7 +20,7 @@ SEED = 0
 """The master seed of a pilot's configurations, views and images."""
 
 
-class Stage:
+class PilotScene:
     """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
 
     def __init__(self, spec: SceneSpec, beside: Path | None) -> None:

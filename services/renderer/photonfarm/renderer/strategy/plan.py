@@ -9,7 +9,7 @@ from typing import Any
 
 from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.choices import Offer, offers, settled
+from photonfarm.renderer.strategy.choices import CandidateAtCost, offers, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Measurement, Talk, measure, present
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
@@ -26,7 +26,7 @@ Settings = Mapping[str, Mapping[str, int | float]]
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class TransportPlan:
     """The settings a spec should have, given the measurement and the cost that the spec accepts now."""
 
     spec: SceneSpec
@@ -36,7 +36,7 @@ class Plan:
     half_spp: int  # of about the cost of the spec's settings now
     photons: PhotonSpec
     photons_reason: str
-    offers: Mapping[Candidate, Offer]  # all measured candidates, at that cost; empty if every view is black
+    offers: Mapping[Candidate, CandidateAtCost]  # all measured candidates, at that cost; empty if every view is black
     halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
 
     @property
@@ -84,7 +84,7 @@ class Plan:
         }  # fmt: skip
 
 
-def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, talk: Talk) -> Plan:
+def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, talk: Talk) -> TransportPlan:
     """The plan of a spec; a cached measurement is used if it took at least `seconds`, unless `again` is set."""
     found = None if again else cache.find(spec)
     if found is not None and found.asked_s >= seconds and _knows(found, spec):
@@ -108,16 +108,16 @@ def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
     return 1 / SIMILAR <= half_s / measurement.half_s <= SIMILAR
 
 
-def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Plan:
+def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> TransportPlan:
     """The plan that follows from a measurement for a spec as it is now; its settings are among those measured."""
     photons, reason = light_reach.recommend(spec.photons, measurement.near, measurement.power, spec.transport.max_depth)
     half_spp = spec.transport.half_spp
     if not measurement.rows:
-        return Plan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
+        return TransportPlan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
     now = present(spec)
     candidate, samples = settled(measurement, now, half_spp)
     cost = measurement.row(candidate).cost
-    return Plan(
+    return TransportPlan(
         spec=spec,
         measurement=measurement,
         cached=cached,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from photonfarm.renderer.strategy.candidate import PLAIN
-from photonfarm.renderer.strategy.comparison import CLEAR, Measured, is_alike
+from photonfarm.renderer.strategy.comparison import CLEAR, MeasuredCandidate, is_alike
 
 BLACK = "every view of the pilot is black: there is no light to model, so plain path tracing does"
 
@@ -14,7 +14,7 @@ SUSPICIOUS = 0.05
 """The share of a candidate's error inferred from light it misses above which that is examined and reported."""
 
 
-def reasons_for(chosen: Measured, rows: Sequence[Measured], shared: float) -> tuple[str, ...]:
+def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], shared: float) -> tuple[str, ...]:
     """The reasons for a candidate among all that were measured.
 
     `shared`: relMSE of an image that all candidates share in rare bright samples (see `noise`).
@@ -36,7 +36,7 @@ def reasons_for(chosen: Measured, rows: Sequence[Measured], shared: float) -> tu
     return tuple(reasons)
 
 
-def _against_plain(chosen: Measured, rows: Sequence[Measured]) -> str:
+def _against_plain(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate]) -> str:
     if chosen.candidate != PLAIN:
         share = plus_minus(chosen.relative_cost, chosen.spread)
         return f"{chosen.candidate} reaches the error of {PLAIN} in {share} of the time"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
-from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
@@ -141,14 +141,14 @@ class Rounds:
         """Error × time of a candidate: less is better."""
         return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
 
-    def measured(self, candidate: Candidate) -> Measured:
+    def measured(self, candidate: Candidate) -> MeasuredCandidate:
         """The error × time against plain path tracing, over the images that both rendered with equal seeds."""
         seen, inferred = self._seen(candidate), self._missed(candidate)
         plain = self._seen(PLAIN)[: len(seen)] + self._missed(PLAIN)
-        errors = Errors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
+        errors = RelativeErrors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
         cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
         relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
-        return Measured(
+        return MeasuredCandidate(
             candidate=candidate,
             errors=errors,
             missed=inferred,

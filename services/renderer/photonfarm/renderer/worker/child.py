@@ -24,8 +24,8 @@ from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
-from photonfarm.renderer.worker.heartbeat import Heart
-from photonfarm.renderer.worker.log import JobCounts, Talk
+from photonfarm.renderer.worker.heartbeat import HeartbeatThread
+from photonfarm.renderer.worker.log import JobCounts, WorkerLog
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import (
@@ -111,14 +111,14 @@ class RenderWorker(SimpleWorker):
         self._failed = False  # the job in hand
         self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
-        self._heart = Heart(settings, store, words)
+        self._heart = HeartbeatThread(settings, store, words)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None
             if settings.ahead is None
             else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
         )
-        self._talk = Talk(settings)
+        self._talk = WorkerLog(settings)
         self._words = words
         self._tally = JobCounts()
 

@@ -19,7 +19,7 @@ from photonfarm.shared.store import Store
 STDERR = 2
 
 
-class Heart:
+class HeartbeatThread:
     """Writes the heartbeat of the worker and its job, and why it is idle, from a thread with its own connection.
 
     `paused` is the reason why it takes no jobs, and `left` by scene id the reason why it skips scenes for now.

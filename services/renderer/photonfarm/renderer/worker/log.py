@@ -53,7 +53,7 @@ def counted(jobs: int) -> str:
     return f"{jobs} job{'s' * (jobs != 1)}"
 
 
-class Talk:
+class WorkerLog:
     """Counts jobs, and logs progress; with `quiet` only what holds the worker up."""
 
     def __init__(self, settings: WorkerSettings) -> None:

@@ -22,7 +22,7 @@ JOB_IN_HAND = "job in hand: "
 """The line's beginning by which a child reports the job that it begins, before the job's name."""
 
 TALLY = "so far: "
-"""The line's beginning by which a child reports its jobs so far, before the numbers of a `Tally`."""
+"""The line's beginning by which a child reports its jobs so far, before the numbers of `JobCounts`."""
 
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
 """The format of log lines of a supervisor and its child."""

@@ -34,7 +34,7 @@ HUNG_LINES = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class ChildOutput:
     """The output of a child."""
 
     last: str  # why it ended, if it stated that
@@ -43,7 +43,7 @@ class Words:
     tally: JobCounts  # of the jobs that ended
 
     @classmethod
-    def of(cls, told: str) -> Words:
+    def of(cls, told: str) -> ChildOutput:
         """Parse a child's output: jobs begun, last words, and faulthandler's dump, the main thread at its end."""
         said, timeout, dump = told.partition("Timeout (")
         lines = said.splitlines()
@@ -152,7 +152,7 @@ class Supervisor:
             self._say(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
-    def _run_child(self) -> tuple[int, Words]:
+    def _run_child(self) -> tuple[int, ChildOutput]:
         """Run one child; returns its exit code and its output."""
         with subprocess.Popen(
             self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
@@ -164,7 +164,7 @@ class Supervisor:
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
                 self._child.stdin.flush()  # it stays open: its end shows the child that the supervisor is gone
-            words = Words.of(_all_told(self._child.stdout.fileno()).decode(errors="replace"))
+            words = ChildOutput.of(_all_told(self._child.stdout.fileno()).decode(errors="replace"))
             self._tally += words.tally
             return self._child.wait(), words
 
@@ -217,7 +217,7 @@ def _all_told(pipe: int) -> bytes:
             told += part
 
 
-def _ending(code: int, words: Words, deadline_s: float) -> str:
+def _ending(code: int, words: ChildOutput, deadline_s: float) -> str:
     """How a child ended, in words."""
     if code < 0:
         return f"its child was ended by {signal.Signals(-code).name}"

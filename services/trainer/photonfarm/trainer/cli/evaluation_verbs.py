@@ -16,7 +16,7 @@ from photonfarm.trainer.cli.train_verb import run_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
-class Several(click.Option):
+class RepeatableOption(click.Option):
     """An option that may be repeated; a configuration file may give a single value."""
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
@@ -30,19 +30,20 @@ device_option = click.option(
 
 
 runs_option = click.option(
-    "--run", "runs", cls=Several, multiple=True, type=click.Path(path_type=Path, file_okay=False), default=["run"],
-    envvar="PHOTONFARM_RUN", show_default=True, help="Folder of a training run; several give several rows.",
+    "--run", "runs", cls=RepeatableOption, multiple=True, type=click.Path(path_type=Path, file_okay=False),
+    default=["run"], envvar="PHOTONFARM_RUN", show_default=True,
+    help="Folder of a training run; several give several rows.",
 )  # fmt: skip
 references_option = click.option(
     "--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
     help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
 )  # fmt: skip
 denoisers_option = click.option(
-    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=Several, multiple=True,
+    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=RepeatableOption, multiple=True,
     help="Measure one that is not trained too, or several. none: dropped pixels stay black.",
 )  # fmt: skip
 kept_option = click.option(
-    "--kept", type=click.IntRange(1), cls=Several, multiple=True, metavar="K",
+    "--kept", type=click.IntRange(1), cls=RepeatableOption, multiple=True, metavar="K",
     help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
 )  # fmt: skip
 samples_option = click.option(

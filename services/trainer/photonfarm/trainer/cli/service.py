@@ -51,13 +51,13 @@ def run(
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
-    from photonfarm.trainer.runs.distributed import ALONE, leading, ranks
+    from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
     from photonfarm.trainer.training.assist import assist
     from photonfarm.trainer.training.loop import stop_on_signals
 
     settings = settings_of(preset_name, changes)
     with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
-        group = ours or ALONE
+        group = ours or SINGLE_PROCESS
         device = group.device(settings.device)
         if ours is not None and ours.rank:
             assist(partial(StoreSource, store), settings, folder, ours)

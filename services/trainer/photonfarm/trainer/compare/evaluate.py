@@ -21,7 +21,7 @@ from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
@@ -39,14 +39,14 @@ from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.evaluation import (
     NONE_COMPLETE,
     DevicePredictor,
-    HeldOut,
+    HeldOutErrors,
     Predictor,
     batches,
     by_turns,
     measure,
 )
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.runs.device import described, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
@@ -68,7 +68,7 @@ class PredictorRow:
 
     name: str
     kept: int | None  # it gets one of so many pixels of half A; None: no colour
-    held_out: HeldOut  # linear radiance × exposure, noise removed
+    held_out: HeldOutErrors  # linear radiance × exposure, noise removed
     seconds: Seconds  # of its network alone, for one image
     metrics: ImageMetrics | None  # in the metric space; None if no view has a reference
     shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
@@ -169,7 +169,7 @@ def compare(
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
-    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    samples = HeldOutSamples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
         kept_count(spec, kept)
@@ -177,7 +177,7 @@ def compare(
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found and not without_inception else None
     test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
-    untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    untrained = [UntrainedPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     leading, *others = test.timed([*runs, *untrained])
     first_of_all = test.measured(leading)
     if choose:
@@ -244,7 +244,7 @@ class _Watched:
 class _Timed:
     """A loaded predictor, and the time it takes for one image."""
 
-    predictor: TrainedRun | Untrained
+    predictor: TrainedRun | UntrainedPredictor
     predict: DevicePredictor
     seconds: Seconds
 
@@ -254,7 +254,7 @@ class _Measured:
     """A measured predictor, with its images of all rows that may be shown."""
 
     timed: _Timed
-    held_out: HeldOut
+    held_out: HeldOutErrors
     metrics: ImageMetrics | None
     images: dict[int, F32]
 
@@ -270,7 +270,7 @@ class _Test:
     """The samples, references and metrics that all predictors are measured with."""
 
     store: str | Path
-    samples: Samples
+    samples: HeldOutSamples
     references: Mapping[int, Reference]  # by row
     shown: list[int]  # rows
     inception: Inception | None
@@ -278,13 +278,13 @@ class _Test:
     tell: Tell
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def timed(self, predictors: Sequence[TrainedRun | Untrained]) -> list[_Timed]:
+    def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:
         """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
         ready = zip(predictors, calls, by_turns(calls), strict=True)
         return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
 
-    def _call(self, predictor: TrainedRun | Untrained) -> tuple[DevicePredictor, Inputs]:
+    def _call(self, predictor: TrainedRun | UntrainedPredictor) -> tuple[DevicePredictor, Inputs]:
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
             for batch in batches(feed, self.samples.rows, 1):
@@ -302,7 +302,7 @@ class _Test:
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
         return _Measured(timed, held_out, metrics, watched.images)
 
-    def _feed(self, predictor: TrainedRun | Untrained, *, batch: int) -> Feed:
+    def _feed(self, predictor: TrainedRun | UntrainedPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
         source = StoreSource(self.store, self.samples.source.spec.scene_id)
         return Feed(source, settings, needs=predictor.needs)

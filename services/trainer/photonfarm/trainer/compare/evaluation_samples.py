@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.store.read.merge import Merged
+from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.trainer.data.dataset import rows_held_out, units_of
 from photonfarm.trainer.data.store_source import StoreSource
 
@@ -28,7 +28,7 @@ class Reference:
     half_b: F32  # independent of `half_a`
 
     @classmethod
-    def of(cls, merged: Merged, exposure: float) -> Self:
+    def of(cls, merged: MergedView, exposure: float) -> Self:
         """The halves of a merged view, as float32: their noise is far above its steps, and there may be hundreds."""
         a, b = (np.float32(exposure) * half.astype(np.float32) for half in (merged.half_a, merged.half_b))
         return cls(merged.count, a, b)
@@ -69,7 +69,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class HeldOutSamples:
     """The held-out samples that all predictors are measured on: one of each view, however many passes there are."""
 
     source: StoreSource
@@ -77,7 +77,7 @@ class Samples:
     view_keys: list[Key]  # of each
 
     @classmethod
-    def of(cls, source: StoreSource, share: float, most: int) -> Samples:
+    def of(cls, source: StoreSource, share: float, most: int) -> HeldOutSamples:
         """The first sample of each view held out by the smallest share: as shares are nested, no run was trained on it.
 
         At most `most` views; IncompleteError if there is none.
@@ -109,7 +109,7 @@ class Samples:
         return Target(row, halves.mean(axis=0), 2 * half_spp, is_reference=False, half_a=halves[0])
 
 
-def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
+def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Reference]:
     """The references by the row of their view; raises SpecError if none can be used."""
     if not folder.is_dir():
         raise SpecError(f"{folder}: there is no such folder")
@@ -118,7 +118,7 @@ def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
     found: dict[int, Reference] = {}
     for row, key in zip(samples.rows, samples.view_keys, strict=True):
         if (file := folder / f"{key.hex()}.npz").is_file():
-            found[row] = Reference.of(Merged.read(file), spec.exposure)
+            found[row] = Reference.of(MergedView.read(file), spec.exposure)
             if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:

@@ -12,7 +12,7 @@ import torch
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 
 
@@ -40,11 +40,11 @@ class Growth:
         return self.log[place - 1][1] if place else 0
 
 
-class Following:
+class BatchStream:
     """Draws batches ahead of training, while they are being read. A `script` repeats the growth of an earlier run."""
 
     def __init__(
-        self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = ALONE
+        self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = SINGLE_PROCESS
     ) -> None:
         """Draw for all processes of a group, and read this one's part."""
         self._feed, self._settings, self._group = feed, settings, group

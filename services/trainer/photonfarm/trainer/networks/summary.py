@@ -36,7 +36,7 @@ DESCRIPTOR = "descriptor"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class NetworkPart:
     """A part of a network."""
 
     name: str
@@ -44,7 +44,7 @@ class Part:
     gmacs: float  # 10⁹ multiply-adds of matrix products and convolutions, for one image
 
 
-def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
+def summary(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
     """The parts of a scene's network. It makes one image of made-up points and buffers for this.
 
     A multiply-add is two of the operations that torch's FlopCounterMode counts, which are those of convolutions and
@@ -61,12 +61,12 @@ def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
     rest = counts["Global"] - sum(gmacs.values())
     parameters = _parameters(network)
     gmacs[OTHER if parameters[OTHER] else "projection"] = rest
-    return [Part(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
+    return [NetworkPart(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
 
 
-def table(parts: list[Part]) -> str:
+def table(parts: list[NetworkPart]) -> str:
     """The parts and their sum, a line each."""
-    total = Part("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
+    total = NetworkPart("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
     lines = [f"{part.name:<14}{part.parameters:>12,}{part.gmacs:>10.3f}" for part in (*parts, total)]
     return "\n".join([f"{'part':<14}{'parameters':>12}{'GMAC':>10}", *lines])
 

@@ -26,7 +26,7 @@ Predictor = Callable[[TrainingBatch], F32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
+class HeldOutErrors:
     """Errors over held-out samples, in squared exposed radiance per channel.
 
     Views and passes of one configuration are similarly difficult, so they are averaged first; configurations are the
@@ -129,7 +129,7 @@ def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
     return error(prediction, half_a, half_b)
 
 
-def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOut:
+def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
 
     For a predictor whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB.
@@ -149,4 +149,4 @@ def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOut:
         raise IncompleteError(NONE_COMPLETE)
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
-    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))
+    return HeldOutErrors(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))

@@ -38,7 +38,7 @@ NOT_JUDGED = "was trained on (it is not held out), so no error is told: the netw
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class InferResult:
     """The files that were written, and a sentence on the error or the time."""
 
     files: tuple[Path, ...]
@@ -61,7 +61,7 @@ def find_row(store: str | Path, run: TrainedRun, modification: str | None, view:
     return row
 
 
-def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> Written:
+def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> InferResult:
     """Write prediction.png and target.png, the mean of both noisy halves, of one sample; StoreError without it."""
     torch.set_num_threads(run.settings.threads)
     source = _source(store, run)
@@ -77,7 +77,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     for file, pixels in zip(files, shown.values(), strict=True):
         animation.write_png(animation.enlarged(pixels), file)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
-    return Written(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
+    return InferResult(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
 
 
 def _missing(source: StoreSource, row: int) -> str:
@@ -123,7 +123,7 @@ def _ended(code: int) -> PhotonfarmError:
 
 def show_frames(
     store: str | Path, run: TrainedRun, frames: Frames, out: Path, *, fps: float = 12.0, device: str = "auto"
-) -> Written:
+) -> InferResult:
     """Write the network's images of all frames: frame-0000.png …, path.gif, and path.mp4 where that can be made.
 
     Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
@@ -145,9 +145,9 @@ def show_frames(
     animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
     if not animation.can_write_mp4():
         sentence += "; no MP4: pip install photonfarm-trainer[video]"
-        return Written((*files, out / "path.gif"), sentence)
+        return InferResult((*files, out / "path.gif"), sentence)
     animation.write_mp4(map(animation.read_png, files), out / "path.mp4", fps)
-    return Written((*files, out / "path.gif", out / "path.mp4"), sentence)
+    return InferResult((*files, out / "path.gif", out / "path.mp4"), sentence)
 
 
 def check_path(run: TrainedRun) -> None:

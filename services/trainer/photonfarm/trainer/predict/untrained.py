@@ -15,7 +15,7 @@ from photonfarm.trainer.runs.settings import TrainSettings, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True)
-class Untrained:
+class UntrainedPredictor:
     """A denoiser that is given one of `kept` pixels of half A."""
 
     denoiser: UntrainedDenoiser

@@ -16,8 +16,8 @@ from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
-from photonfarm.trainer.report.baselines import Gauges
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
+from photonfarm.trainer.report.baselines import Baselines
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
 from photonfarm.trainer.report.machine import Machine
@@ -28,7 +28,7 @@ from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entry:
+class ReportEntry:
     """A row of the report's tables."""
 
     name: str
@@ -39,14 +39,14 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contents:
+class ReportContents:
     """A report: the data, the runs, the errors of their networks, and the worst cases of the first one."""
 
     card: DatasetCard
     stories: tuple[RunStory, ...]
-    gauges: Gauges
+    gauges: Baselines
     evaluation: Evaluation
-    entries: tuple[Entry, ...]
+    entries: tuple[ReportEntry, ...]
     costs: FrameCosts | None
     untimed: str  # why there are no costs
     machine: Machine  # on which times were taken
@@ -54,7 +54,7 @@ class Contents:
     published: str | None  # the name of the paper's table beside ours
 
     @property
-    def measure(self) -> Entry:
+    def measure(self) -> ReportEntry:
         """The entry that ratios of times refer to: light_transport, or else the first."""
         return next((entry for entry in self.entries if entry.architecture == "light_transport"), self.entries[0])
 
@@ -92,7 +92,7 @@ def gathered(
     device: str = "auto",
     tell: Tell | None = None,
     timed: bool = True,
-) -> Contents:
+) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
@@ -105,10 +105,10 @@ def gathered(
     costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
-    return Contents(
+    return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        gauges=Gauges.of(StoreSource(store, first.scene_id), first, evaluation.measured),
+        gauges=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
@@ -125,17 +125,17 @@ def _entries(
     measured: tuple[Sequence[TrainedRun], Sequence[tuple[UntrainedDenoiser, int]]],
     costs: FrameCosts | None,
     table: Mapping[str, Published],
-) -> list[Entry]:
+) -> list[ReportEntry]:
     runs, denoisers = measured
-    untrained = [Untrained(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | Untrained] = [*runs, *untrained]
+    untrained = [UntrainedPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
+    predictors: list[TrainedRun | UntrainedPredictor] = [*runs, *untrained]
     entries = []
     for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
         name, architecture = row.name, None
         if isinstance(predictor, TrainedRun):
             name, architecture = names[place], predictor.settings.network.architecture
         time = None if costs is None else frame_time(predictor, row.seconds, costs)
-        entries.append(Entry(name, architecture, row, time, table.get(architecture or "")))
+        entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return entries
 
 

@@ -16,7 +16,7 @@ SAMPLES = "samples"
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class PlanTotals:
     """The totals of the plans of one kind of request."""
 
     planned: int  # rows
@@ -33,7 +33,7 @@ class DatasetCard:
     requests: tuple[dict[str, Any], ...]  # of each plan: all rows follow from them
     versions: dict[str, list[str]]  # of the packages that rendered, each with all versions
     workers: int  # the number of workers
-    spent: dict[str, Spent]  # by the kind of the plans' requests; without kinds that have no committed job
+    spent: dict[str, PlanTotals]  # by the kind of the plans' requests; without kinds that have no committed job
 
     @classmethod
     def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
@@ -60,15 +60,15 @@ class DatasetCard:
         return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
 
     @property
-    def samples(self) -> Spent:
+    def samples(self) -> PlanTotals:
         """The rows of new views: the samples that networks are trained on, except held-out ones."""
-        return self.spent.get(SAMPLES, Spent(0, 0, 0.0))
+        return self.spent.get(SAMPLES, PlanTotals(0, 0, 0.0))
 
     @property
-    def further_passes(self) -> Spent:
+    def further_passes(self) -> PlanTotals:
         """The rows that add passes to views, such as for references."""
         others = [spent for kind, spent in self.spent.items() if kind != SAMPLES]
-        return Spent(*(sum(getattr(spent, name) for spent in others) for name in Spent.__slots__))
+        return PlanTotals(*(sum(getattr(spent, name) for spent in others) for name in PlanTotals.__slots__))
 
     @property
     def core_s_per_sample(self) -> float:
@@ -107,14 +107,14 @@ class DatasetCard:
         }
 
 
-def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, Spent]:
+def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
     """The totals by kind of request, given the seconds of the committed jobs."""
-    found: dict[str, Spent] = {}
+    found: dict[str, PlanTotals] = {}
     for plan in scene.plans():
         used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
         done = [job for job in range(plan.first_job, plan.end_job) if job in core_s]
-        before = found.get(plan.request.kind, Spent(0, 0, 0.0))
-        found[plan.request.kind] = Spent(
+        before = found.get(plan.request.kind, PlanTotals(0, 0, 0.0))
+        found[plan.request.kind] = PlanTotals(
             before.planned + plan.samples,
             before.rows + sum(int(used[job - plan.first_job]) for job in done),
             before.core_s + sum(core_s[job] for job in done),

@@ -15,7 +15,7 @@ from typing import Any
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
@@ -78,7 +78,7 @@ def points_used(runs: Sequence[TrainedRun]) -> int | None:
     return None if None in used else max((points for points in used if points), default=None)
 
 
-def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: FrameCosts) -> FrameTime:
+def frame_time(predictor: TrainedRun | UntrainedPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
     return FrameTime(
@@ -91,6 +91,6 @@ def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: Frame
     )
 
 
-def _sees_points(predictor: TrainedRun | Untrained) -> bool:
+def _sees_points(predictor: TrainedRun | UntrainedPredictor) -> bool:
     projects = predictor.needs.points and not predictor.needs.guides  # lit points are summed over, seen or not
     return projects and predictor.settings.network.occlusion == "exact"

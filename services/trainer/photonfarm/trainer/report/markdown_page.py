@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from photonfarm.trainer.compare.markdown import markdown_table
-from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 
-def markdown(contents: Contents, drawn: list[Plot], pictures: str) -> str:
+def markdown(contents: ReportContents, drawn: list[Plot], pictures: str) -> str:
     """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
     first, *others = tables(contents)
     card = "\n".join(f"- **{name}**: {value}" for name, value in facts(contents))

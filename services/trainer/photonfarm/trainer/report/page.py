@@ -7,7 +7,7 @@ from pathlib import Path
 from photonfarm.shared.core.pages import rendered
 from photonfarm.trainer.compare.evaluation_table import views_of
 from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.pictures import cases, first_row, legend_of_cases
 from photonfarm.trainer.report.plots import CURVES, Plot, by_kind
 from photonfarm.trainer.report.tables import facts, tables
@@ -16,7 +16,7 @@ TEMPLATE = Path(__file__).with_name("report.html.j2")
 LARGE_WIDTH = 256  # px, at least, of the pictures of the first row
 
 
-def page(contents: Contents, drawn: list[Plot]) -> str:
+def page(contents: ReportContents, drawn: list[Plot]) -> str:
     """The report's HTML."""
     curves = [plot for plot in drawn if plot.name.startswith(CURVES)]
     return rendered(
@@ -35,7 +35,7 @@ def page(contents: Contents, drawn: list[Plot]) -> str:
     )
 
 
-def headline(contents: Contents) -> list[tuple[str, str]]:
+def headline(contents: ReportContents) -> list[tuple[str, str]]:
     """Figures of the data and of the first entry, each with what it is."""
     card, evaluation = contents.card, contents.evaluation
     samples, colour = card.samples, contents.gauges.mean_colour.error.mean

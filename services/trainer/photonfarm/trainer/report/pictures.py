@@ -9,7 +9,7 @@ import numpy as np
 from photonfarm.shared.core.pictures import Picture, display, display_values
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.evaluation_samples import Target
-from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.contents import ReportContents
 
 OVERVIEW = "overview.png"
 OVERVIEW_WIDTH = 192  # px, at least, of each picture of it
@@ -45,7 +45,7 @@ class Panel:
     picture: Picture
 
 
-def rows(contents: Contents) -> list[list[Panel]]:
+def rows(contents: ReportContents) -> list[list[Panel]]:
     """Rows of pictures: the first entry's input, output, target and difference, one row for each view, best first."""
     entry = contents.entries[0]
     there = [target for target in contents.evaluation.shown if target.row in entry.row.shown]
@@ -54,13 +54,13 @@ def rows(contents: Contents) -> list[list[Panel]]:
     return [_panels(contents, shown, target) for shown, target in made]
 
 
-def first_row(contents: Contents) -> list[Panel]:
+def first_row(contents: ReportContents) -> list[Panel]:
     """The panels of the view whose error is the median of the shown ones; none if none was measured."""
     found = rows(contents)
     return found[(len(found) - 1) // 2] if found else []
 
 
-def overview(contents: Contents) -> Picture:
+def overview(contents: ReportContents) -> Picture:
     """All rows as one picture without text, each pixel enlarged."""
     lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in rows(contents)]
     sheet: Picture = np.concatenate(lines)
@@ -75,7 +75,7 @@ def _framed(picture: Picture) -> Picture:
     return framed
 
 
-def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
+def _panels(contents: ReportContents, shown: Shown, target: Target) -> list[Panel]:
     right = f"reference, {target.spp} samples per pixel" if target.is_reference else "mean of both noisy halves"
     half_spp = contents.card.spec.transport.half_spp
     return [
@@ -86,12 +86,12 @@ def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
     ]
 
 
-def cases(contents: Contents) -> list[Case]:
+def cases(contents: ReportContents) -> list[Case]:
     """The first views, then the worst ones."""
     return [_case(contents, target) for target in contents.evaluation.shown]
 
 
-def legend_of_cases(contents: Contents) -> str:
+def legend_of_cases(contents: ReportContents) -> str:
     """The legend of the pictures, in sentences."""
     others = "" if not contents.worst else f", then the worst cases of {contents.entries[0].name}, found automatically"
     return (
@@ -101,7 +101,7 @@ def legend_of_cases(contents: Contents) -> str:
     )
 
 
-def _case(contents: Contents, target: Target) -> Case:
+def _case(contents: ReportContents, target: Target) -> Case:
     kinds = [f"worst of {case.kind}" for case in contents.worst if case.row == target.row]
     what = "reference" if target.is_reference else "noisy target"
     caption = f"row {target.row}{''.join(f', {kind}' for kind in kinds)}; {what} of {target.spp} samples per pixel"

@@ -15,7 +15,7 @@ from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, wai
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class CurvePoint:
     """A validation of a run."""
 
     step: int
@@ -38,7 +38,7 @@ class RunStory:
     name: str
     run: TrainedRun
     state: dict[str, Any]  # of the checkpoint, without weights
-    curve: tuple[Point, ...]
+    curve: tuple[CurvePoint, ...]
 
     @classmethod
     def of(cls, name: str, run: TrainedRun) -> RunStory:
@@ -48,7 +48,7 @@ class RunStory:
         arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
         training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived
         points = (
-            Point(
+            CurvePoint(
                 r["step"], r["draws"], r["samples"], min(r["draws"], int(training[min(r["samples"], len(arrived))])),
                 r["seconds"]["train"], r["error"], r["held_out"],
             )
@@ -69,7 +69,7 @@ class RunStory:
         device = self.run.settings.device
         return (str(usable_device(device)) if device == AUTO else device).startswith("cuda")
 
-    def step_core_s(self, point: Point) -> float:
+    def step_core_s(self, point: CurvePoint) -> float:
         """The core-seconds of the steps up to a point; on a GPU their wall seconds."""
         return point.train_s * (1 if self.on_gpu else self.run.settings.threads)
 

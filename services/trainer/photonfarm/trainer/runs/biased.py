@@ -18,7 +18,7 @@ PAGE = "docs/results/firefly.md"
 
 
 @dataclass(frozen=True, slots=True)
-class Bias:
+class BiasReason:
     """The reason why a setting is refused."""
 
     why: str
@@ -33,21 +33,21 @@ class Bias:
         return f"is refused, as it biases under noisy targets: {self.why}{measured}; {instead}"
 
 
-L1 = Bias("its least is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
-HUBER = Bias("its least is between the targets' median and their mean", (0.32, 0.39, 0.88))
-LOG = Bias("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
-DISPLAY = Bias("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
-TARGET_WEIGHT = Bias("the weight depends on the target's own noise", (0.20, 0.27, 0.59))
-UNDETACHED = Bias(
+L1 = BiasReason("its least is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
+HUBER = BiasReason("its least is between the targets' median and their mean", (0.32, 0.39, 0.88))
+LOG = BiasReason("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
+DISPLAY = BiasReason("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
+TARGET_WEIGHT = BiasReason("the weight depends on the target's own noise", (0.20, 0.27, 0.59))
+UNDETACHED = BiasReason(
     "the gradient passes through the weight, which rewards bright predictions of noisy pixels", (10.73, 3.36, 1.05)
 )
-STRUCTURE = Bias("it compares contrasts and features, which noise adds to and averaging takes away")
-CLIPPED_GRADIENT = Bias(
+STRUCTURE = BiasReason("it compares contrasts and features, which noise adds to and averaging takes away")
+CLIPPED_GRADIENT = BiasReason(
     "it shortens most the steps in which a rare bright target would make up for the others", HUBER.ends_at
 )
-CLAMPED = Bias("clamped targets have a smaller mean than the clean image", (0.33, 0.40, 0.79))
+CLAMPED = BiasReason("clamped targets have a smaller mean than the clean image", (0.33, 0.40, 0.79))
 
-LOSSES: Mapping[str, Bias] = {
+LOSSES: Mapping[str, BiasReason] = {
     **dict.fromkeys(("l1", "mae", "absolute"), L1),
     **dict.fromkeys(("huber", "smooth_l1", "charbonnier"), HUBER),
     **dict.fromkeys(("log", "log1p", "log_mse", "msle"), LOG),
@@ -58,7 +58,7 @@ LOSSES: Mapping[str, Bias] = {
 }
 """The values of `loss` that users of other trainers know."""
 
-KEYS: Mapping[str, Bias] = {
+KEYS: Mapping[str, BiasReason] = {
     **dict.fromkeys(("gradient_clip", "gradient_clipping", "gradient_clip_val", "grad_clip"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clip_gradient", "clip_gradients", "clip_grad_norm", "max_grad_norm"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clamp", "clamp_targets", "clip_targets", "firefly_clamp", "max_radiance"), CLAMPED),

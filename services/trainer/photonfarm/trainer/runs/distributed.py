@@ -53,7 +53,7 @@ class TrainingGroup(Protocol):
         """The loss over the joint batch; the weights get its gradient. `count` samples are of this process."""
 
 
-class Alone:
+class SingleProcess:
     """A process that trains by itself."""
 
     within_step = False
@@ -78,7 +78,7 @@ class Alone:
         return loss.item()
 
 
-ALONE = Alone()
+SINGLE_PROCESS = SingleProcess()
 
 
 class Ranks:

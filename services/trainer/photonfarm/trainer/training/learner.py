@@ -13,7 +13,7 @@ from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.average import WeightAverage
 from photonfarm.trainer.training.losses import loss_of
@@ -38,7 +38,7 @@ class DivergedError(IncompleteError):
 class Learner:
     """The network of a scene, equal in all processes of a group, before and after each step."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, group: TrainingGroup = ALONE) -> None:
+    def __init__(self, feed: Feed, settings: TrainSettings, group: TrainingGroup = SINGLE_PROCESS) -> None:
         """Make the untrained network of the feed's scene, on the device of this process."""
         frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
         self._settings, self._group = settings, group

@@ -18,18 +18,18 @@ from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.processes import Stop
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.growth import Following, Growth
+from photonfarm.trainer.data.growth import BatchStream, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import ALONE, TrainingGroup
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, waits
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
-from photonfarm.trainer.training.validation import Best, Comparison, Show, Validation, compared, validate
+from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ NAP_SECONDS = 0.05  # between looks at the feed while there is nothing to train 
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
@@ -69,12 +69,12 @@ class Hooks:
     # samples that have arrived
     on_images: Show | None = None  # at each validation: step, targets and predictions of the first held-out samples
     script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
-    group: TrainingGroup = ALONE  # the processes that share each batch; this one is rank 0
+    group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
     waited: float = 0.0  # seconds that have passed already
     clock: Callable[[], float] = time.monotonic
 
 
-def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> Outcome:
+def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `hooks.stop` is set; each
@@ -92,7 +92,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
     with held(run):
         while not source.ready():
             if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
-                return Outcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
+                return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
         with Feed(source, settings, hooks.clock) as feed:
             return Session(feed, settings, run, watch, hooks).run()
@@ -107,15 +107,15 @@ class Session:
         self._log = MetricsLog(run / METRICS, hooks.on_record)
         self._learner = Learner(feed, settings, hooks.group)
         self._good = GoodState(self._learner)
-        self._best: Best | None = None
-        self._following = Following(feed, settings, hooks.script, hooks.group)
+        self._best: BestValidation | None = None
+        self._following = BatchStream(feed, settings, hooks.script, hooks.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
         self._seconds_told: dict[str, float] = {}  # at the last validation
 
-    def run(self) -> Outcome:
+    def run(self) -> TrainingOutcome:
         """Train until something ends it."""
         self._begin()
         self._watch.turn("other")
@@ -132,7 +132,7 @@ class Session:
             self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
-        return Outcome(self._step, reason, self._last_error)
+        return TrainingOutcome(self._step, reason, self._last_error)
 
     def _begin(self) -> None:
         path = self._run / CHECKPOINT
@@ -162,7 +162,7 @@ class Session:
         settle(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
         if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
-            self._best = Best.of(recovery["best"])
+            self._best = BestValidation.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
         self._seconds_told = dict(state["seconds"])
@@ -275,7 +275,7 @@ class Session:
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
         if self._compared.is_best:
-            self._best = Best(now.step, now.errors, now.by_shown)
+            self._best = BestValidation(now.step, now.errors, now.by_shown)
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""

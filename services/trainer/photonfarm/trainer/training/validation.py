@@ -13,7 +13,7 @@ import torch
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.data.dataset import TrainingBatch
-from photonfarm.trainer.predict.evaluation import HeldOut, Predictor, measure
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 
 Show = Callable[[int, F32, F32], None]
 
@@ -33,7 +33,7 @@ class Validation:
 
     step: int
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
-    held_out: HeldOut
+    held_out: HeldOutErrors
     by_shown: bool = False  # compare the error of light up to white, and not that of all light
 
     @property
@@ -77,7 +77,7 @@ def validate(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Best:
+class BestValidation:
     """The best validation of a run so far."""
 
     step: int
@@ -135,7 +135,7 @@ class Comparison:
         return {name: error if math.isfinite(error) else None for name, error in errors.items()}
 
 
-def compared(now: Validation, best: Best | None) -> Comparison:
+def compared(now: Validation, best: BestValidation | None) -> Comparison:
     """Compare a validation with the best one; with itself if there is none of the same rows and the same error.
 
     The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows

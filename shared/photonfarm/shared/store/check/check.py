@@ -16,7 +16,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.guide_check import GuideCheck
 from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.job_pool import JobPool
 from photonfarm.shared.store.check.plan_check import PlanCheck
 from photonfarm.shared.store.check.plan_repair import PlanRepair
@@ -135,7 +135,7 @@ class _SceneChecking:
         self._add(inputs.check_base(committed))
         scene = None
         if inputs.shard_rows is not None:
-            scene = Checked(
+            scene = CheckTarget(
                 self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
             self._jobs(scene, sorted(committed))
@@ -164,13 +164,13 @@ class _SceneChecking:
         self._add([finding for finding in check.check_plans() if finding not in found])
         return check, rewritten
 
-    def _jobs(self, scene: Checked, committed: list[int]) -> None:
+    def _jobs(self, scene: CheckTarget, committed: list[int]) -> None:
         self._read(scene, committed, self._tally, scene.spec.name)
         self._add(self._again(equal_samples(scene, self._tally)))
         if (halves := self._tally.halves.result()) is not None and not halves.passed:
             self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
 
-    def _guides(self, guides: Checked, committed: set[int], quarantine: Quarantine | None) -> list[str]:
+    def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
         """Check the scene's guides, if it has some; returns what of their settings and declarations was mended."""
         if not self._storage.names(guides.name):
             return []
@@ -180,7 +180,7 @@ class _SceneChecking:
         self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
         return check.repair(quarantine, found) if quarantine else []
 
-    def _read(self, scene: Checked, committed: list[int], total: CheckTotals, called: str) -> None:
+    def _read(self, scene: CheckTarget, committed: list[int], total: CheckTotals, called: str) -> None:
         """Read everything that committed jobs stored there, and look for what is missing."""
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):
@@ -228,7 +228,7 @@ class _SceneChecking:
 
     # ----------------------------------------------------------------------------------------------------------- repair
 
-    def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
+    def _repair(self, scene: CheckTarget | None, quarantine: Quarantine) -> list[str]:
         aside = []
         for (guides, job), why in sorted(self._findings.jobs.items(), key=lambda found: found[0]):
             if scene is None or scene.plans is None:
@@ -248,7 +248,7 @@ class _SceneChecking:
                 aside.append(f"job {jobs - 1} (whole; rendered again, as a job writes the base)")
         return aside
 
-    def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
+    def _set_aside(self, scene: CheckTarget, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
         files = set(scene.files_of(job).values())
         try:
             marker = self._marker((scene.guides, job))

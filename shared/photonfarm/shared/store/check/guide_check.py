@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence, Set
 from typing import Any
 
 from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.plan_check import UNREADABLE, declaration
 from photonfarm.shared.store.check.plan_repair import differs
 from photonfarm.shared.store.write import plans
@@ -25,7 +25,7 @@ _GONE = "is missing, and guides are there"
 class GuideCheck:
     """Checks settings and declarations of one scene's guides, and mends them."""
 
-    def __init__(self, guides: Checked, committed: Set[int]) -> None:
+    def __init__(self, guides: CheckTarget, committed: Set[int]) -> None:
         """Take the guides, and the jobs that had their marker before anything else was read."""
         self._guides = guides
         self._committed = committed

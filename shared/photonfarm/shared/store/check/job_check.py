@@ -28,7 +28,7 @@ KINDS: tuple[schema.Kind, ...] = ("sample", "view", "modification")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Checked:
+class CheckTarget:
     """A folder with plans and markers that is being checked: a scene's samples, or its guides."""
 
     storage: Storage
@@ -40,7 +40,7 @@ class Checked:
     lost: frozenset[str] = frozenset()  # folders of plans that are missing
     guides: bool = False  # True: the folder of the guides
 
-    def of_guides(self) -> Checked:
+    def of_guides(self) -> CheckTarget:
         """The guides of the scene, whose plans and jobs have the same numbers."""
         name = f"{self.name}/{GUIDES}"
         found = None if self.plans is None else [beside(plan, name) for plan in self.plans]
@@ -79,7 +79,7 @@ class Checked:
 class JobCheck:
     """Checks jobs of a scene one after the other, with the same memory for each."""
 
-    def __init__(self, scene: Checked) -> None:
+    def __init__(self, scene: CheckTarget) -> None:
         self._scene = scene
         self._finding = scene.finding
         self._arrays = scene.arrays

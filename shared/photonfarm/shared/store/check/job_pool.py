@@ -11,7 +11,7 @@ from typing import Self
 from photonfarm.shared.core.processes import usable_cores
 from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.halves import HalvesTest
-from photonfarm.shared.store.check.job_check import Checked, JobCheck
+from photonfarm.shared.store.check.job_check import CheckTarget, JobCheck
 from photonfarm.shared.store.io.storage import renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 
@@ -22,7 +22,7 @@ MOST_THREADS = 4
 class JobPool:
     """Threads that check jobs, each with memory of its own; a context manager."""
 
-    def __init__(self, scene: Checked, scenes: int) -> None:
+    def __init__(self, scene: CheckTarget, scenes: int) -> None:
         self.tallies: list[CheckTotals] = []
         self._own = threading.local()
         self._scene = scene
@@ -57,7 +57,7 @@ class JobPool:
 class _Checker:
     """Checks jobs of a scene one after the other; tells damage of the store from that of this machine's copies."""
 
-    def __init__(self, scene: Checked, scenes: int) -> None:
+    def __init__(self, scene: CheckTarget, scenes: int) -> None:
         self.tally = CheckTotals(HalvesTest(scenes))
         self._scene = scene
         self._scenes = scenes

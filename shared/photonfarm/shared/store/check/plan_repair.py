@@ -23,11 +23,11 @@ from photonfarm.shared.core.errors import CorruptError, SpecError
 from photonfarm.shared.plan.request import UNUSED, PlannedRows
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.format.declarations import Declared
+from photonfarm.shared.store.format.declarations import ArrayDeclaration
 from photonfarm.shared.store.io.storage import Storage, read_or_none
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Finding
-from photonfarm.shared.store.write.plans import About, StoredPlan
+from photonfarm.shared.store.write.plans import PlanAttributes, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
 
 Mask = NDArray[np.bool_]
@@ -70,7 +70,7 @@ class PlanRepair:
         finally:
             shutil.rmtree(built, ignore_errors=True)
 
-    def _about(self, folder: str) -> About:
+    def _about(self, folder: str) -> PlanAttributes:
         import zarr
 
         try:
@@ -79,7 +79,7 @@ class PlanRepair:
         except (ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError) as error:
             raise self._hopeless(folder, f"its zarr.json cannot be read: {error}") from error
 
-    def _rows(self, folder: str, about: About, before: list[StoredPlan]) -> PlannedRows:
+    def _rows(self, folder: str, about: PlanAttributes, before: list[StoredPlan]) -> PlannedRows:
         """The rows that the request gives after the earlier plans."""
         first_job = before[-1].end_job if before else 0
         if about.first_job != first_job or any(plan.shard_rows != about.shard_rows for plan in before):
@@ -116,7 +116,7 @@ class PlanRepair:
             raise self._hopeless(folder, "too little of it can be read to tell that its request gives the same")
 
     def _intact_chunks(
-        self, folder: str, declared: Declared, values: NDArray[Any]
+        self, folder: str, declared: ArrayDeclaration, values: NDArray[Any]
     ) -> Iterator[tuple[int, NDArray[Any]]]:
         """The chunks that are whole by their checksum, each with its first row; read without the array's zarr.json."""
         length = min(max(len(values), 1), schema.INPUT_ROWS_PER_CHUNK)

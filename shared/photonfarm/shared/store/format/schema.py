@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.records import LIT_POINTS
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, Declared
+from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
     import zarr
@@ -68,7 +68,7 @@ def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     return _arrays(GUIDES, spec)
 
 
-def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySchema]:
+def _arrays(declared: Iterable[ArrayDeclaration], spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
@@ -98,7 +98,7 @@ def bit_counts(spec: SceneSpec) -> dict[str, int]:
     return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
 
 
-def _resolved(declared: Declared, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
+def _resolved(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
     exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
     scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
     return ArraySchema(
@@ -134,7 +134,7 @@ def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, 
         )
 
 
-def create_input(group: zarr.Group, declared: Declared, data: NDArray[Any]) -> None:
+def create_input(group: zarr.Group, declared: ArrayDeclaration, data: NDArray[Any]) -> None:
     """Store a whole array of inputs or of the base, compressed and with checksums; `data` has the declared type."""
     chunks = (min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:]))
     little = data.astype(declared.dtype, casting="equiv", copy=False)

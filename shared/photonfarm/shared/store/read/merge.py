@@ -47,7 +47,7 @@ _AT_ONCE = 1 << 15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Merged:
+class MergedView:
     """One view, estimated from all of its merged passes; linear radiance, unscaled."""
 
     passes: int
@@ -113,7 +113,7 @@ class Moments:
             raise ValueError(f"{self.passes + passes} passes are more than the {MAX_PASSES} that are summed exactly")
         self.passes += passes
 
-    def merged(self) -> Merged:
+    def merged(self) -> MergedView:
         """The image; raises ValueError without passes."""
         if not self.passes:
             raise ValueError("no pass to merge")
@@ -123,7 +123,7 @@ class Moments:
             at = slice(start, start + _AT_ONCE)
             images[:, at] = self._quotients(at)
         mean, m2, half_a, half_b = images.reshape(4, *shape)
-        return Merged(self.passes, mean, m2, half_a, half_b)
+        return MergedView(self.passes, mean, m2, half_a, half_b)
 
     def _quotients(self, at: slice) -> list[list[float]]:
         """Mean, M2, A and B of some values: `whole` numbers are multiples of 2^(32 · _LOWEST)."""
@@ -200,7 +200,7 @@ def merge_rows(reader: SceneReader, rows: Iterable[int]) -> Moments:
     return moments
 
 
-def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, Merged]]:
+def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, MergedView]]:
     """The views of the samples that match a query: their content keys, and all complete passes of each.
 
     A view needs one complete sample that matches, and at least `least` complete passes.
@@ -215,7 +215,7 @@ def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tup
         yield reader.view_key(row).hex(), merge_view(reader, view_row)
 
 
-def merge_view(reader: SceneReader, view_row: int) -> Merged:
+def merge_view(reader: SceneReader, view_row: int) -> MergedView:
     """All passes of a view that were complete at the reader's last refresh; raises StoreError if there is none."""
     rows = reader.rows_of_view(view_row).tolist()
     if not rows:

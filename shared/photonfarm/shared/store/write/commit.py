@@ -57,7 +57,7 @@ def _utc_now() -> datetime:
     return datetime.now(UTC)
 
 
-class Committed(Protocol):
+class CommitTarget(Protocol):
     """The target of a commit: a scene, or its guides."""
 
     @property
@@ -81,7 +81,7 @@ class Committed(Protocol):
 
 
 class RowWriter(ABC):
-    """Takes rows of a job's arrays in any order, and commits them to a `Committed` once all are there.
+    """Takes rows of a job's arrays in any order, and commits them to a `CommitTarget` once all are there.
 
     A context manager: leaving it without `commit` leaves nothing behind. Arrays must not be changed after they are
     passed. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
@@ -89,7 +89,7 @@ class RowWriter(ABC):
     """
 
     def __init__(
-        self, scene: Committed, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
+        self, scene: CommitTarget, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
     ) -> None:
         """Begin; `plan` determines the folder of the arrays."""
         self._scene = scene
@@ -329,7 +329,7 @@ class RowWriter(ABC):
 class JobWriter(RowWriter):
     """Takes a job's outputs: radiance of its samples, buffers of new views, photons of new modifications."""
 
-    def __init__(self, scene: Committed, rows: JobRows, plan: StoredPlan) -> None:
+    def __init__(self, scene: CommitTarget, rows: JobRows, plan: StoredPlan) -> None:
         """Begin; `SceneStore.job_writer` calls this."""
         super().__init__(scene, rows, plan, schema.output_arrays(scene.spec))
 

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from photonfarm.shared.core.errors import CorruptError, store_errors
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import UNUSED, Expansion, Known, PlannedRows, Request, expand
+from photonfarm.shared.plan.request import UNUSED, Expansion, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec, sentences
@@ -81,7 +81,7 @@ class StoredPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class PlanAttributes:
     """The attributes of a plan's group."""
 
     request: Request | TopUp
@@ -125,7 +125,7 @@ def expanded(
     spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
     """The rows of a request that the earlier plans do not have: a function of these, the same each time."""
-    known = Known((plan.first_row, plan.rows) for plan in before)
+    known = PlannedContent((plan.first_row, plan.rows) for plan in before)
     if isinstance(request, TopUp):
         return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
@@ -211,10 +211,10 @@ def check_version(attributes: Mapping[str, Any], where: str) -> None:
     declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
 
 
-def about_plan(attributes: dict[str, Any]) -> About:
+def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
     """Read the attributes of a plan's group; raises ValueError or KeyError."""
     request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
-    return About(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
+    return PlanAttributes(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

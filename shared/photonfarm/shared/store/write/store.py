@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
-from photonfarm.shared.plan.request import SHARD_ROWS, Known, Request, expand
+from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations
 from photonfarm.shared.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
@@ -98,7 +98,7 @@ class Store:
     ) -> PlanResult:
         """Plan the new samples of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
         if dry_run and not self.has_scene(spec.scene_id):
-            expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
+            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
         return scene.plan(request, shard_rows=shard_rows, dry_run=dry_run)

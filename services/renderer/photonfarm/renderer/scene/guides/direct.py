@@ -17,7 +17,7 @@ from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted
+from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, PatternSampler, pattern_of, shifted
 from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.shared.core.keys import Key, Stream
@@ -54,7 +54,7 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
     si.sh_frame = mi.Frame3f(si.n)
-    light = sample_direct(lights, si, Points(u), dr.full(mi.Bool, True, count))
+    light = sample_direct(lights, si, PatternSampler(u), dr.full(mi.Bool, True, count))
     cosine = dr.dot(si.n, light.d)
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
     lit = light.valid & (cosine > 0)
@@ -68,7 +68,7 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class RayArrival:
     """How rays reached a surface."""
 
     met: Any  # Bool: there is a surface
@@ -86,14 +86,14 @@ class _Sum:
 
 
 @dataclass(slots=True)
-class Arrives:
+class ReflectedLight:
     """Reflected direct light."""
 
     diffuse: Any  # Color3f: by a white diffuse surface
     whole: Any  # Color3f: by the surface as it is
 
-    def __add__(self, more: Arrives) -> Arrives:
-        return Arrives(self.diffuse + more.diffuse, self.whole + more.whole)
+    def __add__(self, more: ReflectedLight) -> ReflectedLight:
+        return ReflectedLight(self.diffuse + more.diffuse, self.whole + more.whole)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +111,10 @@ class _Surface:
 
 
 def lit(
-    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: GuideSettings
-) -> Arrives:
+    scene: Any, lights: Lights | None, si: Any, seen: RayArrival, pattern: Any, shift: Any, settings: GuideSettings
+) -> ReflectedLight:
     """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
-    nothing = Arrives(mi.Color3f(0), mi.Color3f(0))
+    nothing = ReflectedLight(mi.Color3f(0), mi.Color3f(0))
     if lights is None or not settings.light_samples:
         return nothing
     flags = si.bsdf().flags()
@@ -127,13 +127,13 @@ def lit(
     return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
 
 
-def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
     count = at.settings.light_samples
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(at.lights, si, Points(shifted(pattern, shift, s.index)), at.diffuse | at.other)
+        light = sample_direct(at.lights, si, PatternSampler(shifted(pattern, shift, s.index)), at.diffuse | at.other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
         lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
         cosine = dr.dot(at.normal, light.d)
@@ -153,10 +153,10 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     )
     diffuse = sums.diffuse / count
     of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
-    return Arrives(diffuse, sums.whole / count + of_diffuse)
+    return ReflectedLight(diffuse, sums.whole / count + of_diffuse)
 
 
-def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
+def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
     u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
@@ -167,7 +167,7 @@ def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
     emitted = emitter.eval(found, at.other)
-    return Arrives(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+    return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
 
 
 def turned(normal: Any, direction: Any) -> Any:

@@ -35,7 +35,7 @@ def shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
     return [x - dr.floor(x) for x in u]
 
 
-class Points:
+class PatternSampler:
     """Three numbers in place of the integrator's sampler: one chooses a light, two a point on it."""
 
     def __init__(self, u: list[Any]) -> None:

@@ -11,7 +11,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.guides.direct import Seen, lit, turned
+from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned
 from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.guides.specular import specular_of
 from photonfarm.renderer.scene.materials import is_pure_delta
@@ -34,7 +34,7 @@ def trace(
     path, last = _followed(scene, ray, first, before, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = diffuse_reflectance(last, met)
-    arrives = lit(scene, lights, last, Seen(met, path.ray.d, path.followed), pattern, shift, settings)
+    arrives = lit(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
     found = {
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),

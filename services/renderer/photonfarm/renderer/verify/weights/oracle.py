@@ -26,7 +26,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paths:
+class OraclePaths:
     """N paths of k edges, as they lie in the scene, and the densities of single steps.
 
     Columns of ends without a value (the lens and a point light have no normal) are not read.
@@ -64,7 +64,7 @@ def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64
     return counts
 
 
-def weights(paths: Paths, counts: F64) -> F64:
+def weights(paths: OraclePaths, counts: F64) -> F64:
     """[N, k + 1]: the weight of each technique; 0 if it cannot make the path, NaN if none can."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = log_densities(paths) + np.log(counts)
@@ -73,7 +73,7 @@ def weights(paths: Paths, counts: F64) -> F64:
     return weighted / total
 
 
-def log_densities(paths: Paths) -> F64:
+def log_densities(paths: OraclePaths) -> F64:
     """[N, k + 1]: log of each technique's density; −∞ if it cannot make the path."""
     k = paths.edges
     r2, at_light_end, at_eye_end = _edges(paths)
@@ -92,7 +92,7 @@ def log_densities(paths: Paths) -> F64:
     return logs
 
 
-def _edges(paths: Paths) -> tuple[F64, F64, F64]:
+def _edges(paths: OraclePaths) -> tuple[F64, F64, F64]:
     """(squared length, |cos| at the end nearer the light, |cos| at the other) of each edge, [N, k]."""
     offset = np.diff(paths.position, axis=1)
     offset[:, 0] = np.where(paths.infinite[:, None], -paths.distant, offset[:, 0])
@@ -103,7 +103,7 @@ def _edges(paths: Paths) -> tuple[F64, F64, F64]:
     return r2, at_light_end, at_eye_end
 
 
-def _log_from_light(paths: Paths, to_eye: F64, area: F64, cos_0: F64) -> list[F64]:
+def _log_from_light(paths: OraclePaths, to_eye: F64, area: F64, cos_0: F64) -> list[F64]:
     """Log density of the first s vertices, made from the light, for s = 0 … k."""
     start = np.log(paths.emission) + np.log(np.where(paths.light_has_cosine, cos_0, 1))
     logs = [np.zeros(len(cos_0)), np.log(paths.next_event), start + area[:, 0]]
@@ -112,7 +112,7 @@ def _log_from_light(paths: Paths, to_eye: F64, area: F64, cos_0: F64) -> list[F6
     return logs
 
 
-def _log_from_eye(paths: Paths, to_light: F64, area: F64) -> list[F64]:
+def _log_from_eye(paths: OraclePaths, to_light: F64, area: F64) -> list[F64]:
     """Log density of the last t vertices, made from the lens, for t = 0 … k + 1; the lens itself counts 1."""
     k = paths.edges
     logs = [np.zeros(len(area)), np.zeros(len(area)), np.log(paths.camera) + area[:, k - 1]]

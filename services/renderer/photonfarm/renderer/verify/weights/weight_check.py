@@ -16,7 +16,7 @@ from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
 from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCounts, stored, walk, weights_of
-from photonfarm.renderer.verify.weights.oracle import Mask, Paths
+from photonfarm.renderer.verify.weights.oracle import Mask, OraclePaths
 
 TOLERANCE = 1e-3
 """The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""
@@ -127,7 +127,7 @@ def compare_weights(
     return result
 
 
-def _can_be_walked(paths: Paths) -> Mask:
+def _can_be_walked(paths: OraclePaths) -> Mask:
     """[N]: whether eye paths find all vertices.
 
     Rays start a little off surfaces: seen from the vertex itself the next one may be hidden by a grazing surface.

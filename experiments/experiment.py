@@ -59,7 +59,6 @@ class Experiment(Frozen):
     title: str
     part: Part
     about: str  # what was made movable, and why
-    sampling: str  # why it is rendered with these connections and light paths
     scene: str  # the spec, beside the file
     changes: Mapping[str, Any] = Field(default_factory=dict)  # of the spec, for every size
     runs: tuple[Run, ...] = ()  # beside one of each architecture

@@ -119,7 +119,7 @@ class Stages:
 
     def _is_trained(self, run: Run) -> bool:
         """Whether the last checkpoint of a run is its end. Raises StageError where it is not of what is asked for."""
-        from photonfarm.trainer import checkpoint  # here, as it brings torch
+        from photonfarm.trainer.runs import checkpoint  # here, as it brings torch
 
         if not self._checkpoint(run).is_file():
             return False

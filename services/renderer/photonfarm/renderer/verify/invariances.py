@@ -62,7 +62,7 @@ class Check:
     @property
     def command(self) -> str:
         """Runs it again."""
-        return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
+        return f"python -m bench.renderer.stability --invariances {self.name}" + " --quick" * (not self.long)
 
     def run(self) -> Finding:
         """Render what it takes, and judge."""

@@ -15,7 +15,7 @@ def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) ->
     """Adam or RMSprop over these weights, without weight decay, momentum of RMSprop or gradient clipping.
 
     Both divide each weight's step by the root of a running mean of its squared gradients, and so both darken where
-    bright targets are rarer than that mean is long (bench/firefly.py).
+    bright targets are rarer than that mean is long (bench/trainer/firefly.py).
     """
     if settings.optimiser == "rmsprop":
         return torch.optim.RMSprop(weights, lr=settings.learning_rate, alpha=settings.alpha)

@@ -143,7 +143,8 @@ def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Cal
             final = bare / name
             part = bare / f"{os.getpid()}.partial"
             with part.open("xb", buffering=0) as file:
-                assert file.write(noise[:size].data) == size
+                if file.write(noise[:size].data) != size:
+                    raise OSError(f"{part}: cut short")
                 os.fdatasync(file.fileno())
             os.link(part, final)
             part.unlink()

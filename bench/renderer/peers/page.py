@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from bench.harness.results import table
 from bench.renderer.peers.plans import BASELINE, PLAN_SECONDS
 from bench.renderer.peers.verdict import verdict
-from bench.renderer.peers.wording import LABELS, SAME_SCENE, Z_LIMIT, figure, mark, table_line, table_rule
+from bench.renderer.peers.wording import LABELS, SAME_SCENE, Z_LIMIT, figure, mark
 
 EXPLANATION = """\
 One image of each method at the same {clock} time, {seconds:g} s on {threads}, at {size}² pixels; samples per
@@ -71,12 +72,12 @@ def plural(count: int, noun: str) -> str:
 def summary(results: list[dict[str, Any]]) -> list[str]:
     """Efficiencies of all scenes, full / trimmed."""
     methods = [m for m in LABELS if m != "path" and any(m in r["rows"] for r in results)]
-    lines = ["## Efficiency relative to `path`: full / trimmed\n", table_line("scene", *(LABELS[m] for m in methods))]
-    lines.append(table_rule(1 + len(methods)))
-    for result in results:
-        cells = [efficiencies(result, method) for method in methods]
-        lines.append(table_line(f"[{result['line']}](render/{result['line']}.png)", *cells))
-    return [*lines, ""]
+    lines = [
+        [f"[{result['line']}](render/{result['line']}.png)", *(efficiencies(result, method) for method in methods)]
+        for result in results
+    ]
+    header = ("scene", *(LABELS[m] for m in methods))
+    return ["## Efficiency relative to `path`: full / trimmed\n", table(header, lines), ""]
 
 
 def efficiencies(result: dict[str, Any], method: str) -> str:
@@ -89,11 +90,7 @@ def efficiencies(result: dict[str, Any], method: str) -> str:
 
 def scenes(results: list[dict[str, Any]]) -> list[str]:
     """What was rendered, and against what."""
-    lines = [
-        "## Scenes\n",
-        table_line("line", "scene", "max_depth", "reference", "chosen", "pyluxcore", "note"),
-        table_rule(7),
-    ]
+    lines = []
     for r in results:
         picked = r["chosen"]
         chosen = (
@@ -103,15 +100,15 @@ def scenes(results: list[dict[str, Any]]) -> list[str]:
         )
         lux = r["absent"].get("pyluxcore") or "; ".join(r["differences"]) or "the same"
         lux = lux if "pyluxcore" in r["absent"] or "pyluxcore" in r["rows"] else "–"
-        lines.append(table_line(r["line"], r["scene"], r["max_depth"], r["reference"], chosen, lux, r["note"]))
-    return [*lines, ""]
+        lines.append((r["line"], r["scene"], r["max_depth"], r["reference"], chosen, lux, r["note"]))
+    header = ("line", "scene", "max_depth", "reference", "chosen", "pyluxcore", "note")
+    return ["## Scenes\n", table(header, lines), ""]
 
 
 def details(result: dict[str, Any]) -> list[str]:
     """One scene's table."""
     columns = ("method", "spp", "wall s", "CPU s", "compile s", "mean", "relMSE", "trimmed", "efficiency", "trimmed")
-    lines = [f"## {result['line']}\n", f"![relMSE against time](render/{result['line']}.png)\n"]
-    lines += [table_line(*columns), table_rule(len(columns))]
+    lines = []
     for method in (m for m in LABELS if m in result["rows"]):
         row = result["rows"][method]
         mean = f"{row['mean_ratio']['value']:.4f} ± {row['mean_ratio']['standard_error']:.4f}{mark(method, row)}"
@@ -120,8 +117,9 @@ def details(result: dict[str, Any]) -> list[str]:
         compiled = "in the pilot" if method == "chosen" and was_piloted(result) else f"{row['compile_s']:.1f}"
         costs = [f"{row['wall_s']:.2f}", f"{row['cpu_s']:.2f}", compiled]
         errors = [figure(row["full"]), figure(row["trimmed"])]
-        lines.append(table_line(LABELS[method], row["spp"], *costs, mean, *errors, *efficiency))
-    return [*lines, ""]
+        lines.append((LABELS[method], row["spp"], *costs, mean, *errors, *efficiency))
+    picture = f"![relMSE against time](render/{result['line']}.png)\n"
+    return [f"## {result['line']}\n", picture, table(columns, lines), ""]
 
 
 def was_piloted(result: dict[str, Any]) -> bool:

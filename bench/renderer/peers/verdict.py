@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from bench.harness.results import table
 from bench.renderer.peers.plans import FIXED, PEERS
-from bench.renderer.peers.wording import LABELS, figure, mark, table_line, table_rule
+from bench.renderer.peers.wording import LABELS, figure, mark
 
 PEERS_EXPLAINED = f"""\
 (relMSE × time) of the peer over that of `bdpt`, chosen, above 1 `bdpt` is better; ± as above. The best peer is the one
@@ -20,17 +21,14 @@ def verdict(results: list[dict[str, Any]]) -> list[str]:
     compared = [result for result in results if result["gains"]]
     if not compared:
         return []
-    lines = [
-        "## `bdpt`, chosen, over the best unbiased peer\n",
-        table_line("scene", "all pixels", "trimmed"),
-        table_rule(3),
-    ]
+    lines = []
     for result in compared:
         best = [best_peer(result, kind) for kind in ("full", "trimmed")]
         cells = [f"{figure(result['gains'][peer][kind])} ({LABELS[peer]})" if peer else "–"
                  for peer, kind in zip(best, ("full", "trimmed"), strict=True)]  # fmt: skip
-        lines.append(table_line(result["line"], *cells))
-    return [*lines, "", PEERS_EXPLAINED, *losses(compared)]
+        lines.append((result["line"], *cells))
+    won = table(("scene", "all pixels", "trimmed"), lines)
+    return ["## `bdpt`, chosen, over the best unbiased peer\n", won, "", PEERS_EXPLAINED, *losses(compared)]
 
 
 def best_peer(result: dict[str, Any], kind: str) -> str | None:

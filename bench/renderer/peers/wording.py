@@ -42,13 +42,3 @@ def number(value: float, digits: int) -> str:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
     return f"{round(value, decimals):.{max(0, decimals)}f}"
-
-
-def table_line(*cells: Any) -> str:
-    """A line of a Markdown table."""
-    return "| " + " | ".join(str(cell) for cell in cells) + " |"
-
-
-def table_rule(columns: int) -> str:
-    """The line below a table's header."""
-    return "|" + "---|" * columns

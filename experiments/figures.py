@@ -21,6 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
+
 from experiments.experiment import HERE, Experiment
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.pictures import Picture

@@ -154,8 +154,8 @@ def code() -> str:
     """Digest of the integrator, its strategy and the scenes: a result of other code does not count."""
     package = results.ROOT / "services/renderer/photonfarm/renderer"
     digest = hashlib.sha256()
-    for part in ("bdpt", "strategy", "rooms"):
-        for path in sorted((package / part).glob("*.py")):
+    for part in ("bdpt", "strategy", "scene/rooms"):
+        for path in sorted((package / part).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -29,7 +29,7 @@ BENCH = Path(__file__).parents[2] / "bench"
 def firefly(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """bench/trainer/firefly.py."""
     monkeypatch.syspath_prepend(str(BENCH))
-    spec = importlib.util.spec_from_file_location("firefly", BENCH / "firefly.py")
+    spec = importlib.util.spec_from_file_location("firefly", BENCH / "trainer/firefly.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(__import__("sys").modules, "firefly", module)
     spec.loader.exec_module(module)

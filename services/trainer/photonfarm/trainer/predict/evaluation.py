@@ -43,6 +43,8 @@ class HeldOutErrors:
 WHITE = np.float32(1)
 """The white of a display, in exposed radiance."""
 
+BLOCK = 8  # px
+
 NONE_COMPLETE = "none of the samples to measure on is complete at present; wait for the workers"
 
 WARM_ROUNDS, TIMED_ROUNDS = 2, 15
@@ -120,13 +122,23 @@ def error_of(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
 
 
 def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
-    """The error of images with light above white cut to white.
+    """The error of means over blocks of `BLOCK` × `BLOCK` pixels, with light above white cut to white.
 
-    It is not unbiased, as noise above white is cut. But otherwise a lamp in view, hundreds of times brighter than the
-    surfaces it lights, makes up most of the error.
+    Without the cut a lamp in view, hundreds of times brighter than the surfaces it lights, makes up most of the error.
+    Means come before the cut, as noise above white would be cut as well: of single noisy pixels the cut makes the
+    targets so much darker that a network that is too dark looks better than the right one.
     """
-    prediction, half_a, half_b = (np.minimum(image, WHITE) for image in images)
+    prediction, half_a, half_b = (np.minimum(block_means(image), WHITE) for image in images)
     return error(prediction, half_a, half_b)
+
+
+def block_means(image: F32) -> F32:
+    """Means over blocks of pixels, (H, W, 3) → (⌈H/BLOCK⌉, ⌈W/BLOCK⌉, 3); blocks at the far edges may be smaller."""
+    sums, counts = image, np.ones((*image.shape[:2], 1), np.float32)
+    for axis in (0, 1):
+        starts = np.arange(0, image.shape[axis], BLOCK)
+        sums, counts = (np.add.reduceat(values, starts, axis=axis) for values in (sums, counts))
+    return (sums / counts).astype(np.float32)
 
 
 def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors:

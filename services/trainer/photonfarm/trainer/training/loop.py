@@ -275,7 +275,7 @@ class Session:
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
         if self._compared.is_best:
-            self._best = BestValidation(now.step, now.errors, now.by_shown)
+            self._best = BestValidation(now.step, now.errors, now.judge)
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""

@@ -26,6 +26,9 @@ DEVIATIONS = 2.0
 Few configurations are held out while a store is young.
 """
 
+ALL_LIGHT = "all light"
+UP_TO_WHITE = "means of blocks, up to white"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
@@ -34,12 +37,12 @@ class Validation:
     step: int
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
     held_out: HeldOutErrors
-    by_shown: bool = False  # compare the error of light up to white, and not that of all light
+    judge: str = ALL_LIGHT  # which error is compared
 
     @property
     def errors(self) -> dict[int, float]:
         """The error of each row, by which validations are compared."""
-        errors = self.held_out.shown if self.by_shown else self.held_out.per_sample
+        errors = self.held_out.shown if self.judge == UP_TO_WHITE else self.held_out.per_sample
         return dict(zip(self.rows, errors.tolist(), strict=True))
 
     @property
@@ -73,7 +76,7 @@ def validate(
 
     with np.errstate(invalid="ignore", over="ignore"):  # overflows of a diverged network, which is reported as such
         held_out = measure(predict_and_show, noted())
-    return Validation(step, tuple(rows), held_out, by_shown=loss != "linear")
+    return Validation(step, tuple(rows), held_out, ALL_LIGHT if loss == "linear" else UP_TO_WHITE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,23 +85,23 @@ class BestValidation:
 
     step: int
     errors: dict[int, float]  # of each measured row
-    by_shown: bool = False
+    judge: str = ALL_LIGHT
 
     def state(self) -> dict[str, Any]:
         """The state for a checkpoint."""
         rows, errors = list(self.errors), list(self.errors.values())
         return {
             "step": self.step,
-            "by_shown": self.by_shown,
+            "judge": self.judge,
             "rows": torch.tensor(rows, dtype=torch.int64),
             "errors": torch.tensor(errors, dtype=torch.float64),
         }
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Self:
-        """The validation of a `state`; older ones are of all light."""
+        """The validation of a `state`; older ones are of all light, or of an error that nothing compares any more."""
         errors = dict(zip(state["rows"].tolist(), state["errors"].tolist(), strict=True))
-        return cls(state["step"], errors, state.get("by_shown", False))
+        return cls(state["step"], errors, state.get("judge", "pixels" if state.get("by_shown") else ALL_LIGHT))
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +146,7 @@ def compared(now: Validation, best: BestValidation | None) -> Comparison:
     """
     mine = now.errors
     theirs = mine
-    if best is not None and best.by_shown == now.by_shown and not best.errors.keys().isdisjoint(mine):
+    if best is not None and best.judge == now.judge and not best.errors.keys().isdisjoint(mine):
         theirs = best.errors
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]

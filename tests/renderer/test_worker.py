@@ -184,7 +184,7 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     assert said.count("leaves scene") == 1
     assert "Traceback" not in said
 
-    assert queue_status(connection).held_up.left == {}, "said while it works only"
+    assert queue_status(connection).idle_reports.left == {}, "said while it works only"
 
 
 def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(

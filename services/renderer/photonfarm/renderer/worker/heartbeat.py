@@ -48,7 +48,7 @@ class HeartbeatThread:
         """Remove the heartbeat of the worker's child; its supervisor keeps the name."""
         self._ended.set()
         queue.free_job(self._connection, self._settings.name)
-        queue.forget_held_up(self._connection, self._settings.name, {*self.left, *self._left_told})
+        queue.clear_idle_report(self._connection, self._settings.name, {*self.left, *self._left_told})
 
     @contextlib.contextmanager
     def working(self, name: str) -> Iterator[None]:
@@ -81,5 +81,5 @@ class HeartbeatThread:
         queue.beat(self._connection, name, process_space(), self._job, ttl_s=ttl_s, process=self._supervisor)
         left, self._left_told = self._left_told, self.left
         if no_longer := left.keys() - self._left_told.keys():
-            queue.forget_held_up(self._connection, name, no_longer)
-        queue.tell_held_up(self._connection, name, self.paused, self._left_told, ttl_s=ttl_s)
+            queue.clear_idle_report(self._connection, name, no_longer)
+        queue.report_idle(self._connection, name, self.paused, self._left_told, ttl_s=ttl_s)

@@ -98,14 +98,14 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     """
     how = _how(**asked)
     from photonfarm.trainer.compare.evaluate import compare, write
-    from photonfarm.trainer.compare.evaluation_table import told
+    from photonfarm.trainer.compare.evaluation_table import evaluation_text
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
     with _progress() as tell:
         found = compare(store, loaded, tell=tell, **how)
     pictures = write(found, loaded)
-    click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
+    click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 

@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 POLL_S = 1.0
 ALIVE_FILE = "alive"
-TELL_S = 5.0  # between reports to the workers
+REPORT_S = 5.0  # between reports to the workers
 ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
 
 
@@ -247,7 +247,7 @@ def _consumption_told(redis_url: str | None, store: str | Path, scene_id: str) -
     ended = threading.Event()
 
     def keep_telling() -> None:
-        while not ended.wait(TELL_S):
+        while not ended.wait(REPORT_S):
             told.tell()
 
     thread = threading.Thread(target=keep_telling, daemon=True)
@@ -284,7 +284,7 @@ class _Told:
             self._connection = self._connection or queue.connect(self._url)
             self._store = self._store or Store(self._root)
             queue.check_served(self._connection, self._store)
-            queue.tell_consumed(self._connection, self._scene_id, self._used)
+            queue.report_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
                 click.echo(f"no worker is told what is used: {error}", err=True)

@@ -58,7 +58,7 @@ Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
 It gets the first predictor's images (H, W, 3), and the references that some rows have.
 """
 
-Tell = Callable[[str, int, int], object]
+MeasureProgress = Callable[[str, int, int], object]
 """A callback with a predictor's name, the number of samples it was measured on so far, and of all samples."""
 
 
@@ -155,7 +155,7 @@ def compare(
     without_inception: bool = False,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    tell: MeasureProgress | None = None,
     choose: Choose | None = None,
 ) -> Evaluation:
     """Compare runs, and denoisers given one of so many pixels, on the first `most` views that no run was trained on.
@@ -275,7 +275,7 @@ class _Test:
     shown: list[int]  # rows
     inception: Inception | None
     device: str
-    tell: Tell
+    tell: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
     def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:

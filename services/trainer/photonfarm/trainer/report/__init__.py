@@ -13,7 +13,7 @@ from typing import Any
 
 from photonfarm.shared.core.errors import store_errors
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluate import Tell
+from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
@@ -34,7 +34,7 @@ def write_report(
     inception: Path | None = None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    tell: MeasureProgress | None = None,
     timed: bool = True,
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.

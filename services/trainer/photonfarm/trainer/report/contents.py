@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
+from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -90,7 +90,7 @@ def gathered(
     inception: Path | None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    tell: MeasureProgress | None = None,
     timed: bool = True,
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""

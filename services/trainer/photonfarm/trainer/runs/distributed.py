@@ -22,7 +22,7 @@ from torch import Tensor, distributed, nn
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.runs.device import AUTO, usable_device
 
-WORD_PATIENCE = timedelta(days=30)
+COMMAND_PATIENCE = timedelta(days=30)
 """How long a rank waits for its next command: as long as a store may take to grow."""
 
 STEP_PATIENCE = timedelta(minutes=15)
@@ -174,7 +174,7 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
         torch.cuda.set_device(own)
     distributed.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo", timeout=STEP_PATIENCE)
     try:
-        yield Ranks(distributed.new_group(backend="gloo", timeout=WORD_PATIENCE))
+        yield Ranks(distributed.new_group(backend="gloo", timeout=COMMAND_PATIENCE))
     finally:
         distributed.destroy_process_group()
 

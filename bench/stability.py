@@ -57,7 +57,7 @@ def main() -> int:
         seed=options.seed,
         settings=options.settings,
         failures=options.out / "failures" if options.out else report.FAILURES,
-        tell=lambda line: print(line, file=sys.stderr, flush=True),
+        log=lambda line: print(line, file=sys.stderr, flush=True),
     )
     command = shlex.join(["python", "bench/stability.py", *sys.argv[1:]])
     if options.json:

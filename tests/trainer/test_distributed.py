@@ -123,7 +123,7 @@ def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source,
         if draws == 4 * 10:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    ended = together(lambda: make_source(24), settings, killed, count=die)
+    ended = together(lambda: make_source(24), settings, killed, on_draws=die)
     assert ended == [-signal.SIGKILL, IncompleteError.exit_code], "whoever is left ends as well, and says so"
     assert checkpoint.load(killed / CHECKPOINT)["step"] == 8
     assert together(lambda: make_source(24), settings, killed) == [0, 0]

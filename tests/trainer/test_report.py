@@ -62,7 +62,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     worker = threading.Thread(target=fill)
     worker.start()
     settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
-    outcome = train(StoreSource(store, scene.scene_id), settings, run, count=lambda *_: begun.set())
+    outcome = train(StoreSource(store, scene.scene_id), settings, run, on_draws=lambda *_: begun.set())
     worker.join()
     figures = write_report(store, run, tmp_path / "out")
 

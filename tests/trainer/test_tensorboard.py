@@ -27,7 +27,7 @@ def accumulated(run: Path) -> Any:
 
 def trained(source: Any, settings: Any, run: Path, then: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
     with boards.event_files(run) as board:
-        train(source, settings, run, listen=lambda record: [board.record(record), then(record)], show=board.pictures)
+        train(source, settings, run, on_record=lambda record: [board.record(record), then(record)], show=board.pictures)
 
 
 def test_a_run_shows_its_records_and_pictures(make_source, tiny, run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,8 +68,8 @@ class SessionContext:
     stop: Stop
     group: TrainingGroup
     script: Growth | None
-    listen: Callable[[dict[str, Any]], object] | None
-    count: Callable[[int, int], None] | None
+    on_record: Callable[[dict[str, Any]], object] | None
+    on_draws: Callable[[int, int], None] | None
     show: Show | None
 
 
@@ -81,8 +81,8 @@ def train(
     stop: Stop | None = None,
     clock: Callable[[], float] = time.monotonic,
     script: Growth | None = None,
-    listen: Callable[[dict[str, Any]], object] | None = None,
-    count: Callable[[int, int], None] | None = None,
+    on_record: Callable[[dict[str, Any]], object] | None = None,
+    on_draws: Callable[[int, int], None] | None = None,
     waited: float = 0.0,
     group: TrainingGroup = SINGLE_PROCESS,
     show: Show | None = None,
@@ -90,10 +90,10 @@ def train(
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
-    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` is called with each record
-    of metrics.jsonl as it is written; `count`, after each step and at the beginning, with the number of draws and of
-    arrived samples. `waited` seconds have passed already. In a `group` this is rank 0. At each validation `show` is
-    called with the step, targets and predictions of the first held-out samples.
+    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `on_record` is called with each
+    record of metrics.jsonl as it is written; `on_draws`, after each step and at the beginning, with the number of draws
+    and of arrived samples. `waited` seconds have passed already. In a `group` this is rank 0. At each validation `show`
+    is called with the step, targets and predictions of the first held-out samples.
 
     Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
     nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
@@ -109,7 +109,7 @@ def train(
                 return TrainingOutcome(0, "stopped" if stop.is_set() else "seconds", None)
         watch.turn("start")
         with Feed(source, settings, clock) as feed:
-            around = SessionContext(run, watch, stop, group, script, listen, count, show)
+            around = SessionContext(run, watch, stop, group, script, on_record, on_draws, show)
             return Session(feed, settings, around).run()
 
 
@@ -119,7 +119,7 @@ class Session:
     def __init__(self, feed: Feed, settings: TrainSettings, around: SessionContext) -> None:
         self._feed, self._settings, self._around = feed, settings, around
         self._run, self._watch, self._stop = around.run, around.watch, around.stop
-        self._log = MetricsLog(around.run / METRICS, around.listen)
+        self._log = MetricsLog(around.run / METRICS, around.on_record)
         self._learner = Learner(feed, settings, around.group)
         self._good = GoodState(self._learner)
         self._best: BestValidation | None = None
@@ -128,7 +128,7 @@ class Session:
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
-        self._seconds_told: dict[str, float] = {}  # at the last validation
+        self._seconds_logged: dict[str, float] = {}  # at the last validation
 
     def run(self) -> TrainingOutcome:
         """Train until something ends it."""
@@ -160,10 +160,10 @@ class Session:
             self._log.write("changes", step=self._step, changes=changed)
         if self._learner.verdict is not None:
             self._log.write("loss", step=self._step, loss=self._settings.loss, verdict=str(self._learner.verdict))
-        self._tell_count()
+        self._report_draws()
 
     def _start(self) -> checkpoint.Changes:
-        self._tell_begin(continues=False)
+        self._send_begin(continues=False)
         settle(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
@@ -180,14 +180,14 @@ class Session:
             self._best = BestValidation.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
-        self._seconds_told = dict(state["seconds"])
-        self._tell_begin(continues=True)
+        self._seconds_logged = dict(state["seconds"])
+        self._send_begin(continues=True)
         self._following.restore(state["following"])
         return changed
 
-    def _tell_begin(self, *, continues: bool) -> None:
-        told = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
-        self._around.group.tell("begin", told)
+    def _send_begin(self, *, continues: bool) -> None:
+        beginning = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        self._around.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
@@ -282,10 +282,10 @@ class Session:
             shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
-            waits=waits(seconds := self._watch.seconds, self._seconds_told),
+            waits=waits(seconds := self._watch.seconds, self._seconds_logged),
             **self._counts(),
         )
-        self._seconds_told = seconds
+        self._seconds_logged = seconds
 
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
@@ -296,12 +296,12 @@ class Session:
         """Keep the state after the last validation, or go back, in all processes."""
         found = self._compared
         if found is not None and found.is_clearly_worse:
-            told = f"step {self._step}: {found.stated}"
-            self._around.group.tell("back", told)
-            self._good.go_back(told)
+            reason = f"step {self._step}: {found.stated}"
+            self._around.group.send("back", reason)
+            self._good.go_back(reason)
             self._log_recovered("held-out error", found)
         elif found is not None and not found.is_worse:
-            self._around.group.tell("keep", self._step)
+            self._around.group.send("keep", self._step)
             self._good.keep(self._step)
 
     def _end_no_worse(self) -> None:
@@ -332,9 +332,9 @@ class Session:
         """The number of draws so far, and of arrived samples."""
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
-    def _tell_count(self) -> None:
-        if self._around.count is not None:
-            self._around.count(*self._used())
+    def _report_draws(self) -> None:
+        if self._around.on_draws is not None:
+            self._around.on_draws(*self._used())
 
     def _counts(self) -> dict[str, Any]:
         draws, samples = self._used()
@@ -348,7 +348,7 @@ class Session:
         if value is None:
             self._log_recovered("loss")
         self._step += 1
-        self._tell_count()
+        self._report_draws()
         if value is not None and self._step % LOG_EVERY == 0:
             rate = self._learner.rate(self._step - 1)
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())

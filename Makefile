@@ -56,10 +56,10 @@ $(VENV)/.bench-ready: $(STAMP)
 	@touch $@
 
 bench-render: $(VENV)/.bench-ready
-	$(BIN)/python bench/render.py
 
+# bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
 bench-%: $(STAMP)
-	$(BIN)/python bench/$(subst -,_,$*).py
+	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(STAMP)

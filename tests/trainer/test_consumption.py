@@ -12,7 +12,7 @@ from photonfarm.shared.queue import connect, consumed_samples, serve
 from photonfarm.shared.store import Store
 from photonfarm.trainer.cli import service
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 SCENE_ID = "0123456789abcdef" * 2
 
@@ -58,10 +58,10 @@ def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
 ) -> None:
     counts: list[tuple[int, int]] = []
     settings = tiny(validate_every=100, checkpoint_every=3, max_steps=4)
-    train(make_source(20), settings, run, on_draws=lambda *told: counts.append(told))
+    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(0, 0), (3, 20), (6, 20), (9, 20), (12, 20)]
     counts.clear()
-    train(make_source(20), settings, run, on_draws=lambda *told: counts.append(told))
+    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(12, 20)]
 
 

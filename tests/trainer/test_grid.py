@@ -97,10 +97,10 @@ def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(
 
 
 def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -> None:
-    def diverge(source, settings, folder, **how):
+    def diverge(source, settings, folder, hooks):
         if settings.learning_rate == 1e-4:
             raise DivergedError("the loss is inf")
-        return train(source, settings, folder, **how)
+        return train(source, settings, folder, hooks)
 
     monkeypatch.setattr(grid, "train", diverge)
     cells = run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)})

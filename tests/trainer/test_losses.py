@@ -27,7 +27,7 @@ BENCH = Path(__file__).parents[2] / "bench"
 
 @pytest.fixture
 def firefly(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """bench/firefly.py."""
+    """bench/trainer/firefly.py."""
     monkeypatch.syspath_prepend(str(BENCH))
     spec = importlib.util.spec_from_file_location("firefly", BENCH / "firefly.py")
     module = importlib.util.module_from_spec(spec)

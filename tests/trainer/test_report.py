@@ -38,7 +38,7 @@ from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
 from photonfarm.trainer.runs.wait_times import bottleneck
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 
 def write_report(store, run, out, **asked):
@@ -62,7 +62,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     worker = threading.Thread(target=fill)
     worker.start()
     settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
-    outcome = train(StoreSource(store, scene.scene_id), settings, run, on_draws=lambda *_: begun.set())
+    outcome = train(StoreSource(store, scene.scene_id), settings, run, Hooks(on_draws=lambda *_: begun.set()))
     worker.join()
     figures = write_report(store, run, tmp_path / "out")
 

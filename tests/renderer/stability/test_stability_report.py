@@ -46,7 +46,7 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     monkeypatch.setattr(rows, "REFUSALS", ())
     result = call(tmp_path, "--quick")
     assert result.exit_code == 1
-    assert "again: python bench/stability.py --only 05-empty --settings 1,1 --seed 0 --quick" in result.stderr
+    assert "again: python -m bench.renderer.stability --only 05-empty --settings 1,1 --seed 0 --quick" in result.stderr
     kept = tmp_path / "out" / "failures" / "05-empty_1,1"
     assert np.load(kept / "bdpt.npy").shape == (12, 16, 16, 3)
     assert (kept / "bdpt_truth_z.png").is_file()

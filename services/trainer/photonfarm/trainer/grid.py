@@ -32,7 +32,7 @@ from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 Axes = Mapping[str, Sequence[Any]]
 """The values of each searched key of the settings."""
@@ -176,7 +176,7 @@ def _run_cell(
 ) -> Cell | None:
     """Train a cell to its end and measure it; None if it was stopped early."""
     try:
-        if train(make_source(), settings, run, stop=stop).reason == "stopped":
+        if train(make_source(), settings, run, Hooks(stop=stop)).reason == "stopped":
             return None
     except DivergedError:
         return Cell(changes, (), ())

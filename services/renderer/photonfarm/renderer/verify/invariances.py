@@ -63,7 +63,7 @@ class Invariance:
     @property
     def command(self) -> str:
         """The command that runs it again."""
-        return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
+        return f"python -m bench.renderer.stability --invariances {self.name}" + " --quick" * (not self.long)
 
     def run(self) -> InvarianceResult:
         """Render what the check needs, and judge it."""

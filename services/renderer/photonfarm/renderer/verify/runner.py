@@ -114,7 +114,7 @@ def run(
         integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
         integrator |= {"connections": counts.connections, "light_ratio": counts.light_ratio}
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
-        command = f"python bench/stability.py --only {item.label} --settings {counts} --seed {seed}"
+        command = f"python -m bench.renderer.stability --only {item.label} --settings {counts} --seed {seed}"
         outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
         yield replace(outcome, result=replace(outcome.result, path_ratio=path[0], path_ratio_standard_error=path[1]))
         start = time.process_time()
@@ -235,6 +235,6 @@ def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     result = SceneResult(
         refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
-        f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,
+        f"python -m bench.renderer.stability --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
     return SceneOutcome(result)

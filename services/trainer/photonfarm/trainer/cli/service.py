@@ -79,7 +79,7 @@ def _lead(
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.tensorboard import event_files
-    from photonfarm.trainer.training.loop import train
+    from photonfarm.trainer.training.loop import Hooks, train
 
     begun_on = _begun_on(folder)
     if scene_id and begun_on and scene_id != begun_on:
@@ -101,11 +101,20 @@ def _lead(
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
         with _reported(redis_url, store, scene_id) as on_draws:
-            on_record = [_log_record, *([board.record] if board else [])]
+            logs = [_log_record, *([board.record] if board else [])]
             outcome = train(
-                source, settings, folder, stop=stop, on_draws=on_draws, waited=waited, group=group,
-                on_record=lambda record: [each(record) for each in on_record], show=board.pictures if board else None,
-            )  # fmt: skip
+                source,
+                settings,
+                folder,
+                Hooks(
+                    stop=stop,
+                    on_record=lambda record: [log(record) for log in logs],
+                    on_draws=on_draws,
+                    on_images=board.pictures if board else None,
+                    waited=waited,
+                    group=group,
+                ),
+            )
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 

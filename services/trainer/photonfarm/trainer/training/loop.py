@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -60,70 +60,55 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 @dataclass(frozen=True, slots=True)
-class SessionContext:
-    """The environment of a session of training; `train` describes its parts."""
+class Hooks:
+    """What a session of training calls and heeds; each part may be left out."""
 
-    run: Path
-    watch: Stopwatch
-    stop: Stop
-    group: TrainingGroup
-    script: Growth | None
-    on_record: Callable[[dict[str, Any]], object] | None
-    on_draws: Callable[[int, int], None] | None
-    show: Show | None
+    stop: Stop = field(default_factory=Stop)  # ends the session once it is set
+    on_record: Callable[[dict[str, Any]], object] | None = None  # gets each record of metrics.jsonl as it is written
+    on_draws: Callable[[int, int], object] | None = None  # at the beginning and after each step: draws so far, and
+    # samples that have arrived
+    on_images: Show | None = None  # at each validation: step, targets and predictions of the first held-out samples
+    script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
+    group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
+    waited: float = 0.0  # seconds that have passed already
+    clock: Callable[[], float] = time.monotonic
 
 
-def train(
-    source: SampleSource,
-    settings: TrainSettings,
-    run: Path,
-    *,
-    stop: Stop | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    script: Growth | None = None,
-    on_record: Callable[[dict[str, Any]], object] | None = None,
-    on_draws: Callable[[int, int], None] | None = None,
-    waited: float = 0.0,
-    group: TrainingGroup = SINGLE_PROCESS,
-    show: Show | None = None,
-) -> TrainingOutcome:
+def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
-    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
-    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `on_record` is called with each
-    record of metrics.jsonl as it is written; `on_draws`, after each step and at the beginning, with the number of draws
-    and of arrived samples. `waited` seconds have passed already. In a `group` this is rank 0. At each validation `show`
-    is called with the step, targets and predictions of the first held-out samples.
+    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `hooks.stop` is set; each
+    leaves a checkpoint.
 
     Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
     nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
     the held-out error is not finite, or the latter much worse than before, and there is no good state, or the run has
     gone back too often; the last checkpoint stays.
     """
+    hooks = hooks or Hooks()
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
-    stop, watch = stop or Stop(), Stopwatch(clock, "wait_data", waited)
+    watch = Stopwatch(hooks.clock, "wait_data", hooks.waited)
     with held(run):
         while not source.ready():
-            if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
-                return TrainingOutcome(0, "stopped" if stop.is_set() else "seconds", None)
+            if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
+                return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
-        with Feed(source, settings, clock) as feed:
-            around = SessionContext(run, watch, stop, group, script, on_record, on_draws, show)
-            return Session(feed, settings, around).run()
+        with Feed(source, settings, hooks.clock) as feed:
+            return Session(feed, settings, run, watch, hooks).run()
 
 
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, around: SessionContext) -> None:
-        self._feed, self._settings, self._around = feed, settings, around
-        self._run, self._watch, self._stop = around.run, around.watch, around.stop
-        self._log = MetricsLog(around.run / METRICS, around.on_record)
-        self._learner = Learner(feed, settings, around.group)
+    def __init__(self, feed: Feed, settings: TrainSettings, run: Path, watch: Stopwatch, hooks: Hooks) -> None:
+        self._feed, self._settings, self._run, self._watch, self._hooks = feed, settings, run, watch, hooks
+        self._stop = hooks.stop
+        self._log = MetricsLog(run / METRICS, hooks.on_record)
+        self._learner = Learner(feed, settings, hooks.group)
         self._good = GoodState(self._learner)
         self._best: BestValidation | None = None
-        self._following = BatchStream(feed, settings, around.script, around.group)
+        self._following = BatchStream(feed, settings, hooks.script, hooks.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
@@ -187,7 +172,7 @@ class Session:
 
     def _send_begin(self, *, continues: bool) -> None:
         beginning = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
-        self._around.group.send("begin", beginning)
+        self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
@@ -260,7 +245,7 @@ class Session:
             found = batches(self._feed, rows, self._settings.batch)
             try:
                 predict, loss = network_predictor(self._learner.predicting), self._settings.loss
-                now = validate(predict, self._step, found, self._around.show, loss=loss)
+                now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
             except IncompleteError:  # a repair has removed all of them, for now
                 return
             finally:
@@ -297,11 +282,11 @@ class Session:
         found = self._compared
         if found is not None and found.is_clearly_worse:
             reason = f"step {self._step}: {found.stated}"
-            self._around.group.send("back", reason)
+            self._hooks.group.send("back", reason)
             self._good.go_back(reason)
             self._log_recovered("held-out error", found)
         elif found is not None and not found.is_worse:
-            self._around.group.send("keep", self._step)
+            self._hooks.group.send("keep", self._step)
             self._good.keep(self._step)
 
     def _end_no_worse(self) -> None:
@@ -333,8 +318,8 @@ class Session:
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
     def _report_draws(self) -> None:
-        if self._around.on_draws is not None:
-            self._around.on_draws(*self._used())
+        if self._hooks.on_draws is not None:
+            self._hooks.on_draws(*self._used())
 
     def _counts(self) -> dict[str, Any]:
         draws, samples = self._used()

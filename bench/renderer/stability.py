@@ -56,7 +56,7 @@ def main() -> int:
         seed=options.seed,
         settings=options.settings,
         failures=options.out / "failures" if options.out else report.FAILURES,
-        tell=lambda line: print(line, file=sys.stderr, flush=True),
+        log=lambda line: print(line, file=sys.stderr, flush=True),
     )
     command = shlex.join(["python", "-m", "bench.renderer.stability", *sys.argv[1:]])
     if options.json:

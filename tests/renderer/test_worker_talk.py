@@ -11,17 +11,17 @@ def settings_of(**changes: object) -> WorkerSettings:
 
 
 def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:
-    talk = WorkerLog(settings_of(report_s=3600))
+    log = WorkerLog(settings_of(report_s=3600))
     for job in range(5):
-        with talk.timing(f"job-{job}"):
+        with log.timing(f"job-{job}"):
             pass
     assert [record.getMessage() for record in caplog.records] == [
         "worker ada: 1 job in 0 s, 0.00 s each; the last was job-0"
     ]
     caplog.clear()
-    talk = WorkerLog(settings_of(report_s=1e-9))
+    log = WorkerLog(settings_of(report_s=1e-9))
     for job in range(5):
-        with talk.timing(f"job-{job}"):
+        with log.timing(f"job-{job}"):
             pass
     assert len(caplog.records) == 5
 
@@ -33,11 +33,11 @@ def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() ->
 
 
 def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:
-    talk = WorkerLog(settings_of(quiet=True))
-    with talk.timing("job"):
+    log = WorkerLog(settings_of(quiet=True))
+    with log.timing("job"):
         pass
     for reason in (None, "the disk is full", "the disk is fuller", None, None):
-        talk.pausing(reason)
+        log.pausing(reason)
     assert [record.getMessage() for record in caplog.records] == [
         "worker ada: takes no jobs: the disk is full",
         "worker ada: takes jobs again",

@@ -20,7 +20,7 @@ from photonfarm.shared.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.compare.evaluation_table import notes, told
+from photonfarm.trainer.compare.evaluation_table import evaluation_text, notes
 from photonfarm.trainer.data.dataset import kept_count, kept_pixels, rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
@@ -146,7 +146,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     """Of 2 passes of a view one half A is a quarter of its reference."""
     runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
     found = compare(store, runs, references=references, most=4)
-    foot = told(found).split("\n\n")[-1]
+    foot = evaluation_text(found).split("\n\n")[-1]
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
     assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
@@ -160,7 +160,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     assert "no weights of the Inception network are installed" in notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
     assert notes(converged)[1].endswith("; converged")
-    head = told(found).split("\n\n")[0]
+    head = evaluation_text(found).split("\n\n")[0]
     assert head.startswith("analytic: 4 held-out views of 4 configurations, one sample of each; noise")
 
 
@@ -239,7 +239,7 @@ def test_without_references_only_the_linear_error_is_given(store: Path, trained)
     found = compare(store, [trained("run")], most=3)
     assert found.samples == 3
     assert found.references is found.rows[0].metrics is None
-    assert "MSSIM" not in told(found)
+    assert "MSSIM" not in evaluation_text(found)
     assert "no references: the columns of the paper need them" in notes(found)[-1]
     assert found.document()["rows"][0]["metric_space"] is None
 

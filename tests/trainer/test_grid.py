@@ -65,7 +65,7 @@ def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) 
     assert run_grid(make, tiny(), run, {"learning_rate": (1e-4,)}) == first
     assert len(opened) == so_far + 1, "one look at the samples, and no run"
     told: list[str] = []
-    cells = run_grid(make, tiny(), run, {"learning_rate": (1e-4, 5e-4)}, tell=told.append)
+    cells = run_grid(make, tiny(), run, {"learning_rate": (1e-4, 5e-4)}, log=told.append)
     assert cells[0] == first[0]
     assert len(cells) == 2
     assert len(told) == 1

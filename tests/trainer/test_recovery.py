@@ -172,7 +172,7 @@ def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_whi
 def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     make_source, tiny, run, tmp_path, capsys
 ) -> None:
-    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=service._tell))
+    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=service._log_record))
     without = train(make_source(48), tiny(**TOO_HIGH, recover=False), tmp_path / "without")
     assert outcome.step == 30
     assert outcome.last_error < 1e-3 * without.last_error
@@ -271,7 +271,7 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     train(make_source(24), tiny(max_steps=5), tmp_path / "five")
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
-    train(make_source(24), tiny(), run, Hooks(on_record=service._tell))
+    train(make_source(24), tiny(), run, Hooks(on_record=service._log_record))
     told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
     assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
     (found,) = records(run, "recovered")

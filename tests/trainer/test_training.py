@@ -208,8 +208,8 @@ def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny,
 
 
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
-    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=service._tell))
-    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=service._tell))
+    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=service._log_record))
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=service._log_record))
     changed = [record for record in metrics_log.read(run / METRICS) if record["kind"] == "changes"]
     wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
     assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]

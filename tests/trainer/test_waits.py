@@ -69,7 +69,7 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     train(make_source(24), tiny(max_steps=1), tmp_path / "before")  # a process' first run takes as long to begin
     source = make_scarce(60, lot=12, patience=30)
     scarce = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, poll_seconds=0.02)
-    train(source, scarce, run, Hooks(on_record=service._tell, on_draws=source.count))
+    train(source, scarce, run, Hooks(on_record=service._log_record, on_draws=source.count))
     records = metrics_log.read(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     waited = [r["seconds"]["wait_data"] for r in told if r["step"] % 5 == 0]

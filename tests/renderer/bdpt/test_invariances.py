@@ -25,7 +25,7 @@ QUICK = [
 @pytest.mark.parametrize("check", QUICK)
 def test_an_image_does_not_change_with_what_must_not_matter(check: Invariance) -> None:
     found = check.run()
-    assert found.faults == (), f"{check.said}: {found.figures}\nagain: {check.command}"
+    assert found.faults == (), f"{check.claim}: {found.figures}\nagain: {check.command}"
 
 
 def test_names_are_unique_and_the_long_version_has_all_quick_checks() -> None:

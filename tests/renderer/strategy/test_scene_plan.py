@@ -322,7 +322,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The seconds of each pilot, in place of the pilots."""
     seconds: list[float] = []
 
-    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, talk: Any) -> Measurement:
+    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, log: Any) -> Measurement:
         seconds.append(asked_s)
         return measurement().model_copy(update={"asked_s": asked_s})
 

@@ -81,13 +81,13 @@ def run_grid(
     axes: Axes = AXES,
     *,
     stop: Stop | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> list[Cell]:
     """Train and measure every cell; returns the finished ones, which are all unless `stop` was set.
 
     Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Finished
     cells are not trained again, and an unfinished one resumes from its last checkpoint; grid.json also keeps cells of
-    other values of the axes. `make_source` opens the same complete samples each time; `tell` gets a line for every
+    other values of the axes. `make_source` opens the same complete samples each time; `log` gets a line for every
     cell. Raises IncompleteError while samples are missing and if fewer than two configurations are held out; SpecError
     for an axis that the settings do not have, and for a folder that holds a grid over other samples or settings; and
     the errors of a run, except DivergedError.
@@ -108,8 +108,8 @@ def run_grid(
             known.append(cell)
             finished.append(cell)
             _write(folder, about, known, finished)
-            if tell:
-                tell(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+            if log:
+                log(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
         _write(folder, about, known, finished)
     return finished
 

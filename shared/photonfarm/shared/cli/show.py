@@ -46,7 +46,7 @@ class CheckResult(Protocol):
 ANSWER_S = 5.0
 """How long `status` waits for an answer of Redis; workers wait longer."""
 
-HELD_UP_SHOWN = 10
+IDLE_SHOWN = 10
 """The most idle workers whose reasons are printed."""
 
 
@@ -287,24 +287,24 @@ def _queue(opened: Store, found: QueueStatus, names: Mapping[str, str]) -> None:
         f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
     )
-    for line in _held_up(found, names):
+    for line in _idle_lines(found, names):
         click.echo(f"  {line}")
     for cause in causes:
         click.echo(f"  {len(cause.jobs)} × {cause.cause}")
         click.echo(f"      to repeat one: {queue.repeating_command(opened.root, cause.example)}")
 
 
-def _held_up(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
+def _idle_lines(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
     """Why scenes of the store are not rendered, by the workers' reports, which strangers may have written."""
-    for scene_id, reasons in found.held_up.left.items():
+    for scene_id, reasons in found.idle_reports.left.items():
         if scene_id in names:
             reason = next(iter(reasons.values()))
             yield f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
-    paused = found.held_up.paused
-    for worker, reason in list(paused.items())[:HELD_UP_SHOWN]:
+    paused = found.idle_reports.paused
+    for worker, reason in list(paused.items())[:IDLE_SHOWN]:
         yield f"worker {worker} takes no jobs: {reason}"
-    if len(paused) > HELD_UP_SHOWN:
-        yield f"and {len(paused) - HELD_UP_SHOWN} workers more"
+    if len(paused) > IDLE_SHOWN:
+        yield f"and {len(paused) - IDLE_SHOWN} workers more"
 
 
 def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
@@ -328,8 +328,8 @@ def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: s
         "queued": found.queued,
         "running": found.running,
         "workers": found.workers,
-        "left": found.held_up.left,
-        "paused": found.held_up.paused,
+        "left": found.idle_reports.left,
+        "paused": found.idle_reports.paused,
         "failures": [
             {
                 "cause": cause.cause,

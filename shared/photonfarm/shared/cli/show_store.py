@@ -15,8 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.store.check.check import Progress as Tell
-from photonfarm.shared.store.check.check import SceneReport, StoreReport, said
+from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Tell]:
+def progress() -> Iterator[CheckProgress]:
     """A progress callback for a check: a bar on a terminal, else a line per scene; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -36,12 +35,12 @@ def progress() -> Iterator[Tell]:
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
-        def tell(scene: str, done: int, total: int, size_bytes: int) -> None:
+        def show(scene: str, done: int, total: int, size_bytes: int) -> None:
             if scene not in tasks:
                 tasks[scene] = bars.add_task(scene, total=total, read="")
             bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs, {size_bytes / 1e6:,.0f} MB")
 
-        yield tell
+        yield show
 
 
 def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
@@ -84,7 +83,7 @@ def _scene(scene: SceneReport) -> None:
     read = f"{scene.jobs} jobs, {scene.samples} samples{guides}, {scene.size_bytes / 1e6:,.1f} MB"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
-        click.echo(f"  A against B: {said(scene.halves)}")
+        click.echo(f"  A against B: {halves_in_words(scene.halves)}")
     if scene.back_facing_share is not None:
         click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
     for group in scene.groups:

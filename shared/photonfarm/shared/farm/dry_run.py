@@ -55,18 +55,18 @@ def rehearse(
     request: Request,
     *,
     measure: bool,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     shard_rows: int | None = None,
 ) -> DryRun:
     """What `submission.submit` would plan; with `measure`, also its cost, and how the same cost would be spent best.
 
-    `tell` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
+    `log` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
     loaded = load_spec(spec)
     found = _counted(loaded, request, store, shard_rows)
     costs = measured_costs(spec) if measure and found.planned else None
     if isinstance(costs, str):
-        tell(f"cost and time are not known: {costs}")
+        log(f"cost and time are not known: {costs}")
     return with_costs(found, loaded, request, costs) if isinstance(costs, SampleCosts) else found
 
 

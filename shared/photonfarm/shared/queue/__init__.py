@@ -17,7 +17,7 @@ rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of
-from photonfarm.shared.queue.consumption import consumed_samples, tell_consumed
+from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
 from photonfarm.shared.queue.failures import (
     FAILED,
     FAILURES_ALLOWED,
@@ -34,7 +34,7 @@ from photonfarm.shared.queue.failures import (
     repeating_command,
 )
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
-from photonfarm.shared.queue.idle_workers import IdleReports, forget_held_up, tell_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import (
     FUNCTION,
     OVERDUE,
@@ -72,13 +72,13 @@ __all__ = [
     "bury",
     "causes",
     "check_served",
+    "clear_idle_report",
     "connect",
     "consumed_samples",
     "count_overdue",
     "count_start",
     "forget_failures",
     "forget_failures_of",
-    "forget_held_up",
     "forget_starts_of",
     "free_job",
     "has_password",
@@ -93,10 +93,10 @@ __all__ = [
     "record_failure",
     "release",
     "repeating_command",
+    "report_consumed",
+    "report_idle",
     "serve",
     "take",
     "take_name",
-    "tell_consumed",
-    "tell_held_up",
     "with_password_of",
 ]

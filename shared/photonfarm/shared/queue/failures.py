@@ -61,9 +61,9 @@ def record_failure(connection: Redis, name: str, reason: str) -> Failure:
     times = int(connection.incr(FAILURES + name))
     connection.expire(FAILURES + name, FAILURES_TTL_S)
     set_aside = times >= FAILURES_ALLOWED
-    said = printable(reason[:REASON_LETTERS])
-    connection.set(FAILED + name, said, ex=None if set_aside else FAILURE_TTL_S)
-    return Failure(said, times, set_aside)
+    text = printable(reason[:REASON_LETTERS])
+    connection.set(FAILED + name, text, ex=None if set_aside else FAILURE_TTL_S)
+    return Failure(text, times, set_aside)
 
 
 def forget_failures(connection: Redis, *, set_aside: bool) -> None:

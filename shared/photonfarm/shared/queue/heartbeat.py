@@ -102,8 +102,8 @@ def _parsed(value: str) -> _Heartbeat | None:
 def workers_alive(connection: Redis) -> set[str]:
     """The workers with a heartbeat, except those of this machine whose process has ended since."""
     names = sorted(names_below(connection, WORKER))
-    said = beginnings(connection, [WORKER + name for name in names], _VALUE_BYTES)
-    return {name for name, held in zip(names, map(_parsed, said), strict=True) if not _has_ended(held)}
+    values = beginnings(connection, [WORKER + name for name in names], _VALUE_BYTES)
+    return {name for name, held in zip(names, map(_parsed, values), strict=True) if not _has_ended(held)}
 
 
 def _has_ended(held: _Heartbeat | None) -> bool:
@@ -112,5 +112,5 @@ def _has_ended(held: _Heartbeat | None) -> bool:
 
 def hosts(connection: Redis) -> set[str]:
     """The hosts, each a process space, that have a live worker."""
-    said = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
-    return {value.split()[0] for value in said if value.strip()}
+    values = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
+    return {value.split()[0] for value in values if value.strip()}

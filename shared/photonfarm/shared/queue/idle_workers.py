@@ -28,7 +28,7 @@ class IdleReports:
     left: dict[str, dict[str, str]]  # by scene id, then by worker: why it skips the scene
 
 
-def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
+def report_idle(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
     """Report why a worker takes no jobs, if it takes none, and which scenes it skips; expires after `ttl_s`."""
     ttl_ms = int(ttl_s * 1000)
     with connection.pipeline(transaction=False) as pipeline:
@@ -41,21 +41,21 @@ def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mappi
         pipeline.execute()
 
 
-def forget_held_up(connection: Redis, worker: str, left: Iterable[str]) -> None:
+def clear_idle_report(connection: Redis, worker: str, left: Iterable[str]) -> None:
     """Remove the reports of a worker: it takes jobs again, and skips none of these scenes."""
     connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
 
 
-def read_held_up(connection: Redis) -> IdleReports:
+def read_idle_reports(connection: Redis) -> IdleReports:
     """The reports that workers have made."""
     left: dict[str, dict[str, str]] = {}
-    for name, reason in _said(connection, LEFT).items():
+    for name, reason in _reports(connection, LEFT).items():
         if found := _SCENE_AND_WORKER.fullmatch(name):
             left.setdefault(found[1], {})[printable(found[2])] = reason
-    return IdleReports({printable(name): reason for name, reason in _said(connection, PAUSED).items()}, left)
+    return IdleReports({printable(name): reason for name, reason in _reports(connection, PAUSED).items()}, left)
 
 
-def _said(connection: Redis, prefix: str) -> dict[str, str]:
+def _reports(connection: Redis, prefix: str) -> dict[str, str]:
     names = sorted(names_below(connection, prefix))
-    told = beginnings(connection, [prefix + name for name in names], 4 * REASON_LETTERS)
-    return {name: printable(reason)[:REASON_LETTERS] for name, reason in zip(names, told, strict=True) if reason}
+    reasons = beginnings(connection, [prefix + name for name in names], 4 * REASON_LETTERS)
+    return {name: printable(reason)[:REASON_LETTERS] for name, reason in zip(names, reasons, strict=True) if reason}

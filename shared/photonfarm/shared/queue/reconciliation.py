@@ -18,7 +18,7 @@ from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
-from photonfarm.shared.queue.idle_workers import IdleReports, read_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, read_idle_reports
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
@@ -47,7 +47,7 @@ _LOCK = "rq:photonfarm:reconcile"
 
 log = logging.getLogger(__name__)
 
-_told: dict[str, str] = {}
+_logged: dict[str, str] = {}
 """Why scenes were skipped, by scene id: an idle worker looks every few seconds, and logs each reason once."""
 
 _KINDS: dict[str, Kind] = {
@@ -147,9 +147,9 @@ def _lacking_by_scene(store: Store, only: str | None, busy: Set[str], limit: int
         return {only: _lacking(store.scene(only), busy, limit)}
     lacking, failed = store.each(lambda scene: _lacking(scene, busy, limit))
     for scene_id, error in failed.items():
-        if _told.get(scene_id) != str(error):
+        if _logged.get(scene_id) != str(error):
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, error)
-        _told[scene_id] = str(error)
+        _logged[scene_id] = str(error)
     return lacking
 
 
@@ -230,7 +230,7 @@ class QueueStatus:
     running: int  # jobs with a heartbeat
     workers: int  # with a heartbeat; those of this machine only if their process lives
     failed: dict[str, Failure]  # by job name
-    held_up: IdleReports
+    idle_reports: IdleReports
 
 
 def queue_status(connection: Redis) -> QueueStatus:
@@ -241,7 +241,7 @@ def queue_status(connection: Redis) -> QueueStatus:
             running=len(names_below(connection, ALIVE)),
             workers=len(workers_alive(connection)),
             failed=read_failures(connection),
-            held_up=read_held_up(connection),
+            idle_reports=read_idle_reports(connection),
         )
     except redis.RedisError as error:
         raise QueueError(f"Redis failed while it was asked for its status: {error}") from error

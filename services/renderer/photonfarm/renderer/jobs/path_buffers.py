@@ -80,10 +80,10 @@ def frames_of(
 
 
 def _guides(
-    scene: SceneRenderer, modification: Modification, views: Sequence[View], told: tuple[str, GuideSpec, BasePointCloud]
+    scene: SceneRenderer, modification: Modification, views: Sequence[View], of: tuple[str, GuideSpec, BasePointCloud]
 ) -> Guides:
-    """The guides of all views, stacked; `told` holds the scene's id, the guides' settings, and the base cloud."""
-    scene_id, wanted, cloud = told
+    """The guides of all views, stacked; `of` holds the scene's id, the guides' settings, and the base cloud."""
+    scene_id, wanted, cloud = of
     key, lit = modification.key(scene_id), lit_points(cloud, modification)
     found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]
     return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

@@ -314,17 +314,17 @@ class _Rendering:
 
     def _again(self, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> F32:
         """Render another estimate in place of a non-finite one, with seeds that are not `taken`."""
-        self._throw_away(key, purpose)
+        self._discard(key, purpose)
         for seed in islice(_seeds(key, purpose, taken), ATTEMPTS - 1):
             image = self._scene.render_halves(view, (seed,))[0]
             if np.isfinite(image).all():
                 return image
-            self._throw_away(key, purpose)
+            self._discard(key, purpose)
         raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
-    def _throw_away(self, key: Key, purpose: str) -> None:
+    def _discard(self, key: Key, purpose: str) -> None:
         self._redrawn += 1
-        _tell_thrown_away(key, purpose)
+        _log_discarded(key, purpose)
 
 
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
@@ -343,11 +343,11 @@ def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:
         photons = scene.photons(seed)
         if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
             return photons, thrown
-        _tell_thrown_away(key, "photons")
+        _log_discarded(key, "photons")
     raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
 
 
-def _tell_thrown_away(key: Key, purpose: str) -> None:
+def _log_discarded(key: Key, purpose: str) -> None:
     log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
 
 

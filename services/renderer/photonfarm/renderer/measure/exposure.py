@@ -46,7 +46,7 @@ EXACT = 1e-4
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
 
-Talk = Callable[[str], None]
+Log = Callable[[str], None]
 """A function that takes a line about the progress."""
 
 
@@ -120,7 +120,7 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, talk: Talk, *, target: float = TARGET, frames: int = FRAMES
+    spec: SceneSpec, beside: Path | None, log: Log, *, target: float = TARGET, frames: int = FRAMES
 ) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
@@ -128,7 +128,7 @@ def propose(
     """
     small = _small(spec)
     spp = _half_spp(small.film)
-    talk(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
+    log(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
     pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp))))
     exposure = pictures.exposure(target)
     if exposure is None:

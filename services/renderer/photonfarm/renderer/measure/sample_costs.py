@@ -46,11 +46,11 @@ MOST_PATHS = 1 << 21
 Clean images would take minutes, and beyond one launch of the integrator time is proportional to samples anyway.
 """
 
-TALK_SECONDS = 10.0
+LOG_SECONDS = 10.0
 """The least seconds between two lines of progress."""
 
 Result = TypeVar("Result")
-Talk = Callable[[str], None]
+Log = Callable[[str], None]
 """A function that takes a line about the progress."""
 
 
@@ -66,7 +66,7 @@ class _Frame:
     noise: float | None  # None if nothing is seen, or values are not finite
 
 
-def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, talk: Talk) -> SampleCosts:
+def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Log) -> SampleCosts:
     """The costs kept from an earlier measurement here of as many frames; with `again`, or without one, measured now.
 
     The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
@@ -74,12 +74,12 @@ def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again:
     file = cache.file_of("costs", cache.digest_here("sample costs with guides", spec.scene_id, str(frames)))
     if not again and (kept := _kept(file)) is not None:
         return kept
-    talk(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
-    costs = measured_costs(spec, beside, frames, talk)
+    log(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
+    costs = measured_costs(spec, beside, frames, log)
     try:
         cache.write_whole(file, costs.json())
     except OSError as error:
-        talk(f"the measurement could not be kept: {error}")
+        log(f"the measurement could not be kept: {error}")
     return costs
 
 
@@ -91,22 +91,22 @@ def _kept(file: Path) -> SampleCosts | None:
 
 
 def measured_costs(
-    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, talk: Talk | None = None
+    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, log: Log | None = None
 ) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
-    return sample_costs(LoadedScene.load(spec, beside), frames, talk)
+    return sample_costs(LoadedScene.load(spec, beside), frames, log)
 
 
-def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> SampleCosts:
+def sample_costs(scene: LoadedScene, frames: int, log: Log | None = None) -> SampleCosts:
     """The medians over views of `frames` random configurations, one view of each, after some untimed ones."""
     cloud = scene.base()[1]
-    measured, told = [], time.monotonic()
+    measured, logged = [], time.monotonic()
     for number in range(WARM_UPS + frames):
         measured.append(_measured(scene, cloud, number))
-        if talk is not None and time.monotonic() - told > TALK_SECONDS:
-            talk(f"view {number + 1} of {WARM_UPS + frames}")
-            told = time.monotonic()
+        if log is not None and time.monotonic() - logged > LOG_SECONDS:
+            log(f"view {number + 1} of {WARM_UPS + frames}")
+            logged = time.monotonic()
     measured = measured[WARM_UPS:]
     noise = [frame.noise for frame in measured if frame.noise is not None]
     return SampleCosts(

@@ -38,7 +38,7 @@ LEAST_VIEWS, MOST_VIEWS = 3, 8
 LIT = 16
 """The configurations in which light paths are traced: photons that contribute in any of them are worth storing."""
 
-Talk = Callable[[str], None]
+Log = Callable[[str], None]
 """A function that takes a line about the progress."""
 
 
@@ -102,19 +102,19 @@ class _Compared:
     rows: tuple[CandidateRow, ...]
 
 
-def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) -> Measurement:
+def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> Measurement:
     """Load the scene of a spec and measure its light transport, in about `seconds` of CPU time.
 
     The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does.
     """
     begun = time.process_time()
-    talk(f"loading {spec.name}")
+    log(f"loading {spec.name}")
     stage = PilotScene(spec, beside)
     found = content.read(stage.loaded.scene, stage.camera())
     reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
     candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
-    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, talk)
+    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, log)
     spent = time.process_time() - begun
     return Measurement(
         film=compared.film,
@@ -136,7 +136,7 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
 
 
 def _compare(
-    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk
+    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, log: Log
 ) -> _Compared:
     spec = stage.spec
     now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
@@ -145,7 +145,7 @@ def _compare(
     film, spp, views = _pilot_film(spec, costs, left_s)
     if film != spec.film:
         stage = PilotScene(spec.model_copy(update={"film": film}), beside)
-    talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
+    log(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
     pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
     choice = pilot.choose(
         stage.renders(views),

@@ -11,7 +11,7 @@ from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost, offers, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
-from photonfarm.renderer.strategy.measurement import Measurement, Talk, measure, present
+from photonfarm.renderer.strategy.measurement import Log, Measurement, measure, present
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
@@ -84,16 +84,16 @@ class TransportPlan:
         }  # fmt: skip
 
 
-def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, talk: Talk) -> TransportPlan:
+def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, log: Log) -> TransportPlan:
     """The plan of a spec; a cached measurement is used if it took at least `seconds`, unless `again` is set."""
     found = None if again else cache.find(spec)
     if found is not None and found.asked_s >= seconds and _knows(found, spec):
         return plan_of(spec, found, cached=True)
-    measurement = measure(spec, beside, seconds, talk)
+    measurement = measure(spec, beside, seconds, log)
     try:
         cache.keep(spec, measurement)
     except OSError as error:
-        talk(f"the measurement could not be kept: {error}")
+        log(f"the measurement could not be kept: {error}")
     return plan_of(spec, measurement, cached=False)
 
 

@@ -56,7 +56,7 @@ class Invariance:
     """A property that must hold."""
 
     name: str
-    said: str  # what must hold
+    claim: str  # what must hold
     find: Callable[[], tuple[list[str], str]]  # (faults, figures)
     long: bool
 
@@ -117,7 +117,7 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
 
 def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     """A table of checks and their results, and the commands that repeat the failed ones."""
-    lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
+    lines = [f"| {check.name} | {check.claim} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [
         f"- {check.name}: {'; '.join(finding.faults)}. Again: `{check.command}`"
         for check, finding in found
@@ -145,8 +145,8 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
     faults, ratios = [], []
     for settings in COUNTS:
         wanted = effort if settings.light_ratio else replace(effort, resolution=np.inf)
-        test, said = _compare(_images(scene, settings, effort, 0), truth, wanted)
-        faults += [f"{settings}: {fault}" for fault in said]
+        test, found = _compare(_images(scene, settings, effort, 0), truth, wanted)
+        faults += [f"{settings}: {fault}" for fault in found]
         ratios.append(f"{settings}: {plus_minus(test.mean_ratio, test.mean_ratio_standard_error)}")
     return faults, "; ".join(ratios)
 
@@ -178,8 +178,8 @@ def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], st
     off = _largest_difference(_images(scene, ALL[0], effort, 0), before * 8)
     faults = [f"times 8: a pixel is off by {off:.2g}, allowed is {_SUMS:g}"] if not off <= _SUMS else []
     _brighten(scene, 3 / 8)
-    test, said = _compare(_images(scene, ALL[0], effort, TRUTH_SEEDS), before * 3, effort)
-    return faults + said, f"times 8: largest difference {off:.2g}; times 3: {_ratio(test)}"
+    test, found = _compare(_images(scene, ALL[0], effort, TRUTH_SEEDS), before * 3, effort)
+    return faults + found, f"times 8: largest difference {off:.2g}; times 3: {_ratio(test)}"
 
 
 _SUMS = 1e-5
@@ -197,9 +197,9 @@ def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
     near = float(np.mean(_differences(images, same) < _NEAR_SCALED[factor]))
     faults = [f"with one seed {near:.1%} of the pixels are near, wanted are {_SHARE:.0%}"] if near < _SHARE else []
     others = _images(load(scaled(1.0)(effort.size)), ALL[0], effort, TRUTH_SEEDS)
-    test, said = _compare(images, others, effort)
+    test, found = _compare(images, others, effort)
     return (
-        faults + said,
+        faults + found,
         f"with one seed {near:.1%} of the pixels are within {_NEAR_SCALED[factor]:.1%}; with others {_ratio(test)}",
     )
 
@@ -235,8 +235,8 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     test, faults = _compare(moved, _images(scene, ALL[0], effort, TRUTH_SEEDS), effort)
     faults += [f"with one seed {unequal:.2%} of the values are unequal"] if unequal else []
     faults += [f"with one seed {near:.2%} of the pixels are near, wanted are {_SHARE:.0%}"] if near < _SHARE else []
-    said = f"unequal values with a dimmed light {unequal:.1%}; near pixels with box and camera moved {near:.1%}"
-    return faults, f"with one seed: {said}; with others {_ratio(test)}"
+    figures = f"unequal values with a dimmed light {unequal:.1%}; near pixels with box and camera moved {near:.1%}"
+    return faults, f"with one seed: {figures}; with others {_ratio(test)}"
 
 
 def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:

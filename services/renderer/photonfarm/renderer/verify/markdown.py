@@ -91,8 +91,8 @@ def _verdict(report: StabilityReport) -> str:
 def _line(results: list[SceneResult]) -> str:
     first = results[0]
     if first.z_limit is None:
-        said = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
-        return f"{said} | – | – | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
+        head = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
+        return f"{head} | – | – | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
     z = max((r.z_max or 0.0) for r in results)
     brightest = max((r.max_over_mean or 0.0) for r in results)
     verdict = "FAIL" if any(r.faults for r in results) else "pass"
@@ -168,8 +168,8 @@ def _hard(results: Sequence[SceneResult]) -> str:
             names += [result.name] if result.name not in names else []
     lines = []
     for row, sentences in rows.items():
-        said = [f"*{', '.join(names)}*: {hard}" if len(sentences) > 1 else hard for hard, names in sentences.items()]
-        lines.append(f"- {row}: {'; '.join(said)}")
+        found = [f"*{', '.join(names)}*: {hard}" if len(sentences) > 1 else hard for hard, names in sentences.items()]
+        lines.append(f"- {row}: {'; '.join(found)}")
     return "## What is hard\n\n" + "\n".join(lines) if lines else ""
 
 
@@ -179,6 +179,6 @@ def _failures(results: Sequence[SceneResult]) -> str:
 
 
 def _unsupported(refusals: Sequence[SceneResult]) -> str:
-    said = [f"- {r.label}: “{r.hard}” ({r.verdict})" for r in refusals]
-    refused = "## Refused\n\n" + "\n".join([*said, f"- {REFUSED_ON_IMPORT}"])
+    lines = [f"- {r.label}: “{r.hard}” ({r.verdict})" for r in refusals]
+    refused = "## Refused\n\n" + "\n".join([*lines, f"- {REFUSED_ON_IMPORT}"])
     return refused + "\n\n## Done from the eye alone\n\n" + "\n".join(f"- {sentence}" for sentence in EYE_ALONE)

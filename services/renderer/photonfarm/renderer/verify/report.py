@@ -53,26 +53,26 @@ def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
 
 def examine(
     items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = (),
-    failures: Path = FAILURES, tell: Callable[[str], None] = lambda _: None,
+    failures: Path = FAILURES, log: Callable[[str], None] = lambda _: None,
 ) -> StabilityReport:  # fmt: skip
     """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""
     report = StabilityReport()
     for item in items:
         for outcome in run(item, quick=quick, seed=seed, settings=settings):
-            _add(report, outcome, failures, tell)
+            _add(report, outcome, failures, log)
         gc.collect()  # Dr.Jit finds the next scene's kernels in its cache only once this scene is gone
     return report
 
 
-def _add(report: StabilityReport, outcome: SceneOutcome, failures: Path, tell: Callable[[str], None]) -> None:
+def _add(report: StabilityReport, outcome: SceneOutcome, failures: Path, log: Callable[[str], None]) -> None:
     result = outcome.result
     if outcome.renders is not None and result.label not in dict(report.pictures):
         report.pictures.append((result.label, triple(outcome.renders)))
     report.results.append(result)
-    tell(f"{result.label} ({result.settings}): {result.verdict}")
+    log(f"{result.label} ({result.settings}): {result.verdict}")
     if result.faults:
         folder = keep(outcome, failures)
-        tell(f"  {'; '.join(result.faults)}\n  again: {result.command}\n  renders: {folder}")
+        log(f"  {'; '.join(result.faults)}\n  again: {result.command}\n  renders: {folder}")
 
 
 def write(report: StabilityReport, out: Path, command: str) -> None:

@@ -137,7 +137,7 @@ def _judged(
     z_max = float(np.fmax(blocks.z_max, whole.z_max))
     faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
     result = SceneResult(
-        item.row, item.name, item.hard, item.truth.said, str(settings), effort.size, effort.seeds, effort.spp,
+        item.row, item.name, item.hard, item.truth.name, str(settings), effort.size, effort.seeds, effort.spp,
         effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
         _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
         _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
@@ -228,12 +228,12 @@ def _refusal(scene: object, settings: BdptSettings) -> str:
 
 def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     start = time.process_time()
-    said = message_of(refusal)
-    faults = [] if refusal.sentence in said else [f"not refused with {refusal.sentence!r}, but with {said!r}"]
+    text = message_of(refusal)
+    faults = [] if refusal.sentence in text else [f"not refused with {refusal.sentence!r}, but with {text!r}"]
     if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
     result = SceneResult(
-        refusal.row, refusal.name, said, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
+        refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
         f"python -m bench.renderer.stability --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip

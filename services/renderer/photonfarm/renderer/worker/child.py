@@ -57,7 +57,7 @@ log = logging.getLogger(__name__)
 
 def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     """The child's main function: settings from stdin, work, and the exit code; its last words go to stdout."""
-    words = os.dup(1)
+    pipe = os.dup(1)
     os.dup2(2, 1)  # all other output, by Mitsuba say, goes to stderr
     settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
@@ -65,19 +65,19 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     try:
         store = Store(settings.store)
         jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
-        return RenderWorker(settings, store, queue.connect(settings.redis_url), words).run()
+        return RenderWorker(settings, store, queue.connect(settings.redis_url), pipe).run()
     except PhotonfarmError as error:
-        _leave_word(words, str(error))
+        _send_line(pipe, str(error))
         return error.exit_code
     except redis.RedisError as error:
-        _leave_word(words, f"lost Redis: {error}")
+        _send_line(pipe, f"lost Redis: {error}")
         return QueueError.exit_code
 
 
-def _leave_word(words: int, message: str) -> None:
+def _send_line(pipe: int, message: str) -> None:
     """Send a line to the supervisor, if it is still there."""
     with contextlib.suppress(BrokenPipeError):
-        os.write(words, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
+        os.write(pipe, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
 
 
 def _end_with_supervisor() -> None:
@@ -92,8 +92,8 @@ def _end_with_supervisor() -> None:
 class RenderWorker(SimpleWorker):
     """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
 
-    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, words: int | None = None) -> None:
-        """Prepare without registering; `words` is a file descriptor that the supervisor reads, if there is one."""
+    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, pipe: int | None = None) -> None:
+        """Prepare without registering; `pipe` is a file descriptor that the supervisor reads, if there is one."""
         self._queue = queue.open_queue(connection)
         super().__init__(
             [self._queue],
@@ -111,7 +111,7 @@ class RenderWorker(SimpleWorker):
         self._failed = False  # the job in hand
         self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
-        self._heart = HeartbeatThread(settings, store, words)
+        self._heart = HeartbeatThread(settings, store, pipe)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None
@@ -119,8 +119,8 @@ class RenderWorker(SimpleWorker):
             else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
         )
         self._talk = WorkerLog(settings)
-        self._words = words
-        self._tally = JobCounts()
+        self._pipe = pipe
+        self._counts = JobCounts()
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
@@ -242,9 +242,9 @@ class RenderWorker(SimpleWorker):
     def _count(self, name: str, seconds: float) -> None:
         """Report the jobs so far to the supervisor, which outlives this process, however it ends."""
         done = not self._failed
-        self._tally += JobCounts(done, not done, self._samples(name) if done else 0, seconds)
-        if self._words is not None:
-            _leave_word(self._words, self._tally.line)
+        self._counts += JobCounts(done, not done, self._samples(name) if done else 0, seconds)
+        if self._pipe is not None:
+            _send_line(self._pipe, self._counts.line)
 
     def _samples(self, name: str) -> int:
         """The number of samples of a job; 0 if its scene cannot be read any more."""

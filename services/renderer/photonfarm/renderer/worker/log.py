@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from photonfarm.renderer.worker.settings import TALLY, WorkerSettings
+from photonfarm.renderer.worker.settings import JOBS_SO_FAR, WorkerSettings
 
 log = logging.getLogger(__name__)
 
@@ -34,12 +34,12 @@ class JobCounts:
     @property
     def line(self) -> str:
         """The counts as a child writes them to its supervisor."""
-        return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
+        return f"{JOBS_SO_FAR}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
 
     @classmethod
     def of(cls, line: str) -> JobCounts:
         """The counts in a line of a child."""
-        jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
+        jobs, failed, samples, seconds = line.removeprefix(JOBS_SO_FAR).split()
         return cls(int(jobs), int(failed), int(samples), float(seconds))
 
     def __str__(self) -> str:
@@ -63,7 +63,7 @@ class WorkerLog:
         self._every_s = settings.report_s
         self._jobs = 0
         self._seconds = 0.0
-        self._said = -settings.report_s
+        self._logged_s = -settings.report_s
         self._pausing = False
         self._waiting: set[str] = set()
 
@@ -75,8 +75,8 @@ class WorkerLog:
         now = time.monotonic()
         self._jobs += 1
         self._seconds += now - began
-        if now - self._said >= self._every_s:
-            self._said = now
+        if now - self._logged_s >= self._every_s:
+            self._logged_s = now
             log.info(
                 "worker %s: %s in %.0f s, %.2f s each; the last was %s",
                 self._name,

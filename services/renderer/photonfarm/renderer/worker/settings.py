@@ -21,7 +21,7 @@ RECYCLED = 75
 JOB_IN_HAND = "job in hand: "
 """The line's beginning by which a child reports the job that it begins, before the job's name."""
 
-TALLY = "so far: "
+JOBS_SO_FAR = "so far: "
 """The line's beginning by which a child reports its jobs so far, before the numbers of `JobCounts`."""
 
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"

@@ -36,7 +36,7 @@ def run_worker(
     *,
     name: str | None = None,
     child: Sequence[str] = CHILD,
-    say: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> None:
     """Render queued jobs until asked to stop, or with `until_complete` until nothing is missing.
@@ -48,8 +48,8 @@ def run_worker(
     StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
     """
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
-    told = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
-    Supervisor(told, tuple(child), say or log.warning).run()
+    worker = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
+    Supervisor(worker, tuple(child), report or log.warning).run()
 
 
 def render_job(

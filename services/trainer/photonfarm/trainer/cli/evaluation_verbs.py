@@ -98,14 +98,14 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     """
     how = _how(**asked)
     from photonfarm.trainer.compare.evaluate import compare, write
-    from photonfarm.trainer.compare.evaluation_table import told
+    from photonfarm.trainer.compare.evaluation_table import evaluation_text
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    with _progress() as tell:
-        found = compare(store, loaded, tell=tell, **how)
+    with _progress() as on_progress:
+        found = compare(store, loaded, on_progress=on_progress, **how)
     pictures = write(found, loaded)
-    click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
+    click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 
@@ -125,8 +125,8 @@ def report(
     how = _how(**asked)
     from photonfarm.trainer.report import write_report
 
-    with _progress() as tell:
-        figures = write_report(store, list(dict.fromkeys(runs)), out, tell=tell, timed=not untimed, **how)
+    with _progress() as on_progress:
+        figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 
 
@@ -145,12 +145,12 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
-        def tell(name: str, done: int, total: int) -> None:
+        def show(name: str, done: int, total: int) -> None:
             if name not in tasks:
                 tasks[name] = bars.add_task(markup.escape(name), total=total)
             bars.update(tasks[name], completed=done)
 
-        yield tell
+        yield show
 
 
 def _line(name: str, done: int, total: int) -> None:

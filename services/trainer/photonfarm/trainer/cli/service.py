@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 POLL_S = 1.0
 ALIVE_FILE = "alive"
-TELL_S = 5.0  # between reports to the workers
+REPORT_S = 5.0  # between reports to the workers
 ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
 
 
@@ -100,8 +100,8 @@ def _lead(
             there = scene_id in Store(store).scene_ids()
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
-        with _consumption_told(redis_url, store, scene_id) as count:
-            logs = [_tell, *([board.record] if board else [])]
+        with _reported(redis_url, store, scene_id) as on_draws:
+            logs = [_log_record, *([board.record] if board else [])]
             outcome = train(
                 source,
                 settings,
@@ -109,7 +109,7 @@ def _lead(
                 Hooks(
                     stop=stop,
                     on_record=lambda record: [log(record) for log in logs],
-                    on_draws=count,
+                    on_draws=on_draws,
                     on_images=board.pictures if board else None,
                     waited=waited,
                     group=group,
@@ -173,17 +173,17 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
         wanted = f" {spec}" if spec else ""
         raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):
-        tell = partial(click.echo, err=True)
+        log = partial(click.echo, err=True)
         axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
         if settings.schedule == "cosine":
             axes["decay"] = (settings.decay,)
-            tell("decay is not searched: schedule = 'cosine' has none")
+            log("decay is not searched: schedule = 'cosine' has none")
         elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
             axes["decay"] = (settings.decay,)
-            tell(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
-        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
+            log(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
+        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, log=log)
         if stop.is_set():
-            tell(f"stopped after {len(cells)} cells; the same command goes on")
+            log(f"stopped after {len(cells)} cells; the same command goes on")
         return table(cells)
 
 
@@ -246,30 +246,30 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _consumption_told(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+def _reported(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
     """A callback for draws and samples of training; a thread reports the used ones to Redis regularly, and at the end.
 
     Each sample counts once, and held-out ones as soon as they are visible. A missing Redis or store is ignored; if the
     Redis serves another store, that is logged once.
     """
-    told = _Told(redis_url, store, scene_id)
+    reporter = _ConsumptionReporter(redis_url, store, scene_id)
     ended = threading.Event()
 
-    def keep_telling() -> None:
-        while not ended.wait(TELL_S):
-            told.tell()
+    def keep_reporting() -> None:
+        while not ended.wait(REPORT_S):
+            reporter.report()
 
-    thread = threading.Thread(target=keep_telling, daemon=True)
+    thread = threading.Thread(target=keep_reporting, daemon=True)
     thread.start()
     try:
-        yield told.take
+        yield reporter.take
     finally:
         ended.set()
         thread.join()
-        told.tell()
+        reporter.report()
 
 
-class _Told:
+class _ConsumptionReporter:
     """Reports a scene's used samples to Redis."""
 
     def __init__(self, redis_url: str | None, store: str | Path, scene_id: str) -> None:
@@ -283,7 +283,7 @@ class _Told:
         """Set the current numbers."""
         self._used = min(draws, samples)
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Report the last numbers, if there are any and a Redis."""
         if self._url is None or self._used is None:
             return
@@ -293,7 +293,7 @@ class _Told:
             self._connection = self._connection or queue.connect(self._url)
             self._store = self._store or Store(self._root)
             queue.check_served(self._connection, self._store)
-            queue.tell_consumed(self._connection, self._scene_id, self._used)
+            queue.report_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
                 click.echo(f"no worker is told what is used: {error}", err=True)
@@ -302,7 +302,7 @@ class _Told:
             pass
 
 
-def _tell(record: dict[str, Any]) -> None:
+def _log_record(record: dict[str, Any]) -> None:
     if record["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
         click.echo(f"goes on from step {record['step']} with {changed}", err=True)

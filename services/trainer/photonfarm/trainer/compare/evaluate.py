@@ -58,7 +58,7 @@ Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
 It gets the first predictor's images (H, W, 3), and the references that some rows have.
 """
 
-Tell = Callable[[str, int, int], object]
+MeasureProgress = Callable[[str, int, int], object]
 """A callback with a predictor's name, the number of samples it was measured on so far, and of all samples."""
 
 
@@ -155,7 +155,7 @@ def compare(
     without_inception: bool = False,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     choose: Choose | None = None,
 ) -> Evaluation:
     """Compare runs, and denoisers given one of so many pixels, on the first `most` views that no run was trained on.
@@ -176,7 +176,7 @@ def compare(
     found = {} if references is None else read_references(references, samples)
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found and not without_inception else None
-    test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
+    test = _Test(store, samples, found, shown, network, str(place), on_progress or (lambda *_: None))
     untrained = [UntrainedPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     leading, *others = test.timed([*runs, *untrained])
     first_of_all = test.measured(leading)
@@ -225,7 +225,7 @@ class _Watched:
 
     predict: Predictor
     wanted: set[int]
-    tell: Callable[[int], object]  # called with the number of samples so far
+    on_progress: Callable[[int], object]  # called with the number of samples so far
     images: dict[int, F32] = field(default_factory=dict)
     units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
     samples: int = 0
@@ -236,7 +236,7 @@ class _Watched:
             if row in self.wanted:
                 self.images[row], self.units[row] = image.copy(), unit
         self.samples += len(batch.rows)
-        self.tell(self.samples)
+        self.on_progress(self.samples)
         return images
 
 
@@ -275,7 +275,7 @@ class _Test:
     shown: list[int]  # rows
     inception: Inception | None
     device: str
-    tell: Tell
+    on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
     def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:
@@ -296,7 +296,9 @@ class _Test:
         predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
         with self._feed(predictor, batch=size) as feed:
             watched = _Watched(
-                timed.predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, len(rows))
+                timed.predict,
+                {*self.references, *self.shown},
+                lambda done: self.on_progress(predictor.name, done, len(rows)),
             )
             held_out = measure(watched, batches(feed, rows, size))
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)

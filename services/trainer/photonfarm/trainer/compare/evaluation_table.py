@@ -17,7 +17,7 @@ FEW_UNITS = 6
 """The number of configurations or views below which intervals by Student's t are of little use."""
 
 
-def told(evaluation: Evaluation) -> str:
+def evaluation_text(evaluation: Evaluation) -> str:
     """The head, the rows as a Markdown table, and the foot."""
     of_time = _of_time(evaluation)
     foot = "\n".join(f"- {sentence}" for sentence in (of_time, *notes(evaluation)))

@@ -116,7 +116,7 @@ class BatchStream:
 
     def _ask(self, rows: tuple[int, ...]) -> None:
         self._asked.append(rows)
-        self._group.tell("rows", rows)
+        self._group.send("rows", rows)
         self._feed.ask(self._group.part(rows))
 
     def take(self) -> TrainingBatch | None:
@@ -125,7 +125,7 @@ class BatchStream:
         None if no row is left in it: another batch is drawn instead, at the end.
         """
         batch = self._feed.take()
-        self._group.tell("take")  # only now, so that other ranks do not wait for a rank whose reading failed
+        self._group.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
         rows, there = self._asked.popleft(), self._group.joined(batch.rows)
         self._sampler.put_back((Counter(rows) - Counter(there)).elements())
         if there:

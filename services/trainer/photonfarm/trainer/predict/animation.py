@@ -86,14 +86,14 @@ def write_mp4(pictures: Iterable[Picture], file: Path, fps: float) -> None:
     coded = ["-an", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     ffmpeg = import_module(FFMPEG).get_ffmpeg_exe()  # its own write_frames leaves pipes open
     command = [ffmpeg, "-loglevel", "error", "-y", *given, *coded, str(file)]
-    with store_errors("write the film", file), tempfile.TemporaryFile() as words:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words) as process:
+    with store_errors("write the film", file), tempfile.TemporaryFile() as log:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process:
             if process.stdin is not None:
                 _pour(chain([first], coming), process.stdin)
-        words.seek(0)
-        said = words.read().decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+        log.seek(0)
+        lines = log.read().decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
     if process.returncode:
-        raise StoreError(f"{file}: ffmpeg cannot write the film: {said[-1]}")
+        raise StoreError(f"{file}: ffmpeg cannot write the film: {lines[-1]}")
 
 
 def _pour(pictures: Iterable[Picture], pipe: IO[bytes]) -> None:

@@ -37,8 +37,8 @@ class TrainedRun:
         a readable checkpoint.
         """
         settings, state = read_settings(folder), checkpoint.load(folder / name)
-        said = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
-        checkpoint.check_continues(folder / name, state, said)
+        identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
+        checkpoint.check_continues(folder / name, state, identity)
         weights = average["weights"] if (average := state.get("average")) else state["network"]
         return cls(folder, settings, str(state["scene_id"]), weights)
 
@@ -53,8 +53,8 @@ class TrainedRun:
     def name(self) -> str:
         """The architecture, and the folder if its name adds something; of an absolute path its last part."""
         architecture, folder = self.settings.network.architecture, self.folder
-        said = folder.name if folder.is_absolute() else str(folder)
-        return architecture if said == architecture else f"{architecture} ({said})"
+        name = folder.name if folder.is_absolute() else str(folder)
+        return architecture if name == architecture else f"{architecture} ({name})"
 
     @property
     def needs(self) -> Needs:

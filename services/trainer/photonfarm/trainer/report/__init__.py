@@ -13,7 +13,7 @@ from typing import Any
 
 from photonfarm.shared.core.errors import store_errors
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluate import Tell
+from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
@@ -34,7 +34,7 @@ def write_report(
     inception: Path | None = None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     timed: bool = True,
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
@@ -49,7 +49,7 @@ def write_report(
         tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
     contents = gathered(
         store, loaded, denoisers, references=references, inception=inception, most=most,
-        device=device, tell=tell, timed=timed,
+        device=device, on_progress=on_progress, timed=timed,
     )  # fmt: skip
     text, drawn = json.dumps(contents.document(), indent=2, ensure_ascii=False), plots(contents)
     with store_errors("write the report", out):

@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow, Tell
+from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -90,7 +90,7 @@ def gathered(
     inception: Path | None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     timed: bool = True,
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
@@ -99,8 +99,8 @@ def gathered(
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), timed=timed)
     evaluation = evaluate.compare(
-        store, runs, denoisers, references=references, inception=inception, most=most, device=device, tell=tell,
-        choose=close_look,
+        store, runs, denoisers, references=references, inception=inception, most=most, device=device,
+        on_progress=on_progress, choose=close_look,
     )  # fmt: skip
     costs = close_look.costs
     found = table_of(card.spec)

@@ -47,9 +47,9 @@ class DatasetCard:
         workers = set()
         core_s: dict[int, float] = {}
         committed, guided = scene.committed_jobs(), scene.guides.committed_jobs()
-        told = [(job, scene.marker(job)) for job in sorted(committed)]
-        told += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
-        for job, marker in told:
+        marked = [(job, scene.marker(job)) for job in sorted(committed)]
+        marked += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
+        for job, marker in marked:
             figures = marker["figures"]
             core_s[job] = core_s.get(job, 0.0) + figures["core_s"]
             workers.add(figures["worker"])

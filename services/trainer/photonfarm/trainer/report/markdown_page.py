@@ -24,9 +24,9 @@ def markdown(contents: ReportContents, drawn: list[Plot], pictures: str) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _plots(title: str, said: str, drawn: list[Plot]) -> str:
+def _plots(title: str, explanation: str, drawn: list[Plot]) -> str:
     images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
-    return f"## {title}\n\n{said}\n\n{images}"
+    return f"## {title}\n\n{explanation}\n\n{images}"
 
 
 def _table(table: Table) -> str:

@@ -61,7 +61,7 @@ OF_CURVES = (
 def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
     """The title, an explanation, and the plots of each kind, without empty kinds."""
     kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
-    found = [(title, said, [plot for plot in drawn if plot.name.startswith(kind)]) for title, said, kind in kinds]
+    found = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
     return [each for each in found if each[2]]
 
 

@@ -116,8 +116,8 @@ def _paper(contents: ReportContents) -> Table:
             head.append("paper")
     rows = [_paper_row(contents, entry, beside=beside) for entry in contents.entries]
     named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
-    said = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
-    return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(said))
+    below = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
+    return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(below))
 
 
 def _has_references(contents: ReportContents) -> bool:
@@ -143,15 +143,15 @@ def _of_time(contents: ReportContents) -> str:
 
 def _of_paper(contents: ReportContents) -> str:
     film, unit = contents.card.spec.film, contents.measure.published
-    said = (
+    times = (
         "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on another "
         "machine: orders of errors can be compared, values cannot. Of time, the networks' ratios can"
         f"{'' if unit is None else f' ({contents.measure.architecture} took {unit.seconds:g} s there)'}"
     )
     if not _has_denoisers(contents):
-        return said
+        return times
     return (
-        f"{said}. The denoisers' cannot: their time is mostly rendering, here of "
+        f"{times}. The denoisers' cannot: their time is mostly rendering, here of "
         f"{contents.card.spec.transport.half_spp} samples per pixel at {film.width} × {film.height}, where starting "
         "takes much of it, and of another number in the paper"
     )
@@ -211,14 +211,14 @@ def _further(contents: ReportContents) -> Table:
         rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
     titles = (*(m.title for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
-    said = [notes(contents.evaluation)[0]]
+    below = [notes(contents.evaluation)[0]]
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
-        said.append(
+        below.append(
             f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
             f"{weights.source}, sha256 {weights.sha256}; images are resized to 299 × 299 bilinearly without aligned "
             "corners. KID's interval is the jackknife's over views; FID has none"
         )
-    return Table("Further metrics", head, tuple(rows), tuple(said))
+    return Table("Further metrics", head, tuple(rows), tuple(below))
 
 
 def _frame_parts(contents: ReportContents) -> list[Table]:
@@ -234,20 +234,20 @@ def _frame_parts(contents: ReportContents) -> list[Table]:
         if entry.time
     )
     head = ("architecture", "render 1/k", "buffers", "guides", "points seen", "photons", "network", "all")
-    said = ["milliseconds: the median, and the middle 80 % of the times"]
+    below = ["milliseconds: the median, and the middle 80 % of the times"]
     if _has_denoisers(contents):
-        said.append(
+        below.append(
             "denoisers are given one half-estimate of 1/k of the pixels; as splats of light paths do not stop at "
             "these, their light paths are as many as for the whole image (up to 64 × as many per pixel)"
         )
     networks = {story.name: story.run.settings.network for story in contents.stories}
     transport = {name: of for name, of in networks.items() if of.architecture.startswith("light_transport")}
     if relative := [name for name, of in transport.items() if of.maxima == "relative"]:
-        said.append(
+        below.append(
             f"{', '.join(relative)}: maxima are relative, for which the network runs over the base cloud anew in each "
             "frame, though what that gives is the same each time: a renderer would keep it"
         )
-    return [Table("Where the time of a frame goes", head, rows, tuple(said))]
+    return [Table("Where the time of a frame goes", head, rows, tuple(below))]
 
 
 def _ms(time: Seconds) -> str:
@@ -280,10 +280,10 @@ def _worst(contents: ReportContents) -> list[Table]:
     if not contents.worst:
         return []
     rows = tuple((c.kind, f"{c.row}", f"{c.pixels:.1%}", f"{c.mse:.4f}") for c in contents.worst)
-    said = (
+    note = (
         f"of all views with references, those in which pixels of one kind cost {contents.entries[0].name} most: the "
         "sum of their squared error in the metric space, the references' noise taken out; one view may be the worst of "
         "several kinds. Close: nearer than 5 % of what is seen. Fine shadows: in both halves of the reference light "
         "steps where surface, normal and colour do not"
     )
-    return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (said,))]
+    return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (note,))]

@@ -143,7 +143,7 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
 
     Returns the other settings that have changed. Both arguments have `scene_id` and `settings`.
     """
-    then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
+    then, now = ({"scene_id": one["scene_id"], **one["settings"]} for one in (state, identity))
     check_of_this_version(path, then["network"])
     changed = _differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}

@@ -22,7 +22,7 @@ from torch import Tensor, distributed, nn
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.runs.device import AUTO, usable_device
 
-WORD_PATIENCE = timedelta(days=30)
+COMMAND_PATIENCE = timedelta(days=30)
 """How long a rank waits for its next command: as long as a store may take to grow."""
 
 STEP_PATIENCE = timedelta(minutes=15)
@@ -43,7 +43,7 @@ class TrainingGroup(Protocol):
     def part(self, rows: Sequence[int]) -> tuple[int, ...]:
         """The rows of a batch that this process reads."""
 
-    def tell(self, what: str, told: Any = None) -> None:
+    def send(self, command: str, value: Any = None) -> None:
         """Send the other ranks a command; for rank 0."""
 
     def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
@@ -66,7 +66,7 @@ class SingleProcess:
         """All of the rows."""
         return tuple(rows)
 
-    def tell(self, what: str, told: Any = None) -> None:
+    def send(self, command: str, value: Any = None) -> None:
         """Do nothing: there are no other ranks."""
 
     def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
@@ -84,10 +84,10 @@ SINGLE_PROCESS = SingleProcess()
 class Ranks:
     """One of the processes of torch's default group. Raises IncompleteError if another one has ended or hangs."""
 
-    def __init__(self, words: distributed.ProcessGroup) -> None:
-        """Take `words`, a group of the same processes by which rank 0 sends commands."""
+    def __init__(self, commands: distributed.ProcessGroup) -> None:
+        """Take `commands`, a group of the same processes by which rank 0 sends commands."""
         self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
-        self._words = words
+        self._commands = commands
         self.within_step = False
 
     def device(self, name: str) -> torch.device:
@@ -98,17 +98,17 @@ class Ranks:
         """Every `size`-th row, beginning with this rank's."""
         return tuple(rows[self.rank :: self.size])
 
-    def tell(self, what: str, told: Any = None) -> None:
+    def send(self, command: str, value: Any = None) -> None:
         """Send the other ranks a command; for rank 0."""
         with self._others_there():
-            distributed.broadcast_object_list([what, told], src=0, group=self._words)
+            distributed.broadcast_object_list([command, value], src=0, group=self._commands)
 
-    def hear(self) -> tuple[str, Any]:
+    def receive(self) -> tuple[str, Any]:
         """Receive the next command of rank 0; for the others."""
-        heard: list[Any] = [None, None]
+        received: list[Any] = [None, None]
         with self._others_there():
-            distributed.broadcast_object_list(heard, src=0, group=self._words)
-        return heard[0], heard[1]
+            distributed.broadcast_object_list(received, src=0, group=self._commands)
+        return received[0], received[1]
 
     def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
         """The rows of a batch that all processes have read together; all must call."""
@@ -154,7 +154,7 @@ def leading(group: TrainingGroup) -> Iterator[None]:
     finally:
         if not group.within_step:
             with suppress(IncompleteError):  # they have ended already
-                group.tell("end")
+                group.send("end")
 
 
 @contextmanager
@@ -174,7 +174,7 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
         torch.cuda.set_device(own)
     distributed.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo", timeout=STEP_PATIENCE)
     try:
-        yield Ranks(distributed.new_group(backend="gloo", timeout=WORD_PATIENCE))
+        yield Ranks(distributed.new_group(backend="gloo", timeout=COMMAND_PATIENCE))
     finally:
         distributed.destroy_process_group()
 

@@ -11,10 +11,10 @@ from photonfarm.shared.core.errors import StoreError, store_errors
 
 
 class MetricsLog:
-    """The log of one run. `listen` is called with each record as it is written; StoreError if the disk refuses."""
+    """The log of one run. `on_record` is called with each record as it is written; StoreError if the disk refuses."""
 
-    def __init__(self, path: Path, listen: Callable[[dict[str, Any]], object] | None = None) -> None:
-        self._path, self._listen = path, listen
+    def __init__(self, path: Path, on_record: Callable[[dict[str, Any]], object] | None = None) -> None:
+        self._path, self._on_record = path, on_record
 
     def cut(self, step: int) -> list[dict[str, Any]]:
         """Drop the records after the checkpoint of `step`, which a resumed run writes again.
@@ -41,8 +41,8 @@ class MetricsLog:
         record = {"kind": kind, **values}
         with store_errors("write the log", self._path), self._path.open("ab") as file:
             file.write(json.dumps(record).encode() + b"\n")
-        if self._listen:
-            self._listen(record)
+        if self._on_record:
+            self._on_record(record)
 
 
 def _is_after(record: dict[str, Any], step: int) -> bool:

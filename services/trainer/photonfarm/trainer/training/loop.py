@@ -113,7 +113,7 @@ class Session:
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
-        self._seconds_told: dict[str, float] = {}  # at the last validation
+        self._seconds_logged: dict[str, float] = {}  # at the last validation
 
     def run(self) -> TrainingOutcome:
         """Train until something ends it."""
@@ -145,10 +145,10 @@ class Session:
             self._log.write("changes", step=self._step, changes=changed)
         if self._learner.verdict is not None:
             self._log.write("loss", step=self._step, loss=self._settings.loss, verdict=str(self._learner.verdict))
-        self._tell_count()
+        self._report_draws()
 
     def _start(self) -> checkpoint.Changes:
-        self._tell_begin(continues=False)
+        self._send_begin(continues=False)
         settle(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
@@ -165,14 +165,14 @@ class Session:
             self._best = BestValidation.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
-        self._seconds_told = dict(state["seconds"])
-        self._tell_begin(continues=True)
+        self._seconds_logged = dict(state["seconds"])
+        self._send_begin(continues=True)
         self._following.restore(state["following"])
         return changed
 
-    def _tell_begin(self, *, continues: bool) -> None:
-        told = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
-        self._hooks.group.tell("begin", told)
+    def _send_begin(self, *, continues: bool) -> None:
+        beginning = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
@@ -267,10 +267,10 @@ class Session:
             shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
-            waits=waits(seconds := self._watch.seconds, self._seconds_told),
+            waits=waits(seconds := self._watch.seconds, self._seconds_logged),
             **self._counts(),
         )
-        self._seconds_told = seconds
+        self._seconds_logged = seconds
 
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
@@ -281,12 +281,12 @@ class Session:
         """Keep the state after the last validation, or go back, in all processes."""
         found = self._compared
         if found is not None and found.is_clearly_worse:
-            told = f"step {self._step}: {found.stated}"
-            self._hooks.group.tell("back", told)
-            self._good.go_back(told)
+            reason = f"step {self._step}: {found.stated}"
+            self._hooks.group.send("back", reason)
+            self._good.go_back(reason)
             self._log_recovered("held-out error", found)
         elif found is not None and not found.is_worse:
-            self._hooks.group.tell("keep", self._step)
+            self._hooks.group.send("keep", self._step)
             self._good.keep(self._step)
 
     def _end_no_worse(self) -> None:
@@ -317,7 +317,7 @@ class Session:
         """The number of draws so far, and of arrived samples."""
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
-    def _tell_count(self) -> None:
+    def _report_draws(self) -> None:
         if self._hooks.on_draws is not None:
             self._hooks.on_draws(*self._used())
 
@@ -333,7 +333,7 @@ class Session:
         if value is None:
             self._log_recovered("loss")
         self._step += 1
-        self._tell_count()
+        self._report_draws()
         if value is not None and self._step % LOG_EVERY == 0:
             rate = self._learner.rate(self._step - 1)
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())

@@ -44,20 +44,20 @@ def relative_loss(prediction: Tensor, target: Tensor) -> Tensor:
     return torch.mean((prediction[:, None] - target) ** 2 / (brightness**2 + RELATIVE_EPSILON)[:, None])
 
 
-def paired_loss(prediction: Tensor, target: Tensor, told: Tensor | None = None) -> Tensor:
+def paired_loss(prediction: Tensor, target: Tensor, weighting: Tensor | None = None) -> Tensor:
     """The relative error of each half, with a weight from the prediction and the other half: (B, 2, H, W, 3).
 
     Where the prediction is far too dark, as beside lamps at first, the relative loss's weight is far too large, and a
     few such pixels make up most of the gradient. The other half shows that they are bright. Its noise is independent of
     this half's: E w(B) (f − A) = E w(B) · (f − I), zero for the clean image. The weight of a pixel depends on the
-    noise, and so does, for a network that cannot be right everywhere, where it is right. Ours. `told` are the halves
-    that give the weights, if not the target's. Raises ValueError unless there are two.
+    noise, and so does, for a network that cannot be right everywhere, where it is right. Ours. `weighting` are the
+    halves that give the weights, if not the target's. Raises ValueError unless there are two.
     """
-    told = target if told is None else told
-    if told.shape[1] != 2:
-        raise ValueError(f"has {told.shape[1]} half-estimates; each of two is weighted by the other")
+    weighting = target if weighting is None else weighting
+    if weighting.shape[1] != 2:
+        raise ValueError(f"has {weighting.shape[1]} half-estimates; each of two is weighted by the other")
     prediction = prediction[:, None]
-    brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), told.flip(1)))
+    brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), weighting.flip(1)))
     return torch.mean((prediction - target) ** 2 / (brightness**2 + of_other**2 + RELATIVE_EPSILON))
 
 

@@ -21,7 +21,7 @@ from photonfarm.shared.store.check.job_pool import JobPool
 from photonfarm.shared.store.check.plan_check import PlanCheck
 from photonfarm.shared.store.check.plan_repair import PlanRepair
 from photonfarm.shared.store.check.repeated_seeds import equal_samples
-from photonfarm.shared.store.check.unplanned_files import strangers
+from photonfarm.shared.store.check.unplanned_files import unplanned_files
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
@@ -31,7 +31,7 @@ from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.write.store import Store
 
-Progress = Callable[[str, int, int, int], None]
+CheckProgress = Callable[[str, int, int, int], None]
 """Called with the scene's name, the jobs checked, the jobs to check, and the bytes read."""
 
 
@@ -74,7 +74,12 @@ class StoreReport:
 
 
 def check_store(
-    store: Store, scene_id: str | None = None, *, when: str, repair: bool = False, tell: Progress | None = None
+    store: Store,
+    scene_id: str | None = None,
+    *,
+    when: str,
+    repair: bool = False,
+    on_progress: CheckProgress | None = None,
 ) -> StoreReport:
     """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
 
@@ -89,16 +94,16 @@ def check_store(
         quarantine = Quarantine(storage, when)
         reports = []
         for each in ids:
-            checking = _SceneChecking(storage, each, len(ids), tell or (lambda *_: None))
+            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None))
             reports.append(checking.run(quarantine if repair else None))
         return StoreReport(
             tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
         )
 
 
-def said(halves: HalvesResult) -> str:
+def halves_in_words(halves: HalvesResult) -> str:
     """The outcome of the test between A and B, in words."""
-    few = "" if halves.tells else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
+    few = "" if halves.is_conclusive else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
     return few + (
         f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
         f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
@@ -109,11 +114,11 @@ def said(halves: HalvesResult) -> str:
 class _SceneChecking:
     """One scene on its way through the check."""
 
-    def __init__(self, storage: Storage, scene_id: str, scenes: int, tell: Progress) -> None:
+    def __init__(self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress) -> None:
         self._storage = storage
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
-        self._tell = tell
+        self._on_progress = on_progress
         self._findings = Findings()
         self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
@@ -168,7 +173,7 @@ class _SceneChecking:
         self._read(scene, committed, self._tally, scene.spec.name)
         self._add(self._again(equal_samples(scene, self._tally)))
         if (halves := self._tally.halves.result()) is not None and not halves.passed:
-            self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+            self._add([Finding(Cause.HALVES_DIFFER, halves_in_words(halves), self._scene_id)])
 
     def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
         """Check the scene's guides, if it has some; returns what of their settings and declarations was mended."""
@@ -185,15 +190,15 @@ class _SceneChecking:
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):
                 jobs = committed[done : done + AT_ONCE]
-                self._tell(called, done, len(committed), pool.size_bytes)
+                self._on_progress(called, done, len(committed), pool.size_bytes)
                 for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
                     if found:
                         self._markers[scene.guides, job] = marker
                         self._add(self._again(found))
             for tally in pool.tallies:
                 total.add(tally)
-        self._tell(called, len(committed), len(committed), total.size_bytes)
-        self._add(strangers(scene))
+        self._on_progress(called, len(committed), len(committed), total.size_bytes)
+        self._add(unplanned_files(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
         """The findings, with another cause for equal halves that were equal again after being rendered again."""

@@ -39,7 +39,7 @@ class HalvesResult:
         return self.statistic < self.limit
 
     @property
-    def tells(self) -> bool:
+    def is_conclusive(self) -> bool:
         """Whether there are enough samples for a difference to show: |S| is √n at most."""
         return sqrt(self.samples) >= self.limit
 

@@ -116,7 +116,7 @@ class JobCheck:
         try:
             named = markers.files(marker, scene.name, job)
         except CorruptError as error:
-            yield self._finding(Cause.MARKER, job, _said(error), name)
+            yield self._finding(Cause.MARKER, job, _error_text(error), name)
             return
         files = {file: about for file, about in named.items() if _array_of(file) in self._arrays}  # others may be added
         self._tally.jobs += 1
@@ -160,7 +160,7 @@ class JobCheck:
             shard = Shard(self._scene.storage.local(file), array, self._scene.shard_rows)
             crc32c = shard.summary()["crc32c"]
         except CorruptError as error:
-            yield self._finding(Cause.CHECKSUM, job, _said(error), file)
+            yield self._finding(Cause.CHECKSUM, job, _error_text(error), file)
             return
         except OSError as error:
             yield self._unreadable(job, file, error)
@@ -235,7 +235,7 @@ class JobCheck:
         try:
             shard.read_into(i, values)
         except CorruptError as error:
-            return Cause.CHECKSUM, _said(error)
+            return Cause.CHECKSUM, _error_text(error)
         if values.dtype.kind == "f" and not is_finite(values):
             return Cause.NOT_FINITE, name
         return None
@@ -267,6 +267,6 @@ def _plan_of(file: str) -> str:
     return file.rsplit("/", 2)[0]
 
 
-def _said(error: CorruptError) -> str:
+def _error_text(error: CorruptError) -> str:
     """The text of an error without the file, which the finding names."""
     return str(error).partition(": ")[2] or str(error)

@@ -11,7 +11,7 @@ from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.write.findings import Cause, Finding
 
 
-def strangers(scene: CheckTarget) -> Iterator[Finding]:
+def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
     """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
     foreign = [

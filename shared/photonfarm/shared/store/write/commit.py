@@ -258,11 +258,11 @@ class RowWriter(ABC):
             marker = self._storage.read(name)
         except FileNotFoundError:  # a repair was faster
             return False
-        told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
-        wrong = self._told_wrong(told)
+        named = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
+        wrong = self._mismatched(named)
         renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
         if any(renewed):
-            wrong = self._told_wrong(told)
+            wrong = self._mismatched(named)
         if not wrong:
             return True
         detail = "files were moved or replaced while the job was committed; those that are there stay"
@@ -271,11 +271,11 @@ class RowWriter(ABC):
         Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
         return False
 
-    def _told_wrong(self, told: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    def _mismatched(self, named: Mapping[str, Mapping[str, Any]]) -> list[str]:
         """The arrays whose files differ from the marker."""
         there = self._summaries()
-        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
-        return [name for name in relevant if not _is_told(told.get(self._plan_file(name)), there.get(name))]
+        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in named]
+        return [name for name in relevant if not _matches(named.get(self._plan_file(name)), there.get(name))]
 
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
@@ -381,9 +381,9 @@ class JobWriter(RowWriter):
         self._check_rows("radiance_wide", samples)
 
 
-def _is_told(told: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
+def _matches(named: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
     """Whether a marker's entry matches a file: the same size and checksum, or neither exists."""
-    return told == there if told is None or there is None else all(told[key] == there[key] for key in there)
+    return named == there if named is None or there is None else all(named[key] == there[key] for key in there)
 
 
 def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:

@@ -59,7 +59,7 @@ LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=384, resolution=0.
 class Truth:
     """The reference of an image."""
 
-    said: str  # in words, for the table
+    name: str  # in words, for the table
     images: Callable[[HardScene, Effort, int], Images]  # function of a scene, an effort and a seed
 
 

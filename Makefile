@@ -1,13 +1,13 @@
 # make demo   the main job, on embedded defaults      make test       the tests
 # make check  style, types, layers                    make test-slow  those that take long: many kills, many images
-# make setup  the virtual environment alone
+# make setup  the virtual environment alone         make docs       the documentation as a site, in build/site
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 PROJECTS := shared services/renderer services/trainer
 
-.PHONY: setup demo test test-slow test-compose check lock clean
+.PHONY: setup demo test test-slow test-compose check docs lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -41,16 +41,25 @@ check: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The documentation as a site; a link to nothing is an error.
+docs: $(VENV)/.docs-ready
+	$(BIN)/python scripts/cli_page.py
+	$(BIN)/mkdocs build --strict --quiet
+
+$(VENV)/.docs-ready: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[docs]'
+	@touch $@
+
 # What only this benchmark needs: the peers it is about, and plots.
 $(VENV)/.bench-ready: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[bench]'
 	@touch $@
 
 bench-render: $(VENV)/.bench-ready
-	$(BIN)/python bench/render.py
 
+# bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
 bench-%: $(STAMP)
-	$(BIN)/python bench/$(subst -,_,$*).py
+	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(STAMP)

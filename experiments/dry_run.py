@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from experiment import Experiment, Run
+from experiments.experiment import Experiment, Run
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SceneSpec
 

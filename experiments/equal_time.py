@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.rooms import Room
 from photonfarm.trainer.compare.markdown import markdown_table
-from rooms import Room
 
 F64 = NDArray[np.float64]
 

@@ -21,7 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from experiment import HERE, Experiment
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
+
+from experiments.experiment import HERE, Experiment
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
@@ -58,7 +60,7 @@ class Report:
             name: [_tile(sheet, top + view * step + LINE, column * (width + GAP), width) for view in range(self.views)]
             for column, name in enumerate(names)
         }
-        worst = {}
+        worst: dict[int, list[str]] = {}
         for case in document["worst_cases"]:
             worst.setdefault(case["row"], []).append(case["kind"])
         self.worst = [", ".join(kinds) for kinds in worst.values()]

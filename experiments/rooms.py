@@ -11,10 +11,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from experiment import Experiment, seeded
+from experiments.experiment import Experiment, seeded
+from experiments.stages import EVALUATION
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.estimate import Estimate
-from stages import EVALUATION
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +83,7 @@ class Room:
     @property
     def rows(self) -> dict[str, dict[str, Any]]:
         """Those of its evaluation, by name."""
-        return self.document["rows"]  # type: ignore[no-any-return]
+        return self.document["rows"]
 
     @property
     def film(self) -> tuple[int, int]:

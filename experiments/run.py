@@ -17,12 +17,13 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-import dry_run
-from experiment import Experiment, SizeName, names
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
-from stages import Stages, tell
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
 
-ROOT = Path(__file__).parents[1]
+from bench.harness.results import ROOT
+from experiments import dry_run
+from experiments.experiment import Experiment, SizeName, names
+from experiments.stages import Stages, tell
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
 
 
 def options() -> argparse.ArgumentParser:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiment import Experiment, Run
+from experiments.experiment import Experiment, Run
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.processes import tied
@@ -173,7 +173,7 @@ class Stages:
         """
         size, out = self.experiment.size, self.folder / "report"
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
-        denoisers += [argument for kept in size.kept for argument in ("--kept", kept)]
+        denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
         if again := self.experiment.again():
             self._measure("evaluate", again, ["--without-inception"], self._folder(again[0]) / EVALUATION)

@@ -24,8 +24,12 @@ from typing import Any, TypeVar, get_args
 
 import numpy as np
 
-import equal_time
-from experiment import HERE, Experiment, Part, SizeName, names
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
+
+from bench.harness import results
+from experiments import equal_time
+from experiments.experiment import HERE, Experiment, Part, SizeName, names
+from experiments.rooms import Room, estimate
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.compare.markdown import markdown_table
@@ -33,11 +37,6 @@ from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, Table
 from photonfarm.trainer.report.tables import with_interval
-from rooms import Room, estimate
-
-ROOT = HERE.parent
-sys.path.insert(0, str(ROOT / "bench"))
-import results  # noqa: E402
 
 T = TypeVar("T")
 
@@ -326,10 +325,9 @@ time. Intervals are a bootstrap over configurations.
 
 def options() -> argparse.ArgumentParser:
     """What can be told."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = results.parser(__doc__)
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
-    parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
-    results.add_options(parser)
+    parser.add_argument("--work", type=Path, default=results.ROOT / "build/experiments", help="(build/experiments)")
     return parser
 
 
@@ -368,11 +366,12 @@ def main() -> int:
     (told.out / f"{page_of(told.size)}.png").write_bytes(equal_time.picture(found))
     told_of = {
         "command": command(told.size),
+        "commit": results.commit(),
         "machine": "each room's own",  # and not the one that this runs on
         "size": told.size,
         "rooms": {room.name: room.document for room in found},
     }
-    results.write("tables", text, told_of, told.out, page_of(told.size))
+    results.save(page_of(told.size), text, told_of, told.out)
     return 0
 
 

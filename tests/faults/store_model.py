@@ -9,7 +9,7 @@ import numpy as np
 import store_samples as samples
 
 from photonfarm.shared.core.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.plan.request import UNUSED, Known, Request, expand, sample_key
+from photonfarm.shared.plan.request import UNUSED, PlannedContent, Request, expand, sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.store import SceneReader, SceneStore
@@ -117,7 +117,7 @@ class Model:
 
     def named(self, request: Request) -> set[bytes]:
         """The keys that a request names, whatever is planned."""
-        rows = expand(self.spec, request, Known(), first_job=0, shard_rows=self.shard_rows).rows
+        rows = expand(self.spec, request, PlannedContent(), first_job=0, shard_rows=self.shard_rows).rows
         return {key.tobytes() for key in rows.sample_key[rows.sample_modification != UNUSED]}
 
 

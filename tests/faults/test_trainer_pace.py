@@ -16,7 +16,7 @@ from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared.cli import show
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status, tell_consumed
+from photonfarm.shared.queue import connect, queue_status, report_consumed
 from photonfarm.shared.store import SceneStore, Store
 
 
@@ -66,7 +66,7 @@ def test_no_more_is_committed_than_the_ratio_to_what_the_trainer_has_used(
         if job is not None:
             renderer.render(scene.scene_id, job)
         if used is not None:
-            tell_consumed(connection, scene.scene_id, used)
+            report_consumed(connection, scene.scene_id, used)
         clock.now += AHEAD_LOOK_S
         return pace.ahead().get(scene.scene_id)
 
@@ -87,7 +87,7 @@ def test_each_scene_is_held_against_its_own_trainer(
     store: Store, add: Callable[..., SceneStore], connection: redis.Redis
 ) -> None:
     ahead, new, used = add("ahead", 8, 3), add("new", 16, 1), add("used", 24, 3)
-    tell_consumed(connection, used.scene_id, 6)
+    report_consumed(connection, used.scene_id, 6)
     assert TrainerPace(store, connection, 1.0).ahead().keys() == {ahead.scene_id}
     assert TrainerPace(store, connection, 1.0, scene_id=new.scene_id).ahead() == {}
     assert TrainerPace(store, connection, 1.0, scene_id=ahead.scene_id).ahead().keys() == {ahead.scene_id}
@@ -117,14 +117,14 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     with analytic.start_worker(store.root, redis_server.url, child, log, until_complete=True, ahead=1.5) as running:
         try:
             analytic.wait_for(lambda: len(new.committed_jobs()) == 2, 120)
-            held_up = lambda: queue_status(connection).held_up  # noqa: E731
-            analytic.wait_for(lambda: held_up().left.keys() == {ahead.scene_id, new.scene_id}, 60)
-            tell_consumed(connection, new.scene_id, 8)
+            idle = lambda: queue_status(connection).idle_reports  # noqa: E731
+            analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id, new.scene_id}, 60)
+            report_consumed(connection, new.scene_id, 8)
             analytic.wait_for(lambda: not new.missing_jobs(), 60)
-            analytic.wait_for(lambda: held_up().left.keys() == {ahead.scene_id}, 60)
+            analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id}, 60)
             show.status(store.root, redis_server.url, as_json=False)
             assert len(ahead.committed_jobs()) == 3
-            tell_consumed(connection, ahead.scene_id, 6)
+            report_consumed(connection, ahead.scene_id, 6)
             assert running.wait(120) == 0
         finally:
             running.kill()
@@ -134,4 +134,4 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     said = log.read_text()
     assert said.count(f"takes no jobs of scene {ahead.scene_id}: {reason}") == 1
     assert said.count(f"takes jobs of scene {ahead.scene_id} again") == 1
-    assert queue_status(connection).held_up.left == {}
+    assert queue_status(connection).idle_reports.left == {}

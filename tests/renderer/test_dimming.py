@@ -12,7 +12,7 @@ import pytest
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy import content, light_reach
-from photonfarm.renderer.strategy.pilot_scene import Stage
+from photonfarm.renderer.strategy.pilot_scene import PilotScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.scene.files import BUILTIN_EMITTING
@@ -211,14 +211,14 @@ def test_a_plan_and_photons_see_only_what_shines(file_scene: Loader, folder: Pat
     own = SKY + window(RGB.format("radiance"))
     lit = file_scene(folder, BLOCK + own, lights=[lamp()])
     night = file_scene(folder, BLOCK + own, lights=[lamp()], emitters={"all": 0})
-    found = [content.read(scene.scene, Stage(scene.spec, folder).camera()) for scene in (lit, night)]
+    found = [content.read(scene.scene, PilotScene(scene.spec, folder).camera()) for scene in (lit, night)]
     assert found[0].lights == {"area": 2, "environment map": 1}
     assert found[1].lights == {"area": 1}
     assert "lights: 1 area" in content.sentences(found[1], 4)
     reaches = [light_reach.measure([scene.scene], scene.spec.view, 0) for scene in (lit, night)]
     assert reaches[0].hit < 0.5 < reaches[1].hit  # the sky's paths miss
     dark = file_scene(folder, BLOCK + own, emitters={"all": 0})
-    read = content.read(dark.scene, Stage(dark.spec, folder).camera())
+    read = content.read(dark.scene, PilotScene(dark.spec, folder).camera())
     _, left_out = content.restrict(read, 4, 0.0, [])
     assert "there is no light that shines" in str(left_out[0])
 

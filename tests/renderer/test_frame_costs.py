@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from photonfarm.renderer.cli import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.measure.frame_costs import WARM_UPS, Frame, frame_costs, in_turn
+from photonfarm.renderer.measure.frame_costs import WARM_UPS, TimedFrame, frame_costs, in_turn
 from photonfarm.renderer.measure.partial_film import PartialFilm, part_of
 from photonfarm.renderer.measure.surfaces import surface_kinds
 from photonfarm.renderer.scene import backend
@@ -47,8 +47,8 @@ def plain(film: int = 16, **changes: Any) -> SceneSpec:
     return parse_spec(described, where="test")
 
 
-def frame(view: View, modification: Modification, key: str = "same", row: int = 0) -> Frame:
-    return Frame(row, modification, key.encode(), view)
+def frame(view: View, modification: Modification, key: str = "same", row: int = 0) -> TimedFrame:
+    return TimedFrame(row, modification, key.encode(), view)
 
 
 # ------------------------------------------------------------------------------------------------------------- surfaces

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.renderer.worker.heartbeat import Heart
+from photonfarm.renderer.worker.heartbeat import HeartbeatThread
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.shared import queue
@@ -56,7 +56,7 @@ def test_a_worker_says_at_its_end_what_all_its_children_have_done(
         redis_server.url,
         name="ada",
         child=analytic.command(),
-        say=said.append,
+        report=said.append,
         max_jobs=1,
         quiet=quiet,
         **QUICK,
@@ -184,7 +184,7 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     assert said.count("leaves scene") == 1
     assert "Traceback" not in said
 
-    assert queue_status(connection).held_up.left == {}, "said while it works only"
+    assert queue_status(connection).idle_reports.left == {}, "said while it works only"
 
 
 def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
@@ -192,7 +192,7 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
 ) -> None:
     connection = connect(redis_server.url)
     settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
-    heart = Heart(settings, Store(tmp_path / "store"), None)
+    heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
     heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
     heart.start()
     show.status(tmp_path / "store", redis_server.url, as_json=False)
@@ -331,7 +331,7 @@ def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_al
 ) -> None:
     connection, said = connect(redis_server.url), []
     queue.beat(connection, "ada", "another-machine", None, ttl_s=60, process=7)
-    run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), say=said.append, **QUICK)
+    run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), report=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
     assert said[0] == "worker ada: another one of this name is alive, so this one goes by ada-2"

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonfarm.shared.plan.allocation import MOST_SPP, MOST_VIEWS, Allocation, Terms, excess, seconds
+from photonfarm.shared.plan.allocation import MOST_SPP, MOST_VIEWS, Allocation, CostModel, excess, seconds
 from photonfarm.shared.plan.sample_costs import SampleCosts
 
 NAMES = ("configuration_s", "view_s", "pass_s", "spp_s", "relative_variance")
@@ -43,7 +43,7 @@ def test_seconds_and_excess_are_those_of_the_model() -> None:
 def test_the_best_samples_per_pixel_are_at_the_numeric_minimum(
     of: SampleCosts, views: int, passes: int, kappa: float, rho: float
 ) -> None:
-    found = Terms(of, kappa, rho).best_spp(views, passes)
+    found = CostModel(of, kappa, rho).best_spp(views, passes)
     tried = found * np.geomspace(1e-3, 1e3, 60_001)  # a step is 0.02 %
     errors = at_one_budget(of, views, passes, tried, kappa, rho)
     assert at_one_budget(of, views, passes, found, kappa, rho) <= errors.min() * (1 + 1e-9)
@@ -53,13 +53,13 @@ def test_the_best_samples_per_pixel_are_at_the_numeric_minimum(
 
 def test_the_best_samples_per_pixel_of_an_example_by_hand() -> None:
     of = SampleCosts("made", 6.0, 2.0, 1.0, 0.5, 30.0)  # c₀ = 6/2 + 2 + 1 of two views
-    assert Terms(of, 10, 1).best_spp(2) == pytest.approx(math.sqrt(6 * 30 / (10 * 0.5 * 3)))
-    assert Terms(of, 10, 1).best_spp(2, 3) == pytest.approx(math.sqrt(8 * 30 / (10 * 0.5 * 3)) / 3)
+    assert CostModel(of, 10, 1).best_spp(2) == pytest.approx(math.sqrt(6 * 30 / (10 * 0.5 * 3)))
+    assert CostModel(of, 10, 1).best_spp(2, 3) == pytest.approx(math.sqrt(8 * 30 / (10 * 0.5 * 3)) / 3)
 
 
 def test_without_noise_no_sample_is_worth_its_cost_and_of_free_ones_there_are_never_enough() -> None:
-    assert Terms(costs(view_s=1, spp_s=1)).best_spp(1) == 0
-    assert Terms(costs(view_s=1, relative_variance=1)).best_spp(1) == math.inf
+    assert CostModel(costs(view_s=1, spp_s=1)).best_spp(1) == 0
+    assert CostModel(costs(view_s=1, relative_variance=1)).best_spp(1) == math.inf
 
 
 @given(any_costs, st.integers(1, 16), st.integers(2, 8), st.integers(1, 512))
@@ -77,7 +77,7 @@ def test_no_allocation_of_the_same_budget_is_better_than_the_best(
     of: SampleCosts, budget: float, kappa: float, rho: float
 ) -> None:
     budget_s = budget * seconds(of, Allocation(1, 1, 1, 2))
-    found = Terms(of, kappa, rho).best(budget_s)
+    found = CostModel(of, kappa, rho).best(budget_s)
     assert seconds(of, found) <= budget_s * (1 + 1e-6)
     assert found.passes == 1
     least = excess(of.relative_variance, found, kappa=kappa, rho=rho)
@@ -93,27 +93,27 @@ def test_rounding_takes_nothing_from_an_allocation_that_is_asked_for(
     of: SampleCosts, modifications: int, views: int, power: int
 ) -> None:
     asked = Allocation(modifications, views, 1, 2**power)
-    found = Terms(of).best(seconds(of, asked))
+    found = CostModel(of).best(seconds(of, asked))
     assert excess(of.relative_variance, found) <= excess(of.relative_variance, asked)
 
 
 def test_the_best_whole_numbers_are_next_to_the_real_one() -> None:
     of = replace(ROOM, relative_variance=3000.0)
-    found = Terms(of, *FIT).best(1e4)
-    assert found.spp / 2 < Terms(of, *FIT).best_spp(found.views) < found.spp * 2
+    found = CostModel(of, *FIT).best(1e4)
+    assert found.spp / 2 < CostModel(of, *FIT).best_spp(found.views) < found.spp * 2
 
 
 def test_dear_configurations_call_for_views_and_noise_for_samples_per_pixel() -> None:
     noisy, dear = replace(ROOM, relative_variance=3000.0), replace(ROOM, configuration_s=10.0)
-    plain, noisy, dear = (Terms(of, *FIT).best(1e4) for of in (ROOM, noisy, dear))
+    plain, noisy, dear = (CostModel(of, *FIT).best(1e4) for of in (ROOM, noisy, dear))
     assert noisy.spp > plain.spp == 2
     assert plain.views == 1
     assert dear.views == round(math.sqrt(1.005 * 10 / 0.104))  # V* of the product (ρ + w/V)·(c + V·k)
-    assert Terms(costs(view_s=1, relative_variance=1)).best(1e4).spp == MOST_SPP
+    assert CostModel(costs(view_s=1, relative_variance=1)).best(1e4).spp == MOST_SPP
 
 
 def test_of_a_static_scene_each_view_stands_for_itself() -> None:
-    terms = Terms.of(ROOM, static=True)
+    terms = CostModel.of(ROOM, static=True)
     found = terms.best(1e3)
     assert found.views == 1
     assert found.modifications == int(1e3 / (0.035 + 0.005 + 2 * 0.032))
@@ -121,4 +121,4 @@ def test_of_a_static_scene_each_view_stands_for_itself() -> None:
 
 def test_a_budget_that_pays_for_nothing_is_refused_with_what_the_least_costs() -> None:
     with pytest.raises(ValueError, match=r"^budget_s is 0\.1; one view of 2 spp costs 0\.14"):
-        Terms(ROOM).best(0.1)
+        CostModel(ROOM).best(0.1)

@@ -171,8 +171,8 @@ def test_a_flipped_bit_is_found_by_both(store: Store, tmp_path: Path, by: str, a
         plain_reader.READERS[by](tmp_path / array)
 
 
-def test_the_readmes_example_reads_the_store(store: Store) -> None:
-    section = (ROOT / "README.md").read_text().partition("## Reading the store without photonfarm")[2]
+def test_the_example_of_the_page_reads_the_store(store: Store) -> None:
+    section = (ROOT / "docs/store-format.md").read_text().partition("## An example")[2]
     code = section.split("```")[1].removeprefix("python\n")
     done = subprocess.run(
         [sys.executable, "-I", "-W", "error", "-c", code],

@@ -58,7 +58,7 @@ def rehearsed(folder: Path, store: Path, told: list[str] | None = None, **option
     shard_rows = options.pop("shard_rows", None)
     request = Request.of(**{"modifications": 6, "views_per_modification": 2, **options})
     log = (told if told is not None else []).append
-    return rehearse(str(spec), store, request, measure=measure, tell=log, shard_rows=shard_rows)
+    return rehearse(str(spec), store, request, measure=measure, log=log, shard_rows=shard_rows)
 
 
 def run(spec: Path, store: Path, *more: str) -> Result:

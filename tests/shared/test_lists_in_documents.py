@@ -20,6 +20,7 @@ DISTRIBUTIONS = {
     "## shared": "shared/photonfarm/shared",
     "## services/renderer": "services/renderer/photonfarm/renderer",
     "## services/trainer": "services/trainer/photonfarm/trainer",
+    "## bench": "bench",
 }
 """The headings of ARCHITECTURE.md that have tables of folders, and where these folders lie."""
 

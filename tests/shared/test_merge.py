@@ -18,7 +18,7 @@ from photonfarm.shared.core.estimate import clean_error
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read.merge import MAX_PASSES, Merged, Moments, merge_rows, merge_view
+from photonfarm.shared.store.read.merge import MAX_PASSES, MergedView, Moments, merge_rows, merge_view
 
 HALF = np.float32(np.finfo(np.float16).smallest_subnormal)
 TINY, HUGE = np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max
@@ -39,8 +39,8 @@ def moments_of(passes: list[np.ndarray]) -> Moments:
     return moments
 
 
-def assert_equal(a: Merged, b: Merged) -> None:
-    for field in fields(Merged):
+def assert_equal(a: MergedView, b: MergedView) -> None:
+    for field in fields(MergedView):
         np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), strict=True)
 
 
@@ -185,7 +185,7 @@ def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Pat
         merged.write(tmp_path / "view.exr")
     assert list(tmp_path.glob("view*")) == []
     merged.write(tmp_path / "view.npz")
-    assert_equal(Merged.read(tmp_path / "view.npz"), merged)
+    assert_equal(MergedView.read(tmp_path / "view.npz"), merged)
     with np.load(tmp_path / "view.npz") as stored:
         np.testing.assert_array_equal(stored["standard_error"], merged.standard_error)
     np.savez(tmp_path / "two.npz", **{**asdict(merged), "passes": [1, 2]})
@@ -195,10 +195,10 @@ def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Pat
     for content in (b"nothing", whole[:3000], *others):
         (tmp_path / "other.npz").write_bytes(content)
         with pytest.raises(StoreError, match=r"other\.npz: holds no merged view that `photonfarm store merge` wrote"):
-            Merged.read(tmp_path / "other.npz")
+            MergedView.read(tmp_path / "other.npz")
     (tmp_path / "folder.npz").mkdir()
     with pytest.raises(StoreError, match=r"folder\.npz: cannot be read: Is a directory"):
-        Merged.read(tmp_path / "folder.npz")
+        MergedView.read(tmp_path / "folder.npz")
 
 
 def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is(
@@ -218,7 +218,7 @@ def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is
     (told,) = json.loads(one.stdout)
     reader = reader_of(scene)
     assert (told["view"], told["passes"]) == (reader.view_key(0).hex(), 1)
-    assert_equal(Merged.read(Path(told["file"])), merge_view(reader, 0))
+    assert_equal(MergedView.read(Path(told["file"])), merge_view(reader, 0))
 
     samples.commit_all(scene)
     reader.refresh()
@@ -226,4 +226,4 @@ def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is
     views = {reader.view_row(int(row)): int(row) for row in reader.rows}
     assert len(result.stdout.splitlines()) == len(views) == len(list(out.iterdir()))
     for view_row, row in views.items():
-        assert_equal(Merged.read(out / f"{reader.view_key(row).hex()}.npz"), merge_view(reader, view_row))
+        assert_equal(MergedView.read(out / f"{reader.view_key(row).hex()}.npz"), merge_view(reader, view_row))

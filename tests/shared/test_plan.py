@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Stream, make_key
 from photonfarm.shared.plan import sampling
-from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, Known, PlannedRows, Request, expand, sample_key
+from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, PlannedContent, PlannedRows, Request, expand, sample_key
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import sample_view
@@ -292,7 +292,9 @@ def test_plans_equal_those_made_sample_by_sample_to_the_bit(name: str, wanted: l
     oracle, known, first_row = OneByOne(SPECS[name], shard_rows), [], 0
     for request in wanted:
         expected = oracle.plan(request)
-        found = expand(oracle.spec, request, Known(known), first_job=first_row // shard_rows, shard_rows=shard_rows)
+        found = expand(
+            oracle.spec, request, PlannedContent(known), first_job=first_row // shard_rows, shard_rows=shard_rows
+        )
         named = {sample_key(oracle.spec.scene_id, *sample) for sample in oracle.named(request)}
         assert found.new + found.known == len(named)
         if expected is None:

@@ -108,10 +108,10 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
         assert reconcile(store, limited) == 10
         queue.beat(limited, "worker", "host", "job", ttl_s=60)
         queue.record_failure(limited, NAME, "broken")
-        queue.tell_consumed(limited, SCENE_ID, 1)
+        queue.report_consumed(limited, SCENE_ID, 1)
         assert queue_status(limited).queued == 10
         assert queue.take_name(limited, "worker", "host", os.getppid(), ttl_s=60) == "worker-2"
-        queue.tell_held_up(limited, "worker", "full", {SCENE_ID: "gone"}, ttl_s=60)
+        queue.report_idle(limited, "worker", "full", {SCENE_ID: "gone"}, ttl_s=60)
         for name in ("worker", "worker-2"):
             queue.bury(limited, name)
         assert queue.hosts(limited) == set()

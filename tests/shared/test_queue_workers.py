@@ -90,19 +90,19 @@ def test_a_name_that_is_held_for_ever_is_not(connection: redis.Redis, ttl_s: int
 
 
 def test_what_holds_workers_up_is_told_for_a_time_and_printable(connection: redis.Redis) -> None:
-    queue.tell_held_up(connection, "a:b", "the disk is full", {SCENE_ID: "no \x1b]file" + "x" * 9999}, ttl_s=60)
+    queue.report_idle(connection, "a:b", "the disk is full", {SCENE_ID: "no \x1b]file" + "x" * 9999}, ttl_s=60)
     connection.set(f"rq:photonfarm:left:{SCENE_ID[:-1]}:c", "x")
     connection.rpush("rq:photonfarm:paused:d", "x")
     assert 0 < connection.ttl("rq:photonfarm:paused:a:b") <= 60
-    held_up = queue_status(connection).held_up
-    assert held_up.paused == {"a:b": "the disk is full"}
-    assert list(held_up.left) == [SCENE_ID]
-    assert held_up.left[SCENE_ID]["a:b"].startswith("no  ]filexxx")
-    assert len(held_up.left[SCENE_ID]["a:b"]) <= 500
-    queue.tell_held_up(connection, "a:b", None, {}, ttl_s=60)
-    assert queue_status(connection).held_up.paused == {}
-    queue.forget_held_up(connection, "a:b", {SCENE_ID: ""})
-    assert queue_status(connection).held_up.left == {}
+    idle = queue_status(connection).idle_reports
+    assert idle.paused == {"a:b": "the disk is full"}
+    assert list(idle.left) == [SCENE_ID]
+    assert idle.left[SCENE_ID]["a:b"].startswith("no  ]filexxx")
+    assert len(idle.left[SCENE_ID]["a:b"]) <= 500
+    queue.report_idle(connection, "a:b", None, {}, ttl_s=60)
+    assert queue_status(connection).idle_reports.paused == {}
+    queue.clear_idle_report(connection, "a:b", {SCENE_ID: ""})
+    assert queue_status(connection).idle_reports.left == {}
 
 
 # ------------------------------------------------------------------------------------------------ what is consumed
@@ -111,8 +111,8 @@ def test_what_holds_workers_up_is_told_for_a_time_and_printable(connection: redi
 def test_what_trainers_have_used_is_told_by_scene_and_lost_with_redis(connection: redis.Redis) -> None:
     other = "f" * 32
     assert queue.consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
-    queue.tell_consumed(connection, SCENE_ID, 100)
-    queue.tell_consumed(connection, other, 7)
+    queue.report_consumed(connection, SCENE_ID, 100)
+    queue.report_consumed(connection, other, 7)
     assert queue.consumed_samples(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 7}
     connection.set(f"rq:photonfarm:consumed:{other}", "-12 or so")
     assert queue.consumed_samples(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 0}

@@ -38,7 +38,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
 # ------------------------------------------------------------------------------------------------------ the document
 
 
-def table(declared: Iterable[declarations.Declared], prefix: str = "") -> str:
+def table(declared: Iterable[declarations.ArrayDeclaration], prefix: str = "") -> str:
     """The document's table of these arrays."""
     lines = ["| array | type | shape | axes | unit | convention |", "|---|---|---|---|---|---|"]
     for array in declared:

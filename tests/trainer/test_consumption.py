@@ -12,7 +12,7 @@ from photonfarm.shared.queue import connect, consumed_samples, serve
 from photonfarm.shared.store import Store
 from photonfarm.trainer.cli import service
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 SCENE_ID = "0123456789abcdef" * 2
 
@@ -23,7 +23,7 @@ def made(folder: Path) -> Path:
 
 
 def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "TELL_S", 0.01)
+    monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
         connection = connect(server.url)
 
@@ -34,7 +34,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
                 time.sleep(0.01)
 
         connection.set(f"rq:photonfarm:consumed:{SCENE_ID}", 7)
-        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
             time.sleep(0.3)
             wait_for(7)  # of the session before: this one knows nothing yet
             count(40, 100)
@@ -46,9 +46,9 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
 
 
 def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "TELL_S", 3600)
+    monkeypatch.setattr(service, "REPORT_S", 3600)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
             count(120, 48)
         assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
 
@@ -58,21 +58,21 @@ def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
 ) -> None:
     counts: list[tuple[int, int]] = []
     settings = tiny(validate_every=100, checkpoint_every=3, max_steps=4)
-    train(make_source(20), settings, run, count=lambda *told: counts.append(told))
+    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(0, 0), (3, 20), (6, 20), (9, 20), (12, 20)]
     counts.clear()
-    train(make_source(20), settings, run, count=lambda *told: counts.append(told))
+    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(12, 20)]
 
 
 def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(service, "TELL_S", 0.01)
+    monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
         connection = connect(server.url)
         serve(connection, Store(tmp_path / "other", create=True))
-        with service._consumption_told(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
             count(40, 100)
             time.sleep(0.3)
         assert consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
@@ -81,8 +81,8 @@ def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once
 
 @pytest.mark.parametrize("url", [None, "redis://127.0.0.1:1/0", "nonsense"])
 def test_without_a_redis_training_goes_on(url: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "TELL_S", 0.01)
-    with service._consumption_told(url, made(tmp_path), SCENE_ID) as count:
+    monkeypatch.setattr(service, "REPORT_S", 0.01)
+    with service._reported(url, made(tmp_path), SCENE_ID) as count:
         count(1, 1)
         time.sleep(0.1)
 
@@ -99,9 +99,9 @@ def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(
 
 
 def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "TELL_S", 0.01)
+    monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._consumption_told(server.url, tmp_path / "store", SCENE_ID) as count:
+        with service._reported(server.url, tmp_path / "store", SCENE_ID) as count:
             count(1, 1)
             time.sleep(0.1)
             made(tmp_path)

@@ -26,7 +26,7 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.assist import assist
 from photonfarm.trainer.training.learner import Learner
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
@@ -65,7 +65,7 @@ def together(make: Callable[[], Any], settings: TrainSettings, run: Path, **how:
             assist(lambda _: make(), settings, run, group)
             return
         with leading(group):
-            train(make(), settings, run, group=group, **how)
+            train(make(), settings, run, Hooks(group=group, **how))
 
     return in_both(target, settings.batch)
 
@@ -104,7 +104,7 @@ def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_s
             assist(lambda _: source, tiny(batch=4), run, group)
         else:
             with leading(group):
-                train(source, tiny(batch=4), run, group=group)
+                train(source, tiny(batch=4), run, Hooks(group=group))
         (tmp_path / f"{group.rank}.json").write_text(json.dumps(source.reads))
 
     assert in_both(target) == [0, 0]
@@ -123,7 +123,7 @@ def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source,
         if draws == 4 * 10:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    ended = together(lambda: make_source(24), settings, killed, count=die)
+    ended = together(lambda: make_source(24), settings, killed, on_draws=die)
     assert ended == [-signal.SIGKILL, IncompleteError.exit_code], "whoever is left ends as well, and says so"
     assert checkpoint.load(killed / CHECKPOINT)["step"] == 8
     assert together(lambda: make_source(24), settings, killed) == [0, 0]

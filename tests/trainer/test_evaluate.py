@@ -16,11 +16,11 @@ from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.pictures import display
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.read.merge import Merged, merge_view
+from photonfarm.shared.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.compare.evaluation_table import notes, told
+from photonfarm.trainer.compare.evaluation_table import evaluation_text, notes
 from photonfarm.trainer.data.dataset import kept_count, kept_pixels, rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
@@ -94,7 +94,7 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(
     rows = held_out(store, scene, 0.4)[::2][:3]
     exposure = scene.spec.exposure
     images = [exposure * reader.read(row).radiance[0] for row in rows]
-    wanted = [Merged.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
+    wanted = [MergedView.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
     halves = (np.array([exposure * getattr(of, half) for of in wanted], np.float32) for half in ("half_a", "half_b"))
     expected = mse(metric_space(np.array(images, np.float32)), *map(metric_space, halves), having_seen_a=True)
     assert found.rows[1].name == "none 1/1"
@@ -146,7 +146,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     """Of 2 passes of a view one half A is a quarter of its reference."""
     runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
     found = compare(store, runs, references=references, most=4)
-    foot = told(found).split("\n\n")[-1]
+    foot = evaluation_text(found).split("\n\n")[-1]
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
     assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
@@ -160,7 +160,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     assert "no weights of the Inception network are installed" in notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
     assert notes(converged)[1].endswith("; converged")
-    head = told(found).split("\n\n")[0]
+    head = evaluation_text(found).split("\n\n")[0]
     assert head.startswith("analytic: 4 held-out views of 4 configurations, one sample of each; noise")
 
 
@@ -182,7 +182,7 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
             radiance = reader.read(target.row).radiance
             wanted = radiance.mean(axis=0)
             if first == "reference":
-                wanted = Merged.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
+                wanted = MergedView.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
             for picture, image in zip(shown, (wanted, radiance[0]), strict=True):
                 assert np.abs(picture.astype(int) - display(image, scene.spec.exposure)).max() <= 1
 
@@ -239,7 +239,7 @@ def test_without_references_only_the_linear_error_is_given(store: Path, trained)
     found = compare(store, [trained("run")], most=3)
     assert found.samples == 3
     assert found.references is found.rows[0].metrics is None
-    assert "MSSIM" not in told(found)
+    assert "MSSIM" not in evaluation_text(found)
     assert "no references: the columns of the paper need them" in notes(found)[-1]
     assert found.document()["rows"][0]["metric_space"] is None
 
@@ -289,7 +289,7 @@ def test_what_cannot_be_compared_is_refused(
     with pytest.raises(SpecError, match="holds no reference of the"):
         compare(store, [run], references=tmp_path / "empty")
     for file in references.iterdir():
-        Merged(1, *np.zeros((4, 8, 8, 3))).write(file)
+        MergedView(1, *np.zeros((4, 8, 8, 3))).write(file)
     with pytest.raises(SpecError, match=r"has the shape \(8, 8, 3\), and the scene's film \(16, 16, 3\)"):
         compare(store, [run], references=references)
 

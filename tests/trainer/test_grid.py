@@ -18,7 +18,7 @@ from photonfarm.trainer import grid
 from photonfarm.trainer.cli import service
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.grid import Cell, run_grid, table
-from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.training.learner import DivergedError
@@ -65,7 +65,7 @@ def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) 
     assert run_grid(make, tiny(), run, {"learning_rate": (1e-4,)}) == first
     assert len(opened) == so_far + 1, "one look at the samples, and no run"
     told: list[str] = []
-    cells = run_grid(make, tiny(), run, {"learning_rate": (1e-4, 5e-4)}, tell=told.append)
+    cells = run_grid(make, tiny(), run, {"learning_rate": (1e-4, 5e-4)}, log=told.append)
     assert cells[0] == first[0]
     assert len(cells) == 2
     assert len(told) == 1
@@ -97,10 +97,10 @@ def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(
 
 
 def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -> None:
-    def diverge(source, settings, folder, **how):
+    def diverge(source, settings, folder, hooks):
         if settings.learning_rate == 1e-4:
             raise DivergedError("the loss is inf")
-        return train(source, settings, folder, **how)
+        return train(source, settings, folder, hooks)
 
     monkeypatch.setattr(grid, "train", diverge)
     cells = run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)})
@@ -147,7 +147,7 @@ def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, t
 
     def halves(order: list[int]) -> tuple[set[float], set[float]]:
         errors = np.array([rows[i] // 2 for i in order], float)  # the number of its configuration stands for an error
-        found = HeldOut(Estimate.of(errors), 0.0, errors, errors, tuple(units[i] for i in order))
+        found = HeldOutErrors(Estimate.of(errors), 0.0, errors, errors, tuple(units[i] for i in order))
         first, second = grid._halves(found)
         assert len(first) == len(set(units)) // 2
         assert len(first) + len(second) == len(set(units))

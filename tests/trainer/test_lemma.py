@@ -27,8 +27,8 @@ from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.trainer.data.dataset import Batch, fill, fill_photons
-from photonfarm.trainer.data.store_source import StoredSample
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons
+from photonfarm.trainer.data.store_source import RawSample
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
@@ -49,7 +49,7 @@ Loss = Callable[[Tensor, Tensor], Tensor]
 class Rendered:
     """A batch of one with a network, and targets (n, 1, 2, H, W, 3) for it, linear radiance × exposure."""
 
-    batch: Batch
+    batch: TrainingBatch
     network: Network
     noisy: Tensor
     converged: Tensor
@@ -61,7 +61,7 @@ class Seen:
 
     spec: SceneSpec
     base: tuple[Geometry, BasePointCloud]
-    sample: StoredSample
+    sample: RawSample
     photons: Photons
     noisy: F32
     converged: F32
@@ -89,7 +89,7 @@ def seen() -> Seen:
     converged = targets(scene, view, R, samples=CONVERGED, seed=2_000_000)
     visible = visibility_of(scene, view, rebuild(base[1], modification), traced)
     guides = scene.guides(view, view_key(key, view.vector), spec.guides, lit_points(base[1], modification))
-    sample = StoredSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), visible, 0, guides)
+    sample = RawSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), visible, 0, guides)
     noisy, converged = (x * np.float32(spec.exposure) for x in (noisy, converged))
     return Seen(spec, base, sample, traced, noisy, converged)
 
@@ -102,7 +102,7 @@ def rendered(seen: Seen) -> Rendered:
 def of_architecture(seen: Seen, architecture: Architecture) -> Rendered:
     """A network that has been trained a little, and what it sees."""
     network_settings = NetworkSettings(architecture=architecture, width=8)
-    batch = Batch.empty(1, POINTS, seen.spec, ARCHITECTURES[architecture].needs)
+    batch = TrainingBatch.empty(1, POINTS, seen.spec, ARCHITECTURES[architecture].needs)
     fill(batch, 0, seen.sample, seen.spec, seen.base[1])
     if batch.inputs.photons is not None:
         fill_photons(batch.inputs.photons, 0, seen.photons)
@@ -123,7 +123,7 @@ def targets(scene: LoadedScene, view: View, count: int, *, samples: int, seed: i
     return np.concatenate(images).reshape(count, 1, 2, samples, SIZE, SIZE, 3).mean(axis=3)
 
 
-def warm_up(network: Network, settings: TrainSettings, batch: Batch, noisy: Tensor) -> None:
+def warm_up(network: Network, settings: TrainSettings, batch: TrainingBatch, noisy: Tensor) -> None:
     """Some steps of training, so that the layers that start at zero have left it."""
     optimiser = build_optimiser(network.parameters(), settings)
     for step in range(WARM_UP):

@@ -13,7 +13,7 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.data.dataset import Batch, fill
+from photonfarm.trainer.data.dataset import TrainingBatch, fill
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.predict.evaluation import network_predictor
@@ -27,9 +27,9 @@ BENCH = Path(__file__).parents[2] / "bench"
 
 @pytest.fixture
 def firefly(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """bench/firefly.py."""
+    """bench/trainer/firefly.py."""
     monkeypatch.syspath_prepend(str(BENCH))
-    spec = importlib.util.spec_from_file_location("firefly", BENCH / "firefly.py")
+    spec = importlib.util.spec_from_file_location("firefly", BENCH / "trainer/firefly.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(__import__("sys").modules, "firefly", module)
     spec.loader.exec_module(module)
@@ -141,7 +141,7 @@ def test_the_rate_falls_with_every_epoch_of_samples_whatever_the_batch() -> None
 @pytest.mark.parametrize("architecture", ["cnn", "light_transport"])
 def test_a_demodulated_network_is_the_same_network_times_the_albedo(make_source, architecture: str) -> None:
     source = make_source(1)
-    batch = Batch.empty(1, 256, source.spec)
+    batch = TrainingBatch.empty(1, 256, source.spec)
     fill(batch, 0, source.read(0), source.spec, source.base()[1])
     plain, demodulated = (
         build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_having_seen_a
-from photonfarm.trainer.data.dataset import Batch, kept_pixels, read_into
+from photonfarm.trainer.data.dataset import TrainingBatch, kept_pixels, read_into
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
@@ -16,9 +16,9 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
 
 
-def batch_of(source, rows: tuple[int, ...], architecture: str) -> Batch:
+def batch_of(source, rows: tuple[int, ...], architecture: str) -> TrainingBatch:
     needs, (_, cloud) = ARCHITECTURES[architecture].needs, source.base()
-    batch = Batch.empty(len(rows), len(cloud.position), source.spec, needs)
+    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs)
     return read_into(batch, source, rows, needs, cloud)
 
 
@@ -104,7 +104,7 @@ def test_the_error_of_a_prediction_made_from_a_has_the_noise_removed() -> None:
 def test_a_predictor_that_is_not_trained_is_fed_what_it_needs_and_measured_like_a_network(make_source, tiny) -> None:
     """The mean colour of the kept pixels everywhere, though the settings' network needs nothing of an image."""
 
-    def predict(batch: Batch) -> np.ndarray:
+    def predict(batch: TrainingBatch) -> np.ndarray:
         noisy = batch.inputs.noisy
         mean = noisy.colour.sum(dim=(1, 2)) / noisy.kept.sum(dim=(1, 2))[:, None]
         return mean[:, None, None].expand(-1, 16, 16, 3).numpy()

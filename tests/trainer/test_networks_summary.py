@@ -3,7 +3,7 @@
 import pytest
 
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
-from photonfarm.trainer.networks.summary import Part, summary, table
+from photonfarm.trainer.networks.summary import NetworkPart, summary, table
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 
@@ -13,7 +13,7 @@ def spec_of(size: int, points: int = 16384) -> SceneSpec:
     return SceneSpec.model_validate(spec)
 
 
-def parts(size: int = 64, points: int = 16384, **settings: object) -> dict[str, Part]:
+def parts(size: int = 64, points: int = 16384, **settings: object) -> dict[str, NetworkPart]:
     return {part.name: part for part in summary(spec_of(size, points), NetworkSettings(**settings))}
 
 
@@ -61,12 +61,12 @@ def test_the_denoiser_is_light() -> None:
 
 def test_the_points_set_are_those_counted() -> None:
     found = parts(points=4096, architecture="feature_projection")["point branch"]
-    assert found == Part("point branch", 4096 * 32, 0.0)
+    assert found == NetworkPart("point branch", 4096 * 32, 0.0)
     assert parts(points=100)["point branch"].parameters < parts(points=101)["point branch"].parameters
 
 
 def test_the_table_ends_with_the_sum() -> None:
-    lines = table([Part("point branch", 1000, 0.25), Part("U-Net", 2_000_000, 1.0)]).splitlines()
+    lines = table([NetworkPart("point branch", 1000, 0.25), NetworkPart("U-Net", 2_000_000, 1.0)]).splitlines()
     assert lines[0].split() == ["part", "parameters", "GMAC"]
     assert lines[2].split() == ["U-Net", "2,000,000", "1.000"]
     assert lines[3].split() == ["total", "2,001,000", "1.250"]

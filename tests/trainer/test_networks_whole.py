@@ -13,7 +13,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import Photons, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import Batch, read_into
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES, build
@@ -38,9 +38,9 @@ def named(kind: str) -> dict[str, str]:
     return {"architecture": architecture, "photons": photons or "gathered"}
 
 
-def batch_of(source, rows: tuple[int, ...], kind: str = "light_transport") -> Batch:
+def batch_of(source, rows: tuple[int, ...], kind: str = "light_transport") -> TrainingBatch:
     needs, (_, cloud) = ARCHITECTURES[named(kind)["architecture"]].needs, source.base()
-    batch = Batch.empty(len(rows), len(cloud.position), source.spec, needs)
+    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs)
     return read_into(batch, source, rows, needs, cloud)
 
 

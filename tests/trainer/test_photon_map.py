@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from photonfarm.shared.scene.view import Camera
-from photonfarm.trainer.data.dataset import Batch, read_into
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
@@ -19,9 +19,11 @@ ARCHITECTURE = "light_transport_photons"
 B, H, W, K = 2, 24, 32, 40
 
 
-def batch_of(source, rows: tuple[int, ...]) -> Batch:
+def batch_of(source, rows: tuple[int, ...]) -> TrainingBatch:
     needs, (_, cloud) = ARCHITECTURES[ARCHITECTURE].needs, source.base()
-    return read_into(Batch.empty(len(rows), len(cloud.position), source.spec, needs), source, rows, needs, cloud)
+    return read_into(
+        TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs), source, rows, needs, cloud
+    )
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])

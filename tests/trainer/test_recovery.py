@@ -15,15 +15,15 @@ import torch
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.trainer.cli import service
-from photonfarm.trainer.predict.evaluation import HeldOut
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 from photonfarm.trainer.training.recovery import GOOD, NEXT
-from photonfarm.trainer.training.validation import Best, Validation, compared, validate
+from photonfarm.trainer.training.validation import UP_TO_WHITE, BestValidation, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
@@ -36,12 +36,12 @@ def records(run: Path, kind: str) -> list[dict[str, Any]]:
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
     """Of rows, of which each `views` are of one configuration."""
     values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
-    held_out = HeldOut(Estimate.of(group_means(values, units)), 0.0, values, values, units)
+    held_out = HeldOutErrors(Estimate.of(group_means(values, units)), 0.0, values, values, units)
     return Validation(step, (*errors,), held_out)
 
 
-def best(errors: dict[int, float]) -> Best:
-    return Best(0, errors)
+def best(errors: dict[int, float]) -> BestValidation:
+    return BestValidation(0, errors)
 
 
 def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
@@ -121,30 +121,49 @@ def test_where_no_row_of_the_best_was_measured_again_the_best_begins_anew() -> N
 
 
 def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little_for_them() -> None:
-    """Seen is a lamp of 100 in one pixel of 16, which the network takes for 2 now; the rest is right."""
-    image = np.full((1, 4, 4, 3), 0.5, np.float32)
-    image[:, 0, 0] = 100.0
-    batch = SimpleNamespace(
-        rows=(0,), units=(b"a",), inputs=SimpleNamespace(noisy=None),
-        target=torch.from_numpy(image[:, None]).expand(1, 2, 4, 4, 3),
-    )  # fmt: skip
+    """Seen is a lamp of 100 in one block of 16, which the network takes for 2 now; the rest is right."""
+    image = np.full((1, 32, 32, 3), 0.5, np.float32)
+    image[:, :8, :8] = 100.0
+    batch = batch_of(image, image)
     learned, before = image.clip(max=2.0), image.clip(max=50.0) + 0.1
 
-    def at(predicted: Any, loss: str) -> Validation:
-        return validate(lambda _: predicted, 0, iter([batch]), loss=loss)
-
     for loss, worse in [("linear", True), ("relative", False), ("paired", False)]:
-        was = at(before, loss)
-        assert compared(at(learned, loss), Best(0, was.errors, was.by_shown)).is_worse is worse
-    assert at(learned, "relative").held_out.shown == pytest.approx(0.0)
-    assert at(before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
+        was = at(batch, before, loss)
+        assert compared(at(batch, learned, loss), BestValidation(0, was.errors, was.judge)).is_worse is worse
+    assert at(batch, learned, "relative").held_out.shown == pytest.approx(0.0)
+    assert at(batch, before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
+
+
+def test_noise_does_not_make_a_dark_network_look_better_than_the_right_one() -> None:
+    """One pixel in eight is bright in each half, and most of its light is above white."""
+    rng = np.random.default_rng(0)
+    halves = np.where(rng.random((2, 64, 64, 1)) < 1 / 8, 2.4, 0.0).repeat(3, axis=-1).astype(np.float32)
+    right, dark = (np.full((1, 64, 64, 3), value, np.float32) for value in (0.3, 0.15))
+    batch = batch_of(halves[:1], halves[1:])
+    was = at(batch, dark, "relative")
+    found = compared(at(batch, right, "relative"), BestValidation(0, was.errors, was.judge))
+    assert found.is_best
+    assert found.best == pytest.approx(0.15**2, rel=0.2)
+
+
+def batch_of(half_a: Any, half_b: Any) -> Any:
+    """One sample (1, H, W, 3), as far as a validation looks at it."""
+    return SimpleNamespace(
+        rows=(0,), units=(b"a",), inputs=SimpleNamespace(noisy=None),
+        target=torch.from_numpy(np.stack([half_a, half_b], axis=1)),
+    )  # fmt: skip
+
+
+def at(batch: Any, predicted: Any, loss: str) -> Validation:
+    return validate(lambda _: predicted, 0, iter([batch]), loss=loss)
 
 
 def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_white() -> None:
     older = {"step": 4, "rows": torch.tensor([0]), "errors": torch.tensor([0.5], dtype=torch.float64)}
-    now = replace(validation({0: 50.0}), by_shown=True)
-    assert compared(now, Best.of(older)).is_best
-    assert compared(now, Best.of(Best(4, {0: 0.5}, by_shown=True).state())).is_worse
+    now = replace(validation({0: 50.0}), judge=UP_TO_WHITE)
+    for by_pixels in ({}, {"by_shown": True}):  # as older versions wrote it
+        assert compared(now, BestValidation.of({**older, **by_pixels})).is_best
+    assert compared(now, BestValidation.of(BestValidation(4, {0: 0.5}, judge=UP_TO_WHITE).state())).is_worse
 
 
 # ----------------------------------------------------------------------------------------------------------------- runs
@@ -153,7 +172,7 @@ def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_whi
 def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     make_source, tiny, run, tmp_path, capsys
 ) -> None:
-    outcome = train(make_source(48), tiny(**TOO_HIGH), run, listen=service._tell)
+    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=service._log_record))
     without = train(make_source(48), tiny(**TOO_HIGH, recover=False), tmp_path / "without")
     assert outcome.step == 30
     assert outcome.last_error < 1e-3 * without.last_error
@@ -216,7 +235,7 @@ def test_the_weights_their_average_and_the_optimisers_memory_are_those_of_the_la
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        train(make_source(24), settings, run, listen=stop_at_eight)
+        train(make_source(24), settings, run, Hooks(on_record=stop_at_eight))
     found = records(run, "recovered")
     errors = {"now": pytest.approx(0.8333, abs=1e-4), "best": 0.5}
     assert [(r["step"], r["back_to"], r["errors"]) for r in found] == [(8, 4, errors)]
@@ -252,7 +271,7 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     train(make_source(24), tiny(max_steps=5), tmp_path / "five")
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
-    train(make_source(24), tiny(), run, listen=service._tell)
+    train(make_source(24), tiny(), run, Hooks(on_record=service._log_record))
     told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
     assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
     (found,) = records(run, "recovered")

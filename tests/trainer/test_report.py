@@ -28,7 +28,7 @@ from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
@@ -38,7 +38,7 @@ from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
 from photonfarm.trainer.runs.wait_times import bottleneck
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 
 def write_report(store, run, out, **asked):
@@ -62,7 +62,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     worker = threading.Thread(target=fill)
     worker.start()
     settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
-    outcome = train(StoreSource(store, scene.scene_id), settings, run, count=lambda *_: begun.set())
+    outcome = train(StoreSource(store, scene.scene_id), settings, run, Hooks(on_draws=lambda *_: begun.set()))
     worker.join()
     figures = write_report(store, run, tmp_path / "out")
 
@@ -325,7 +325,7 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
     assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
     assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
     settings = TrainedRun.load(transport).settings
-    assert frame_time(Untrained("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
+    assert frame_time(UntrainedPredictor("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(

@@ -23,7 +23,7 @@ from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 from photonfarm.trainer.training.recovery import GOOD, NEXT
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -88,8 +88,8 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
     settings, killed = tiny(max_steps=24, **recipe), tmp_path / "killed"
     train(make_source(24), settings, run)
     for step in sorted(random.Random(7).sample(range(1, 24), 4)):
-        how = {"count": die_after(3 * step)}
-        assert ended_by(lambda how=how: train(make_source(24), settings, killed, **how)) == -signal.SIGKILL
+        how = {"on_draws": die_after(3 * step)}
+        assert ended_by(lambda how=how: train(make_source(24), settings, killed, Hooks(**how))) == -signal.SIGKILL
     train(make_source(24), settings, killed)
     assert_same(run, killed)
     logs = [[(r["kind"], r["step"]) for r in metrics_log.read(folder / METRICS)] for folder in (run, killed)]
@@ -136,7 +136,7 @@ def test_a_run_killed_while_it_writes_a_checkpoint_does_too(
     if step is not None:
         stop = threading.Event()
         stop.set()
-        assert train(make_source(24), tiny(), killed, stop=stop).step == step
+        assert train(make_source(24), tiny(), killed, Hooks(stop=stop)).step == step
         good = checkpoint.load(killed / CHECKPOINT)["recovery"]["good"]
         assert checkpoint.load(killed / GOOD)["step"] == good == (0 if step == 4 else 5)
     train(make_source(24), tiny(), killed)
@@ -163,9 +163,9 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     growing = threading.Thread(target=grow)
     growing.start()
     for step in sorted(random.Random(3).sample(range(5, 30), 3)):
-        last = {"count": die_after(3 * step)}
+        last = {"on_draws": die_after(3 * step)}
         source = StoreSource(root, scene_id)
-        assert ended_by(lambda s=source, k=last: train(s, tiny(**how), killed, **k)) == -signal.SIGKILL
+        assert ended_by(lambda s=source, k=last: train(s, tiny(**how), killed, Hooks(**k))) == -signal.SIGKILL
     growing.join()
     train(StoreSource(root, scene_id), tiny(**how), killed)
 
@@ -175,7 +175,7 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     assert len(state["store"]["plans"]) == 2
     script = Growth.of(state["following"])
     assert len(script.log) > 3
-    train(StoreSource(root, scene_id), tiny(**how), tmp_path / "again", script=script)
+    train(StoreSource(root, scene_id), tiny(**how), tmp_path / "again", Hooks(script=script))
     assert_same(killed, tmp_path / "again")
 
 

@@ -12,7 +12,7 @@ from photonfarm.trainer.runs import metrics_log
 from photonfarm.trainer.runs import tensorboard as boards
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.training import loop
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 pytest.importorskip("tensorboard", reason="TensorBoard is an optional extra")
 
@@ -27,7 +27,12 @@ def accumulated(run: Path) -> Any:
 
 def trained(source: Any, settings: Any, run: Path, then: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
     with boards.event_files(run) as board:
-        train(source, settings, run, listen=lambda record: [board.record(record), then(record)], show=board.pictures)
+        train(
+            source,
+            settings,
+            run,
+            Hooks(on_record=lambda record: [board.record(record), then(record)], on_images=board.pictures),
+        )
 
 
 def test_a_run_shows_its_records_and_pictures(make_source, tiny, run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, small
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import stop_on_signals, train
+from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
 
 
 def weights(run) -> dict[str, torch.Tensor]:
@@ -61,10 +61,10 @@ def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_and_another_growth_i
     source.refresh = refresh
     rare = {"validate_every": 100, "checkpoint_every": 100}
     settings = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, **rare)
-    train(source, settings, run, count=count)
+    train(source, settings, run, Hooks(on_draws=count))
     script = Growth.of(checkpoint.load(run / CHECKPOINT)["following"])
     assert len(script.log) >= 3
-    train(make_source(60), settings, tmp_path / "again", script=script)
+    train(make_source(60), settings, tmp_path / "again", Hooks(script=script))
     assert same(weights(run), weights(tmp_path / "again"))
     train(make_source(60), settings, tmp_path / "other")
     assert not same(weights(run), weights(tmp_path / "other"))
@@ -89,7 +89,7 @@ def test_a_store_that_is_empty_at_first_is_trained_on_as_it_grows(make_source, t
 
     source.refresh = refresh
     settings = tiny(replay_ratio=1.0, replay_buffer=0)
-    outcome = train(source, settings, run, count=lambda *_: begun.set())
+    outcome = train(source, settings, run, Hooks(on_draws=lambda *_: begun.set()))
     records = metrics_log.read(run / METRICS)
     assert outcome.step == 12
     assert records[0]["kind"] == "validation"
@@ -114,7 +114,7 @@ def test_draws_come_up_to_the_replay_ratio_and_no_further_while_more_is_to_come(
 
     source.refresh = refresh
     settings = tiny(max_steps=1000, replay_ratio=0.5, replay_buffer=6, poll_seconds=0.02, validate_every=1000)
-    assert train(source, settings, run, stop=stop, count=source.count).reason == "stopped"
+    assert train(source, settings, run, Hooks(stop=stop, on_draws=source.count)).reason == "stopped"
     for lots, draws in enumerate(source.stalls[1:4], 1):
         training = rows_held_out(source, range(24 * lots), settings.hold_out).count(False)
         assert 0.5 * training + 6 - 3 < draws <= 0.5 * training + 6
@@ -144,7 +144,7 @@ def test_a_signal_leaves_a_checkpoint_and_ends_the_run(make_source, tiny, run, n
             os.kill(os.getpid(), name)
 
     with stop_on_signals() as stop:
-        outcome = train(make_source(24), tiny(), run, stop=stop, listen=listen)
+        outcome = train(make_source(24), tiny(), run, Hooks(stop=stop, on_record=listen))
     assert outcome.reason == "stopped"
     assert checkpoint.load(run / CHECKPOINT)["step"] == outcome.step < 12
 
@@ -154,7 +154,7 @@ def test_waiting_for_a_scene_ends_when_it_is_told_to(make_source, tiny, run) -> 
     source.ready = lambda: False
     assert train(source, tiny(max_seconds=0.05), run).reason == "seconds"
     stop.set()
-    assert train(source, tiny(), run, stop=stop).reason == "stopped"
+    assert train(source, tiny(), run, Hooks(stop=stop)).reason == "stopped"
 
 
 @pytest.mark.parametrize("recover", [False, True])
@@ -199,7 +199,7 @@ def test_what_a_run_logged_up_to_its_end_stays_where_it_goes_on(make_source, tin
 def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny, run) -> None:
     stop = threading.Event()
     stop.set()
-    train(make_source(24), tiny(), run, stop=stop)
+    train(make_source(24), tiny(), run, Hooks(stop=stop))
     train(make_source(24), tiny(max_steps=1), run)
     (run / CHECKPOINT).unlink()
     train(make_source(24), tiny(max_steps=1, seed=1), run)
@@ -208,8 +208,8 @@ def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny,
 
 
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
-    train(make_source(24), tiny(max_steps=5), run, listen=service._tell)
-    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, listen=service._tell)
+    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=service._log_record))
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=service._log_record))
     changed = [record for record in metrics_log.read(run / METRICS) if record["kind"] == "changes"]
     wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
     assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]

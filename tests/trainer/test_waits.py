@@ -11,7 +11,7 @@ from photonfarm.trainer.cli import service
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, waits
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
 
@@ -69,7 +69,7 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     train(make_source(24), tiny(max_steps=1), tmp_path / "before")  # a process' first run takes as long to begin
     source = make_scarce(60, lot=12, patience=30)
     scarce = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, poll_seconds=0.02)
-    train(source, scarce, run, listen=service._tell, count=source.count)
+    train(source, scarce, run, Hooks(on_record=service._log_record, on_draws=source.count))
     records = metrics_log.read(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     waited = [r["seconds"]["wait_data"] for r in told if r["step"] % 5 == 0]
@@ -107,7 +107,7 @@ def test_what_is_no_training_is_counted_as_what_it_is_and_not_as_waiting(
     source.base = slowed(source.base, 0.5)
     monkeypatch.setattr(checkpoint, "save", slowed(checkpoint.save, 0.3))
     began = time.monotonic()
-    train(source, tiny(), run, listen=slowed(lambda _: None, 0.2))
+    train(source, tiny(), run, Hooks(on_record=slowed(lambda _: None, 0.2)))
     wall_s = time.monotonic() - began
     seconds = metrics_log.read(run / METRICS)[-1]["seconds"]
     assert seconds["start"] >= 0.5 + 0.3, "the weights at the beginning are saved as well"

@@ -7,12 +7,14 @@ import pytest
 
 from photonfarm.shared.core.frame_costs import Surface
 from photonfarm.shared.core.records import ViewBuffers
-from photonfarm.trainer.report.worst_cases import View, kinds, shadow_edges, squared_error, worst_cases
+from photonfarm.trainer.report.worst_cases import HeldOutView, kinds, shadow_edges, squared_error, worst_cases
 
 SIZE = 16
 
 
-def view(row: int, error: float = 0.0, where: tuple[slice, slice] = (slice(None), slice(None)), **changes) -> View:
+def view(
+    row: int, error: float = 0.0, where: tuple[slice, slice] = (slice(None), slice(None)), **changes
+) -> HeldOutView:
     """A grey wall at distance 5 under even light, which the network shows too bright by `error` in some pixels."""
     clean = np.full((SIZE, SIZE, 3), 0.25, np.float32)
     image = clean.copy()
@@ -21,7 +23,7 @@ def view(row: int, error: float = 0.0, where: tuple[slice, slice] = (slice(None)
     normal[..., 2] = 1
     buffers = ViewBuffers(np.full((SIZE, SIZE), 5.0, np.float32), np.full((SIZE, SIZE, 3), 0.5, np.float32), normal)
     surface = np.full((SIZE, SIZE), Surface.DIFFUSE, np.uint8)
-    return replace(View(row, image, clean, clean.copy(), buffers, surface), **changes)
+    return replace(HeldOutView(row, image, clean, clean.copy(), buffers, surface), **changes)
 
 
 def mirror(pixels: int) -> np.ndarray:

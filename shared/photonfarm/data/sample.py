@@ -18,11 +18,10 @@ from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.read.reader import Sample as StoredSample
-from photonfarm.shared.store.read.reader import SceneReader
+from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 IMAGES = ("radiance", "albedo", "normal", "depth")
-"""The images that every sample has; a sample of a scene with guides has these too, by the names of `Guides`."""
+"""The images that every sample has. Samples of a scene with guides also have the images that `Guides` names."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,9 +116,9 @@ class Sample:
 
     @property
     def guides(self) -> dict[str, F32]:
-        """What is known of the view before anything is learned, by name; empty unless the scene is read with guides.
+        """The guides, which are images known before any learning, by name; empty unless the scene is read with guides.
 
-        `photonfarm.shared.core.records.Guides` says what each is. A guide is also an attribute of the sample.
+        `photonfarm.shared.core.records.Guides` describes each. A guide is also an attribute of the sample.
         """
         known: Guides | None = self._stored.guides
         return {} if known is None else {name: np.asarray(array) for name, array in arrays_of(known).items()}

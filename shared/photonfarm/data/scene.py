@@ -28,8 +28,8 @@ def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> 
     """A scene of a store, with the samples that are complete now.
 
     `store` is a folder, or the URL of a bucket (`s3://bucket/prefix`). `scene` is a scene's name, its id, or the
-    beginning of its id. With `guides` each sample comes with what is known of its view, and is complete only with it;
-    None reads guides if the scene has some.
+    beginning of its id. With `guides` each sample carries the guides of its view, and is complete only once they are
+    there; None reads guides if the scene has some.
 
     Raises StoreError if there is no such store, or no such scene in it (the message names the scenes that exist), and
     SpecError if `guides` is True and the scene has none.
@@ -42,15 +42,15 @@ def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> 
 
 
 class Scene(Sequence[Sample]):
-    """The complete samples of one scene, in the order of their rows; `refresh` takes in those that came since.
+    """The complete samples of one scene, in the order of their rows; `refresh` adds those completed since.
 
-    It pickles as its place in the store with its rows, so that processes that are spawned read the same samples.
+    A pickled scene holds only its place in the store and its rows, so that spawned processes read the same samples.
     """
 
     def __init__(
         self, store: str | Path, scene_id: str, *, guides: bool = False, rows: Sequence[int] | None = None
     ) -> None:
-        """Use `open_scene`. With `rows` it consists of these samples alone, and does not change."""
+        """Use `open_scene`. With `rows` the scene consists of these samples alone, and does not change."""
         self._store, self._id, self._guides = store, scene_id, guides
         self._reader = SceneReader(store, scene_id)
         if guides:
@@ -85,7 +85,7 @@ class Scene(Sequence[Sample]):
 
     @property
     def has_guides(self) -> bool:
-        """Whether samples come with what is known of their views."""
+        """Whether samples carry the guides of their views."""
         return self._guides
 
     @property
@@ -128,7 +128,7 @@ class Scene(Sequence[Sample]):
     # ------------------------------------------------------------------------------------------------ while it grows
 
     def refresh(self) -> int:
-        """Take in the samples that became complete since; returns how many more there are, below 0 after a repair.
+        """Add the samples completed since the last call; returns how many more there are, below 0 after a repair.
 
         Raises ValueError for a snapshot, which does not change.
         """
@@ -146,8 +146,8 @@ class Scene(Sequence[Sample]):
     def split(self, split: Split, *, hold_out: float = HOLD_OUT) -> Scene:
         """A snapshot of the samples to train on, of those that are held out, or of all.
 
-        Whole configurations are held out (of a static scene, views), a share `hold_out` of them, by a hash of what they
-        are: exactly those that `photonfarm train` holds out. Raises ValueError for another split.
+        A share `hold_out` of the configurations (in a static scene, of the views) is held out whole, chosen by a hash
+        of their content: exactly those that `photonfarm train` holds out. Raises ValueError for another split.
         """
         if split not in (splits := ("train", "held-out", "all")):
             raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
@@ -178,5 +178,5 @@ class Scene(Sequence[Sample]):
 
 
 def _opened(store: str | Path, scene_id: str, guides: bool, rows: Sequence[int] | None) -> Scene:
-    """What a pickled scene becomes."""
+    """The scene that a pickled scene is restored to."""
     return Scene(store, scene_id, guides=guides, rows=rows)

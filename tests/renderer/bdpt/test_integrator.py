@@ -26,7 +26,7 @@ def image(scene: Any, seed: int = 0, spp: int = 4, **parameters: Any) -> Any:
 
 
 def test_the_public_face_is_pinned() -> None:
-    assert bdpt.__all__ == ["BidirectionalPathTracer", "Photons", "trace_photons"]
+    assert bdpt.__all__ == ["BidirectionalPathTracer", "TracedPhotons", "trace_photons"]
 
 
 def test_two_renders_with_one_seed_are_bit_identical() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt import launches
-from photonfarm.renderer.verify.invariances import COUNTS, Check, checks
+from photonfarm.renderer.verify.invariances import COUNTS, Invariance, checks
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
@@ -23,9 +23,9 @@ QUICK = [
 
 # Each right check fails by chance with probability 4e-6 per comparison; the seeds are fixed.
 @pytest.mark.parametrize("check", QUICK)
-def test_an_image_does_not_change_with_what_must_not_matter(check: Check) -> None:
+def test_an_image_does_not_change_with_what_must_not_matter(check: Invariance) -> None:
     found = check.run()
-    assert found.faults == (), f"{check.said}: {found.figures}\nagain: {check.command}"
+    assert found.faults == (), f"{check.claim}: {found.figures}\nagain: {check.command}"
 
 
 def test_names_are_unique_and_the_long_version_has_all_quick_checks() -> None:

@@ -20,7 +20,7 @@ from photonfarm.renderer.bdpt.emission import AREA, DIRECTION, POSITION, DirectS
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.weights import oracle
-from photonfarm.renderer.verify.weights.joined_paths import Bounce, Joined, Pinhole, stored
+from photonfarm.renderer.verify.weights.joined_paths import Bounce, JoinedPaths, Pinhole, stored
 
 EDGES, SIZE, SPP = 5, 16, 8
 CONNECTIONS, LIGHT_RATIO = 1, 0.5
@@ -128,7 +128,7 @@ def seen_light(d: Any, p: Any, *, infinite: Any, delta: Any) -> DirectSample:
     return DirectSample(d, p, infinite, mi.Spectrum(0), nothing, delta, nothing, mi.Bool(True))
 
 
-def hits(scene: Any, lights: Any, states: list[Any], step: int) -> Joined:
+def hits(scene: Any, lights: Any, states: list[Any], step: int) -> JoinedPaths:
     """Paths whose last edge has hit a light."""
     si, ray = states[step]["si"], states[step]["ray"]
     emitter = si.emitter(scene)
@@ -137,10 +137,10 @@ def hits(scene: Any, lights: Any, states: list[Any], step: int) -> Joined:
     light = seen_light(ray.d, si.p, infinite=~si.is_valid(), delta=mi.Bool(False))
     walked = bounces_of(states, step - 1)
     walked[-1].delta = states[step]["dvcm"] == 0
-    return Joined(walked[::-1], light, emitter, index, si, lights.is_kind(index, AREA), None, lit)
+    return JoinedPaths(walked[::-1], light, emitter, index, si, lights.is_kind(index, AREA), None, lit)
 
 
-def next_events(scene: Any, lights: Any, states: list[Any], step: int, light: DirectSample) -> Joined:
+def next_events(scene: Any, lights: Any, states: list[Any], step: int, light: DirectSample) -> JoinedPaths:
     """Paths that next event estimation has made at a vertex."""
     walked = bounces_of(states, step)
     si = walked[-1].si
@@ -158,10 +158,10 @@ def next_events(scene: Any, lights: Any, states: list[Any], step: int, light: Di
     value = walked[-1].bsdf.eval(mi.BSDFContext(), si, si.to_local(light.d))
     hit.p = light.p
     complete = states[step]["active"] & light.valid & seen & (dr.max(value) > 0)
-    return Joined(walked[::-1], light, emitter, index, hit, lights.is_kind(index, AREA), None, complete)
+    return JoinedPaths(walked[::-1], light, emitter, index, hit, lights.is_kind(index, AREA), None, complete)
 
 
-def seen_by_lens(lights: Any, states: list[Any], step: int, start: Any, joined: Any) -> Joined:
+def seen_by_lens(lights: Any, states: list[Any], step: int, start: Any, joined: Any) -> JoinedPaths:
     """Paths that a light path's vertex makes with the lens."""
     index = number_of(lights, start.emitter)
     area = lights.is_kind(index, AREA)
@@ -171,10 +171,10 @@ def seen_by_lens(lights: Any, states: list[Any], step: int, start: Any, joined: 
     on_light.sh_frame.n = start.sample.n
     light = seen_light(-ray.d, on_light.p, infinite=start.at_infinity, delta=start.delta)
     complete = states[step]["active"] & joined
-    return Joined(bounces_of(states, step), light, start.emitter, index, on_light, area, None, complete)
+    return JoinedPaths(bounces_of(states, step), light, start.emitter, index, on_light, area, None, complete)
 
 
-def connections(lights: Any, recorder: Recorder, step: int, depth: int) -> Joined:
+def connections(lights: Any, recorder: Recorder, step: int, depth: int) -> JoinedPaths:
     """Paths that connect an eye path's vertex to a light path's vertex with ``depth`` edges behind it."""
     path, depths = recorder.connected[step]
     (start,) = recorder.start
@@ -194,10 +194,10 @@ def connections(lights: Any, recorder: Recorder, step: int, depth: int) -> Joine
         delta=of_path(lit.light.delta),
     )
     index, area = of_path(lit.index), of_path(lit.is_area)
-    return Joined([*others, *own], light, of_path(lit.emitter), index, of_path(lit.on_light), area, None, joined)
+    return JoinedPaths([*others, *own], light, of_path(lit.emitter), index, of_path(lit.on_light), area, None, joined)
 
 
-def errors(lights: Any, lens: Pinhole, joined: Joined, technique: int, ours: Any) -> Any:
+def errors(lights: Any, lens: Pinhole, joined: JoinedPaths, technique: int, ours: Any) -> Any:
     """[N]: relative difference of the loop's weight from the oracle's."""
     complete = np.array(joined.complete)
     if not complete.any():

@@ -24,7 +24,7 @@ def test_a_hard_scene_looks_like_its_truth(scene: HardScene) -> None:
         if outcome.result.faults:
             folder = keep(outcome, FAILURES).resolve()
             pytest.fail(
-                f"{scene.label} ({outcome.result.settings}), {scene.hard}; truth: {scene.truth.said}\n"
+                f"{scene.label} ({outcome.result.settings}), {scene.hard}; truth: {scene.truth.name}\n"
                 f"{'; '.join(outcome.result.faults)}\nmean ratio {outcome.result.mean_ratio} ± "
                 f"{outcome.result.mean_ratio_standard_error}\nagain: {outcome.result.command}\nrenders: {folder}"
             )

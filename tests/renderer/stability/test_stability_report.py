@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from photonfarm.renderer.cli import report_stability
 from photonfarm.renderer.verify import report, rows
 from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
-from photonfarm.renderer.verify.runner import Result, plus_minus, run
-from photonfarm.renderer.verify.scenes.case import Settings
+from photonfarm.renderer.verify.runner import SceneResult, plus_minus, run
+from photonfarm.renderer.verify.scenes.case import BdptSettings
 from photonfarm.renderer.verify.scenes.truths import known
 
 
@@ -46,14 +46,14 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     monkeypatch.setattr(rows, "REFUSALS", ())
     result = call(tmp_path, "--quick")
     assert result.exit_code == 1
-    assert "again: python bench/stability.py --only 05-empty --settings 1,1 --seed 0 --quick" in result.stderr
+    assert "again: python -m bench.renderer.stability --only 05-empty --settings 1,1 --seed 0 --quick" in result.stderr
     kept = tmp_path / "out" / "failures" / "05-empty_1,1"
     assert np.load(kept / "bdpt.npy").shape == (12, 16, 16, 3)
     assert (kept / "bdpt_truth_z.png").is_file()
     assert "## Failures" in (tmp_path / "out" / "stability.md").read_text(encoding="utf-8")
 
 
-def rounding(mean_ratio: float, **changes: Any) -> Result:
+def rounding(mean_ratio: float, **changes: Any) -> SceneResult:
     """A result that differs by 60 standard errors of its noise, but by less than rounding may."""
     (refused,) = run(rows.REFUSALS[0], quick=True)
     return replace(
@@ -65,18 +65,18 @@ def rounding(mean_ratio: float, **changes: Any) -> Result:
 
 
 def test_what_passes_as_rounding_is_marked_and_stands_beside_path() -> None:
-    text = report.markdown(report.Report([rounding(1.00024)]), "made so")
+    text = report.markdown(report.StabilityReport([rounding(1.00024)]), "made so")
     assert "| 1.0002400 ± 4.0e-06 ° (≤ 0.003) | 1.0006600 ± 5.0e-06 | 0.046 %, 450 % |" in text
     assert "- 01-sphere: `bdpt` +0.024 %, `path` +0.066 %" in text
 
 
 def test_what_is_right_or_fails_is_not_called_rounding() -> None:
     for result in (rounding(1.00001), rounding(1.01, faults=("wrong",))):
-        assert "° (≤" not in report.markdown(report.Report([result]), "made so")
+        assert "° (≤" not in report.markdown(report.StabilityReport([result]), "made so")
 
 
 def test_every_column_of_the_table_is_explained_in_a_line_of_its_own() -> None:
-    text = report.markdown(report.Report([rounding(1.0)]), "made so")
+    text = report.markdown(report.StabilityReport([rounding(1.0)]), "made so")
     header = next(line for line in text.splitlines() if line.startswith("| row |"))
     explained = [line for line in text.splitlines() if line.startswith("- **")]
     for column in header.strip("| ").split(" | "):
@@ -86,15 +86,15 @@ def test_every_column_of_the_table_is_explained_in_a_line_of_its_own() -> None:
 
 def test_what_is_hard_is_said_once_for_each_row() -> None:
     results = [rounding(1.0), rounding(1.0, settings="0,0"), replace(rounding(1.0), name="deep")]
-    assert "## What is hard\n\n- 1: all of it\n" in report.markdown(report.Report(results), "made so")
+    assert "## What is hard\n\n- 1: all of it\n" in report.markdown(report.StabilityReport(results), "made so")
     results.append(replace(rounding(1.0), name="dim", hard="light is rare"))
-    text = report.markdown(report.Report(results), "made so")
+    text = report.markdown(report.StabilityReport(results), "made so")
     assert "- 1: *sphere, deep*: all of it; *dim*: light is rare\n" in text
 
 
 def test_path_is_compared_with_an_exact_truth_and_with_no_other() -> None:
     by_label = {scene.label: scene for scene in rows.SCENES}
-    (exact,) = run(by_label["05-empty"], quick=True, settings=[Settings(1, 1.0)])
+    (exact,) = run(by_label["05-empty"], quick=True, settings=[BdptSettings(1, 1.0)])
     assert exact.result.path_ratio == pytest.approx(1.0, abs=1e-5)
     (rendered,) = run(by_label["28-orthographic"], quick=True)
     assert rendered.result.path_ratio is None
@@ -109,7 +109,7 @@ def test_rows_and_scenes_are_counted_apart_and_refusals_without_a_row_by_themsel
         replace(one, row=2),
         replace(one, row=None, name="fog"),
     ]
-    text = report.markdown(report.Report(results), "made so")
+    text = report.markdown(report.StabilityReport(results), "made so")
     assert "**1 of 2 rows pass**, 2 of 3 scenes and 1 of 1 further refusals." in text
 
 
@@ -146,8 +146,8 @@ def test_colours_of_z_are_those_of_the_legend() -> None:
 
 def test_rows_are_chosen_by_number_name_label_and_settings() -> None:
     with pytest.raises(ValueError, match=r"14-point-caustic is tried with 1,1 or"):
-        rows.chosen(["14"], settings=[Settings(0, 0.0)])
-    assert "point-caustic" not in {item.name for item in rows.chosen(settings=[Settings(0, 0.0)])}
+        rows.chosen(["14"], settings=[BdptSettings(0, 0.0)])
+    assert "point-caustic" not in {item.name for item in rows.chosen(settings=[BdptSettings(0, 0.0)])}
     (by_name,) = rows.chosen(["cove"])
     (by_label,) = rows.chosen(["11-cove"])
     assert [by_name] == [by_label] == rows.chosen(["11"])

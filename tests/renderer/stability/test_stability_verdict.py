@@ -10,8 +10,8 @@ import pytest
 
 from photonfarm.renderer.verify import runner
 from photonfarm.renderer.verify.rows import SCENES
-from photonfarm.renderer.verify.runner import Outcome, compare, run, seen_bias
-from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, Settings
+from photonfarm.renderer.verify.runner import SceneOutcome, compare, run, seen_bias
+from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, BdptSettings
 from photonfarm.renderer.verify.scenes.truths import rendered
 
 
@@ -19,7 +19,7 @@ def scene(label: str) -> Any:
     return next(scene for scene in SCENES if scene.label == label)
 
 
-def only(wrong: Any, **options: Any) -> Outcome:
+def only(wrong: Any, **options: Any) -> SceneOutcome:
     (outcome,) = run(wrong, quick=True, settings=[FIRST], **options)
     return outcome
 
@@ -102,7 +102,7 @@ def test_a_black_image_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_settings_that_are_not_complete_are_not_tried() -> None:
-    assert list(run(scene("14-point-caustic"), quick=True, settings=[Settings(0, 0.0)])) == []
+    assert list(run(scene("14-point-caustic"), quick=True, settings=[BdptSettings(0, 0.0)])) == []
 
 
 def test_one_seed_gives_one_result() -> None:

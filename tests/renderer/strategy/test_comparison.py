@@ -5,12 +5,14 @@ import math
 import pytest
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, Measured, is_alike, saving
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors, is_alike, saving
 
 
-def measured(own: tuple[float, ...], plain: tuple[float, ...], images: int = 12, time: float = 1.0) -> Measured:
-    errors = Errors(images=images, own=own, plain=plain)
-    return Measured(Candidate(0, 1.0), errors, 0.0, 1.0, errors.ratio * time, None)
+def measured(
+    own: tuple[float, ...], plain: tuple[float, ...], images: int = 12, time: float = 1.0
+) -> MeasuredCandidate:
+    errors = RelativeErrors(images=images, own=own, plain=plain)
+    return MeasuredCandidate(Candidate(0, 1.0), errors, 0.0, 1.0, errors.ratio * time, None)
 
 
 def test_candidates_whose_errors_rise_and_fall_together_are_told_apart_however_much_these_vary() -> None:

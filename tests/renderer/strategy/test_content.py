@@ -17,7 +17,7 @@ MIRROR = {"type": "sphere", "bsdf": {"type": "conductor"}}
 BULB = {"type": "point", "intensity": {"type": "rgb", "value": 1.0}}
 
 
-def read(description: dict[str, Any]) -> content.Content:
+def read(description: dict[str, Any]) -> content.SceneContent:
     scene = mi.load_dict({"type": "scene", "camera": {"type": "perspective"}, **description}, optimize=False)
     return content.read(scene, scene.sensors()[0])
 

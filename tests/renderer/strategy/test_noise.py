@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from photonfarm.renderer.strategy.noise import Tally, missed
+from photonfarm.renderer.strategy.noise import BlockSums, missed
 from photonfarm.shared.core.records import F32
 
 SIDE, CANDIDATES, CONNECTED = 64, 6, 0.15
@@ -27,8 +27,8 @@ def dependent(rng: np.random.Generator) -> NDArray[np.float64]:
     return independent(rng) + patches + rng.normal(0, CONNECTED / 5)
 
 
-def tallied(draw: Draw, views: int, pairs: int, rng: np.random.Generator) -> Tally:
-    tally = Tally()
+def tallied(draw: Draw, views: int, pairs: int, rng: np.random.Generator) -> BlockSums:
+    tally = BlockSums()
     for view in range(views):
         for _ in range(pairs):
             tally.add(*(as_image(draw(rng)) for _ in "ab"), WEIGHTS, view)

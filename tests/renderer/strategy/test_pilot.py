@@ -11,7 +11,7 @@ from photonfarm.renderer.scene import backend
 mi = backend.load(threads=1)
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render  # noqa: E402
-from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights  # noqa: E402
+from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.shared.core.statistics import block_z_test  # noqa: E402
@@ -160,7 +160,7 @@ def test_among_equal_candidates_nobody_is_charged(seed: int) -> None:
 
 def test_one_lucky_sample_does_not_convict_the_others() -> None:
     rng = np.random.default_rng(5)
-    ordinary, lucky = Tally(), Tally()
+    ordinary, lucky = BlockSums(), BlockSums()
     weights = np.ones(SHAPE, np.float32)
     for i in range(4):
         a, b, c, d = (1 + 0.1 * rng.standard_normal((4, *SHAPE))).astype(np.float32)

@@ -13,10 +13,10 @@ backend.load(threads=1)
 
 from photonfarm.renderer.strategy import cache, plan  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
-from photonfarm.renderer.strategy.comparison import Errors  # noqa: E402
-from photonfarm.renderer.strategy.measurement import GRID, Measurement, Row  # noqa: E402
+from photonfarm.renderer.strategy.comparison import RelativeErrors  # noqa: E402
+from photonfarm.renderer.strategy.measurement import GRID, CandidateRow, Measurement  # noqa: E402
 from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
-from photonfarm.renderer.strategy.plan import Plan, _knows, plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
 from photonfarm.shared.cli.main import main  # noqa: E402
 from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
@@ -48,16 +48,16 @@ def spec_with(**transport: Any) -> SceneSpec:
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
 
 
-def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, scatter: float = 0.1) -> Row:
+def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, scatter: float = 0.1) -> CandidateRow:
     """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
-    return Row(
+    return CandidateRow(
         connections=candidate.connections, light_ratio=candidate.light_ratio, missed=0.0,
-        errors=Errors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
+        errors=RelativeErrors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
     )  # fmt: skip
 
 
-def measurement(*rows: Row) -> Measurement:
+def measurement(*rows: CandidateRow) -> Measurement:
     """As of a spec with (1, 1) and 2 samples per pixel."""
     default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
@@ -67,7 +67,7 @@ def measurement(*rows: Row) -> Measurement:
     )  # fmt: skip
 
 
-def text_of(found: Plan) -> str:
+def text_of(found: TransportPlan) -> str:
     return "\n".join(lines(found))
 
 
@@ -322,7 +322,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The seconds of each pilot, in place of the pilots."""
     seconds: list[float] = []
 
-    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, talk: Any) -> Measurement:
+    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, log: Any) -> Measurement:
         seconds.append(asked_s)
         return measurement().model_copy(update={"asked_s": asked_s})
 

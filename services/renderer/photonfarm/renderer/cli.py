@@ -195,7 +195,7 @@ def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool)
     from photonfarm.renderer.strategy.plan import make_plan
 
     file = spec_file.writable(spec) if write else find_spec(spec)
-    plan = make_plan(loaded, file.parent, seconds=seconds, again=again, talk=partial(click.echo, err=True))
+    plan = make_plan(loaded, file.parent, seconds=seconds, again=again, log=partial(click.echo, err=True))
     click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))
     if write:
         if plan.changes:
@@ -223,8 +223,8 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
     backend.load(threads=1)
     from photonfarm.renderer.measure.sample_costs import find_or_measure
 
-    talk = partial(click.echo, err=True)
-    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, talk=talk)
+    log = partial(click.echo, err=True)
+    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, log=log)
     click.echo(costs.json() if as_json else costs.line())
 
 
@@ -247,8 +247,8 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     backend.load(threads=1)
     from photonfarm.renderer.measure.exposure import propose
 
-    talk = partial(click.echo, err=True)
-    found = propose(loaded, find_spec(spec).parent, talk, target=target, frames=frames)
+    log = partial(click.echo, err=True)
+    found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 
@@ -271,9 +271,7 @@ def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--only") from error
     out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be rendered first
-    found = report.examine(
-        scenes, quick=quick, seed=seed, failures=out / "failures", tell=partial(click.echo, err=True)
-    )
+    found = report.examine(scenes, quick=quick, seed=seed, failures=out / "failures", log=partial(click.echo, err=True))
     arguments = ["--quick"] * quick + [f"--only {row}" for row in only] + [f"--seed {seed}"] * (seed != 0)
     report.write(found, out, " ".join(["photonfarm report stability", *arguments]))
     click.echo(out / "stability.md")

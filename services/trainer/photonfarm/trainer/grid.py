@@ -1,9 +1,9 @@
 """The grid search over optimisers, rates and decays [supplement 3.1]: short runs that differ in nothing else.
 
-A cell is one combination of the axes. All cells see the same samples in the same order from the same first weights and
+A cell is one combination of the axes. All cells use the same samples in the same order from the same first weights and
 are measured on the same held-out samples, so that they are compared in pairs. The best of many cells looks better than
-it is on whatever it was picked by; so it is picked by one half of the held-out configurations, and the errors that are
-told are those on the other half.
+it is on the samples that selected it; so it is selected by one half of the held-out configurations, and the reported
+errors are those on the other half.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.predict.evaluation import HeldOut, batches, measure
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import train
+from photonfarm.trainer.training.loop import Hooks, train
 
 Axes = Mapping[str, Sequence[Any]]
-"""The values that each key of the settings takes."""
+"""The values of each searched key of the settings."""
 
 AXES: Axes = {
     "optimiser": ("adam", "rmsprop"),
     "learning_rate": (1e-4, 5e-4, 1e-3, 2e-3),
     "decay": (0.95, 0.99, 1.0),
 }
-"""What the supplement searched; its values are not told, and these are ours, about those that it found best."""
+"""The keys that the supplement searched; it does not give the values, and these are ours, around those it chose."""
 
 STEPS = 1000
-"""Steps of a cell unless told otherwise."""
+"""The default number of steps of a cell."""
 
 JSON = "grid.json"
 MARKDOWN = "grid.md"
@@ -53,15 +53,15 @@ MARKDOWN = "grid.md"
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """How one combination ended."""
+    """The result of one combination."""
 
     changes: dict[str, Any]  # the axes' values
     picked_by: tuple[float, ...]  # held-out error of each configuration of one half, noise removed; and of…
-    per_unit: tuple[float, ...]  # …each one of the other half, which nothing was picked by; empty: training diverged
+    per_unit: tuple[float, ...]  # …each one of the other half, which selected nothing; empty: training diverged
 
     @property
     def rank(self) -> float:
-        """What the best has the least of: the mean error on the first half; infinite if training diverged."""
+        """The value that ranks cells, least first: the mean error on the first half; infinite if training diverged."""
         return float(np.mean(self.picked_by)) if self.picked_by else math.inf
 
     @property
@@ -70,7 +70,7 @@ class Cell:
         return Estimate.of(np.array(self.per_unit)) if self.per_unit else None
 
     def behind(self, best: Cell) -> Estimate:
-        """How much larger that is than another cell's: the mean over pairs, one for each configuration."""
+        """The excess of that error over another cell's: the mean over pairs, one for each configuration."""
         return Estimate.of(np.array(self.per_unit) - np.array(best.per_unit))
 
 
@@ -81,16 +81,16 @@ def run_grid(
     axes: Axes = AXES,
     *,
     stop: Stop | None = None,
-    tell: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> list[Cell]:
-    """Train and measure every cell; returns those that are finished, all that the axes make unless `stop` was set.
+    """Train and measure every cell; returns the finished ones, which are all unless `stop` was set.
 
-    Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Cells
-    that are finished there are not trained again, and one that is not goes on from its last checkpoint; grid.json keeps
-    those of other values of the axes too. `make_source` opens the same complete samples each time; `tell` gets a line
-    for every cell. Raises IncompleteError while samples are missing and where fewer than two configurations are held
-    out; SpecError for an axis that the settings do not have, and for a folder that holds a grid over other samples or
-    settings; what a run raises, besides DivergedError.
+    Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Finished
+    cells are not trained again, and an unfinished one resumes from its last checkpoint; grid.json also keeps cells of
+    other values of the axes. `make_source` opens the same complete samples each time; `log` gets a line for every
+    cell. Raises IncompleteError while samples are missing and if fewer than two configurations are held out; SpecError
+    for an axis that the settings do not have, and for a folder that holds a grid over other samples or settings; and
+    the errors of a run, except DivergedError.
     """
     stop = stop or Stop()
     wanted = _cells(settings, axes)
@@ -108,8 +108,8 @@ def run_grid(
             known.append(cell)
             finished.append(cell)
             _write(folder, about, known, finished)
-            if tell:
-                tell(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+            if log:
+                log(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
         _write(folder, about, known, finished)
     return finished
 
@@ -127,7 +127,7 @@ def table(cells: Sequence[Cell]) -> str:
 
 
 def _cells(settings: TrainSettings, axes: Axes) -> list[tuple[dict[str, Any], TrainSettings]]:
-    """Every combination, with the settings that it makes."""
+    """Every combination of the axes, with its settings."""
     try:
         combinations = [dict(zip(axes, values, strict=True)) for values in product(*axes.values())]
         return [(c, TrainSettings.model_validate({**settings.model_dump(), **c})) for c in combinations]
@@ -136,7 +136,7 @@ def _cells(settings: TrainSettings, axes: Axes) -> list[tuple[dict[str, Any], Tr
 
 
 def _about(source: SampleSource, settings: TrainSettings) -> dict[str, Any]:
-    """What all cells have in common: scene and number of samples; IncompleteError where these do not suffice."""
+    """The properties that all cells share: scene and number of samples; IncompleteError if there are too few."""
     if not source.ready():
         raise IncompleteError("the scene has no samples yet; a grid compares runs over samples that are there")
     rows = source.refresh().tolist()
@@ -156,7 +156,7 @@ def _about(source: SampleSource, settings: TrainSettings) -> dict[str, Any]:
 
 
 def _name(changes: Mapping[str, Any]) -> str:
-    """A cell's folder."""
+    """The name of a cell's folder."""
     return "-".join(str(value) for value in changes.values())
 
 
@@ -174,9 +174,9 @@ def _run_cell(
     run: Path,
     stop: Stop,
 ) -> Cell | None:
-    """Train a cell to its end and measure it; None if it was stopped before."""
+    """Train a cell to its end and measure it; None if it was stopped early."""
     try:
-        if train(make_source(), settings, run, stop=stop).reason == "stopped":
+        if train(make_source(), settings, run, Hooks(stop=stop)).reason == "stopped":
             return None
     except DivergedError:
         return Cell(changes, (), ())
@@ -184,8 +184,8 @@ def _run_cell(
     return Cell(changes, picked_by, per_unit) if np.isfinite([*picked_by, *per_unit]).all() else Cell(changes, (), ())
 
 
-def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldOut:
-    """The error of a run's last network on what is held out."""
+def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldOutErrors:
+    """The held-out error of a run's last network."""
     with Feed(source, settings) as feed:
         arrived, _ = feed.arrivals()
         rows = [row for row, is_held_out in arrived if is_held_out][:MOST_HELD_OUT]
@@ -193,7 +193,7 @@ def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldO
         return measure(predict, batches(feed, rows, settings.batch))
 
 
-def _halves(found: HeldOut) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _halves(found: HeldOutErrors) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """The errors of the configurations, in two halves by a hash of their keys; the second has the odd one."""
     errors = group_means(found.per_sample, found.units).tolist()
     ordered = sorted(zip(map(_place, dict.fromkeys(found.units)), errors, strict=True))
@@ -202,7 +202,7 @@ def _halves(found: HeldOut) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _place(unit: Key) -> Key:
-    """By which configurations are put in order: nothing to do with the hash by which they are held out."""
+    """The key that orders the configurations, independent of the hash by which they are held out."""
     return make_key("half of a grid", unit)
 
 
@@ -210,7 +210,7 @@ def _place(unit: Key) -> Key:
 
 
 def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
-    """The finished cells of a grid; SpecError unless it was about the same, StoreError where it cannot be read."""
+    """The finished cells of a grid; SpecError if it has other properties, StoreError if it cannot be read."""
     if not path.exists():
         return []
     with store_errors("read the grid", path):
@@ -228,7 +228,7 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
 
 
 def _write(folder: Path, about: Mapping[str, Any], known: Sequence[Cell], wanted: Sequence[Cell]) -> None:
-    """Write grid.json, of all cells that are known, and grid.md, of those wanted, each whole or not at all."""
+    """Write grid.json, of all known cells, and grid.md, of the wanted ones, each whole or not at all."""
     described = [{**asdict(cell), **(asdict(cell.error) if cell.error else {})} for cell in known]
     document = json.dumps({**about, "cells": described}, indent=2)
     with store_errors("write the grid", folder):

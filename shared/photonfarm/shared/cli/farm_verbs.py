@@ -64,8 +64,8 @@ def submit(
     if dry_run:
         from photonfarm.shared.farm.dry_run import rehearse
 
-        tell = partial(click.echo, err=True)
-        show.dry_run(rehearse(spec, store, request, measure=not no_measure, tell=tell, shard_rows=shard_rows), as_json)
+        log = partial(click.echo, err=True)
+        show.dry_run(rehearse(spec, store, request, measure=not no_measure, log=log, shard_rows=shard_rows), as_json)
     else:
         url = None if no_queue else redis_url
         show.submission(submission.submit(spec, store, url, request, retry=retry, shard_rows=shard_rows), as_json)

@@ -39,7 +39,7 @@ def main(args: list[str] | None = None) -> None:
         umbrella(args, prog_name="photonfarm")
     except PhotonfarmError as error:
         _fail(str(error), error.exit_code)
-    except OSError as error:  # a file that a user named, and nobody closer to it could say more
+    except OSError as error:  # a file that a user named, and no code closer to it knew more
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
 
 

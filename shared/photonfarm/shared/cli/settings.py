@@ -10,13 +10,13 @@ from typing import Any
 from photonfarm.shared.core.errors import SpecError
 
 Options = Mapping[str, Mapping[str, str]]
-"""The options of each verb, and of each subcommand as "verb.subcommand": as written, without dashes, and parameters."""
+"""The options of each verb, and of each subcommand as "verb.subcommand": names without dashes → parameters."""
 
 
 def file_defaults(path: Path, options: Options) -> dict[str, Any]:
-    """Defaults by verb from a TOML file: a table per verb, and above all tables what holds for every verb that has it.
+    """Defaults by verb from a TOML file: a table per verb; keys above all tables hold for every verb that has them.
 
-    A subcommand's table is `[verb.subcommand]`, and its defaults lie in those of its verb under its name. Raises
+    A subcommand's table is `[verb.subcommand]`; its defaults are stored under its name among those of its verb. Raises
     SpecError for a file that cannot be read, and for a verb or an option that does not exist.
     """
     try:

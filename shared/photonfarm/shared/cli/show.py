@@ -19,11 +19,11 @@ from photonfarm.shared.scene.spec import SceneSpec, shape_ids
 if TYPE_CHECKING:
     from photonfarm.shared.farm.dry_run import DryRun
     from photonfarm.shared.farm.submission import Submission
-    from photonfarm.shared.queue import Cause, Failure, QueueStatus
+    from photonfarm.shared.queue import Failure, FailureCause, QueueStatus
     from photonfarm.shared.store import Store
 
 
-class Finding(Protocol):
+class CheckResult(Protocol):
     """The result of one check of `photonfarm doctor`."""
 
     @property
@@ -40,14 +40,14 @@ class Finding(Protocol):
 
     @property
     def exit_code(self) -> int:
-        """Of the command, where this does not work; 0 if it can be done without."""
+        """The exit code of the command if this check fails; 0 if the check is optional."""
 
 
 ANSWER_S = 5.0
-"""How long `status` waits for an answer of Redis; workers have more patience."""
+"""How long `status` waits for an answer of Redis; workers wait longer."""
 
-HELD_UP_SHOWN = 10
-"""Workers that take no jobs, of which it is said why."""
+IDLE_SHOWN = 10
+"""The most idle workers whose reasons are printed."""
 
 
 def _json(document: Any) -> None:
@@ -67,7 +67,7 @@ def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
 
 
 def scene(spec: SceneSpec, as_json: bool) -> None:
-    """A checked spec: its id, its settings, its movable groups."""
+    """Print a checked spec: its id, its settings, its movable groups."""
     if as_json:
         _json({"scene_id": spec.scene_id, "bytes_per_sample": bytes_per_sample(spec), **spec.model_dump(mode="json")})
         return
@@ -101,7 +101,7 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
 
 
 def bytes_per_sample(spec: SceneSpec) -> int:
-    """Stored bytes of one sample that has a view and a modification of its own, before compression."""
+    """The stored bytes of one sample that has a view and a modification of its own, before compression."""
     from photonfarm.shared.store.format.schema import bytes_of_rows
 
     return sum(bytes_of_rows(spec).values())
@@ -115,7 +115,7 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
 
 
 def submission(result: Submission, as_json: bool) -> None:
-    """What became of a request."""
+    """Print the outcome of a submission."""
     if as_json:
         _json(asdict(result))
         return
@@ -135,7 +135,7 @@ def submission(result: Submission, as_json: bool) -> None:
 
 
 def dry_run(result: DryRun, as_json: bool) -> None:
-    """What would become of a request, its size and cost, and what should be better at that cost."""
+    """Print what a request would plan, its size and cost, and a better use of the same cost."""
     submission(result, as_json)
     if as_json or not result.planned:
         return
@@ -178,9 +178,9 @@ def _duration(seconds: float) -> str:
 
 
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
-    """The store's scenes, and the queue where there is one.
+    """Print the store's scenes, and the queue if Redis answers.
 
-    Raises StoreError at the end if a scene or a marker cannot be read, or a marker is of no plan.
+    Raises StoreError at the end if a scene or a marker cannot be read, or a marker belongs to no plan.
     """
     from photonfarm.shared.core.errors import StoreError
     from photonfarm.shared.store import Store, store_status
@@ -198,7 +198,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
 
 
 def _unread_markers(scene: Mapping[str, Any]) -> str:
-    """What is said of a scene with markers that cannot be read."""
+    """The message about a scene's unreadable markers."""
     return (
         f"{scene['markers_unreadable']} of {_markers(scene)} markers cannot be read, and size, core time and "
         f"redrawn leave them out: {scene['marker_error']}; `photonfarm store check` names each"
@@ -206,7 +206,7 @@ def _unread_markers(scene: Mapping[str, Any]) -> str:
 
 
 def _lost_plan(scene: Mapping[str, Any]) -> str:
-    """What is said of a scene with markers of jobs that no plan has."""
+    """The message about a scene's markers whose jobs no plan has."""
     return (
         f"{scene['markers_without_plan']} of {_markers(scene)} markers are of jobs that no plan has; "
         "`photonfarm store check` tells whether the last plan is missing"
@@ -214,7 +214,7 @@ def _lost_plan(scene: Mapping[str, Any]) -> str:
 
 
 def _markers(scene: Mapping[str, Any]) -> int:
-    """How many markers a scene has, those of guides with them."""
+    """The number of a scene's markers, including those of guides."""
     return int(scene["jobs_committed"] + scene["guide_jobs"])
 
 
@@ -235,7 +235,7 @@ def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json
 
 
 def _queue_status(opened: Store, redis_url: str) -> tuple[QueueStatus | None, str]:
-    """What Redis knows; None, and why nothing is known."""
+    """The status of the queue; or None, and the reason why Redis gives none."""
     from photonfarm.shared import queue
     from photonfarm.shared.core.errors import QueueError
 
@@ -272,7 +272,7 @@ def _scenes(scenes: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _guided(scene: Mapping[str, Any]) -> str:
-    """How many views of a scene have guides, of how many."""
+    """How many of a scene's planned views have guides, as text."""
     if scene["views_guided"] is None:
         return "none"
     return f"{scene['views_guided']}/{scene['views_planned']} views"
@@ -287,28 +287,28 @@ def _queue(opened: Store, found: QueueStatus, names: Mapping[str, str]) -> None:
         f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
     )
-    for line in _held_up(found, names):
+    for line in _idle_lines(found, names):
         click.echo(f"  {line}")
     for cause in causes:
         click.echo(f"  {len(cause.jobs)} × {cause.cause}")
         click.echo(f"      to repeat one: {queue.repeating_command(opened.root, cause.example)}")
 
 
-def _held_up(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
-    """What keeps scenes of the store from being rendered, as workers say; text that strangers may have written."""
-    for scene_id, reasons in found.held_up.left.items():
+def _idle_lines(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
+    """Why scenes of the store are not rendered, by the workers' reports, which strangers may have written."""
+    for scene_id, reasons in found.idle_reports.left.items():
         if scene_id in names:
             reason = next(iter(reasons.values()))
             yield f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
-    paused = found.held_up.paused
-    for worker, reason in list(paused.items())[:HELD_UP_SHOWN]:
+    paused = found.idle_reports.paused
+    for worker, reason in list(paused.items())[:IDLE_SHOWN]:
         yield f"worker {worker} takes no jobs: {reason}"
-    if len(paused) > HELD_UP_SHOWN:
-        yield f"and {len(paused) - HELD_UP_SHOWN} workers more"
+    if len(paused) > IDLE_SHOWN:
+        yield f"and {len(paused) - IDLE_SHOWN} workers more"
 
 
 def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
-    """The failures of this store's jobs that nobody has committed since."""
+    """The failures of this store's jobs that are still not committed."""
     from photonfarm.shared.core.errors import CorruptError
     from photonfarm.shared.queue import RenderArguments
 
@@ -321,15 +321,15 @@ def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Fai
     return missing
 
 
-def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Path) -> dict[str, Any]:
+def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: str | Path) -> dict[str, Any]:
     from photonfarm.shared.queue import repeating_command
 
     return {
         "queued": found.queued,
         "running": found.running,
         "workers": found.workers,
-        "left": found.held_up.left,
-        "paused": found.held_up.paused,
+        "left": found.idle_reports.left,
+        "paused": found.idle_reports.paused,
         "failures": [
             {
                 "cause": cause.cause,
@@ -348,8 +348,8 @@ def _queue_document(found: QueueStatus, causes: Iterable[Cause], store: str | Pa
 # --------------------------------------------------------------------------------------------------------------- doctor
 
 
-def findings(found: Iterable[Finding], as_json: bool) -> int:
-    """The results of checks as they come; the exit code is that of the first needed one that failed, else 0."""
+def findings(found: Iterable[CheckResult], as_json: bool) -> int:
+    """Print the results of checks as they come; returns the exit code of the first required check that failed, or 0."""
     console, code, seen = Console(soft_wrap=True), 0, []
     for finding in found:
         if not finding.works and not code:

@@ -15,19 +15,18 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.store.check.check import Progress as Tell
-from photonfarm.shared.store.check.check import SceneReport, StoreReport, said
+from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
-from photonfarm.shared.store.read.merge import Merged
-from photonfarm.shared.store.write.findings import Finding, Group, Remedy
+from photonfarm.shared.store.read.merge import MergedView
+from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
 
 if TYPE_CHECKING:
     from photonfarm.shared.farm.upgrade import SceneUpgrade, Upgrade
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Tell]:
-    """Something to tell how far a check is: a bar on a terminal, a line per scene elsewhere; both to stderr."""
+def progress() -> Iterator[CheckProgress]:
+    """A progress callback for a check: a bar on a terminal, else a line per scene; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _line
@@ -36,12 +35,12 @@ def progress() -> Iterator[Tell]:
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
-        def tell(scene: str, done: int, total: int, size_bytes: int) -> None:
+        def show(scene: str, done: int, total: int, size_bytes: int) -> None:
             if scene not in tasks:
                 tasks[scene] = bars.add_task(scene, total=total, read="")
             bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs, {size_bytes / 1e6:,.0f} MB")
 
-        yield tell
+        yield show
 
 
 def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
@@ -53,7 +52,7 @@ def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
 
 
 def check(report: StoreReport, as_json: bool) -> None:
-    """What was read and found, by scene and cause, and what to do."""
+    """Print what a check read and found, by scene and cause, and what to do about it."""
     if as_json:
         click.echo(json.dumps(_document(report), indent=2))
         return
@@ -84,7 +83,7 @@ def _scene(scene: SceneReport) -> None:
     read = f"{scene.jobs} jobs, {scene.samples} samples{guides}, {scene.size_bytes / 1e6:,.1f} MB"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
-        click.echo(f"  A against B: {said(scene.halves)}")
+        click.echo(f"  A against B: {halves_in_words(scene.halves)}")
     if scene.back_facing_share is not None:
         click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
     for group in scene.groups:
@@ -114,7 +113,7 @@ def _document(report: StoreReport) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _group(group: Group) -> dict[str, Any]:
+def _group(group: FindingGroup) -> dict[str, Any]:
     first = [
         {"job": f.job, "guides": f.guides, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
     ]  # fmt: skip
@@ -127,7 +126,7 @@ def _group(group: Group) -> dict[str, Any]:
 
 
 def found(matches: Matches, store: str | Path, as_json: bool) -> None:
-    """Samples: what they are, where they lie, and how to look at one and render it."""
+    """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
         samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
         click.echo(json.dumps({"count": matches.count, "nearest": matches.nearest, "samples": samples}, indent=2))
@@ -141,10 +140,10 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
         click.echo(f"no sample fits{near}", err=True)
 
 
-def merged(views: Iterable[tuple[str, Merged]], folder: Path, least: int, as_json: bool) -> None:
-    """Write merged views, of so many passes at the least, into a folder that is made for them, and tell of each.
+def merged(views: Iterable[tuple[str, MergedView]], folder: Path, least: int, as_json: bool) -> None:
+    """Write merged views of at least `least` passes into `folder`, which is created, and print a line for each.
 
-    Raises StoreError if there is none, or where they cannot be written.
+    Raises StoreError if there is no such view, or if they cannot be written.
     """
     written = []
     for key, view in views:
@@ -182,7 +181,7 @@ def _sample(sample: FoundSample, store: str | Path) -> None:
 
 
 def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
-    """The command lines to look at a sample, and to render what is missing of it."""
+    """The command lines that read a sample, and those that render what is missing of it."""
     listed = {}
     if sample.complete:
         program = (
@@ -192,7 +191,7 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
         listed["look at it"] = shlex.join(["python", "-c", program])
     lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
     if sample.guided is False:
-        lacking.add(sample.jobs[1])  # which is rendered for its view's guides alone, if it is committed
+        lacking.add(sample.jobs[1])  # a committed job is rendered again for its guides alone
     for job in dict.fromkeys(sample.jobs):
         if job in lacking:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
@@ -204,7 +203,7 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
 
 
 def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
-    """What became of an upgrade, scene by scene, and how it goes on.
+    """Print the outcome of an upgrade, scene by scene, and the command that continues it.
 
     Raises StoreError at the end if a scene cannot be upgraded.
     """

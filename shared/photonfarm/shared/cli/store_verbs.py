@@ -1,4 +1,4 @@
-"""The verbs `photonfarm store …`: looking into a store, without Mitsuba or torch; `upgrade` alone talks to Redis."""
+"""The verbs `photonfarm store …`, which need neither Mitsuba nor torch; only `upgrade` uses Redis."""
 
 from __future__ import annotations
 
@@ -41,9 +41,13 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
 
     opened = Store(store)
     scene_id = None if scene is None else scene_named(opened, scene)
-    with show_store.progress() as tell:
+    with show_store.progress() as on_progress:
         report = check_store(
-            opened, scene_id, when=datetime.now(UTC).isoformat(timespec="seconds"), repair=repair, tell=tell
+            opened,
+            scene_id,
+            when=datetime.now(UTC).isoformat(timespec="seconds"),
+            repair=repair,
+            on_progress=on_progress,
         )
     show_store.check(report, as_json)
     sys.exit(report.exit_code)

@@ -1,8 +1,8 @@
-"""The verbs of the command line: entry points of the group `photonfarm.commands`, each imported only when asked for.
+"""The verbs of the command line: entry points of the group `photonfarm.commands`, each imported only when it is used.
 
-The entry point "report" is the verb `photonfarm report`, and "report.stability" a subcommand of it, whichever
-distribution has the verb itself: a verb that runs by itself keeps doing so, and one whose distribution is not installed
-becomes a bare group.
+The entry point "report" is the verb `photonfarm report`, and "report.stability" is a subcommand of it, even if another
+distribution provides the verb. A verb that is a command of its own stays one; a verb whose distribution is not
+installed becomes a group without a command.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import click
 from photonfarm.shared.core.commands import GROUP
 
 _BARE = {"store": "Look into the sample store, check it, and mend it."}
-"""The help of groups that are no verbs themselves."""
+"""The help texts of groups that are not verbs themselves."""
 
 
 @cache
@@ -71,7 +71,7 @@ class Extended(click.Group):
 
 
 def _unless_below(own: click.Command) -> Any:
-    """The verb's own callback, for when no subcommand follows; its options before one would do nothing."""
+    """The verb's own callback, used when no subcommand follows; it refuses options that stand before a subcommand."""
 
     @click.pass_context
     def run(ctx: click.Context, /, **options: Any) -> Any:
@@ -88,7 +88,7 @@ def _unless_below(own: click.Command) -> Any:
 
 
 def options_by_command(umbrella: click.Group) -> dict[str, dict[str, str]]:
-    """For each verb, and each subcommand as "verb.subcommand", its options: as written, without dashes → parameters."""
+    """The options of each verb, and of each subcommand as "verb.subcommand": names without dashes → parameters."""
     return {
         name: {
             flag.lstrip("-"): str(option.name)

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import StoreError, store_errors
 
 _DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
-"""What reading raises of files that are no such archive."""
+"""The errors that reading raises for a file that is not such an archive."""
 
 
 def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-    """Store arrays by name; `what` they are, messages say. Raises StoreError where the disk refuses."""
+    """Store arrays by name; messages call them `what`. Raises StoreError if the disk refuses."""
     part = file.with_suffix(".partial.npz")
     with store_errors(f"write the {what}", file):
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -28,11 +28,11 @@ def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> N
 
 @contextmanager
 def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
-    """The arrays of a file by name, each read when it is asked for.
+    """The arrays of a file by name, each read at its first use.
 
-    Raises StoreError where there is no such file, it cannot be read, or it is damaged, and where what is made of the
-    arrays inside the `with` raises KeyError, IndexError, TypeError or ValueError; the message names `what` it should
-    hold, and the `verb` that writes it.
+    Raises StoreError if the file is missing, unreadable or damaged, and if the code inside the `with` raises KeyError,
+    IndexError, TypeError or ValueError on its arrays; the message names `what` the file should hold, and the `verb`
+    that writes it.
     """
     try:
         with file.open("rb") as archive, np.load(archive, allow_pickle=False) as stored:  # it leaves damaged ones open

@@ -1,4 +1,4 @@
-"""Verbs of `photonfarm` as processes of their own, whichever distribution they are from."""
+"""Verbs of `photonfarm` as child processes, whichever distribution provides them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ GROUP = "photonfarm.commands"
 
 
 def is_installed(name: str) -> bool:
-    """Whether a verb such as "buffers" or "scene.cost" is there, of whichever service."""
+    """Whether a verb such as "buffers" or "scene.cost" is installed, by any service."""
     return bool(entry_points(group=GROUP, name=name))
 
 
 def command(*arguments: str | Path) -> list[str]:
-    """A verb with its arguments, to be run as a process of its own: by this Python, whatever is on PATH."""
+    """The command line of a verb with its arguments, for a child process: this Python runs it, whatever is on PATH."""
     return [sys.executable, "-m", "photonfarm.shared.cli", *map(str, arguments)]

@@ -66,7 +66,7 @@ class IncompleteError(PhotonfarmError):
 
 @contextlib.contextmanager
 def store_errors(doing: str, where: str | Path) -> Iterator[None]:
-    """Turn what the operating system refuses into a StoreError that says what failed, where and why."""
+    """Turn an OSError into a StoreError that names what failed, where and why."""
     try:
         yield
     except StoreError:

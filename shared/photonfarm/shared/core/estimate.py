@@ -1,7 +1,7 @@
-"""Errors of a prediction against noisy targets, with the noise taken out exactly.
+"""Unbiased errors of a prediction against noisy targets: the targets' noise adds nothing in expectation.
 
 Every sample carries two independent, unbiased half-estimates A and B of one clean image I [ours]. Their noise is
-independent, so its product vanishes in expectation: what remains is the error against I, which nobody rendered.
+independent, so its product vanishes in expectation: what remains is the error against I, which is never rendered.
 Arrays are (..., H, W, 3); values are linear radiance (exposed or not), never clipped.
 """
 
@@ -21,7 +21,7 @@ class Estimate:
     """A mean and its standard error, from `count` independent samples; `group_means` makes dependent ones so."""
 
     mean: float
-    standard_error: float | None  # unknown of one sample
+    standard_error: float | None  # None from a single sample
     count: int
 
     @classmethod
@@ -35,7 +35,7 @@ class Estimate:
 
 
 def stated(mean: float, standard_error: float | None) -> str:
-    """An estimate in words: "0.12345 ± 0.00678", without the latter where it is unknown; a vast one in few digits."""
+    """An estimate in words: "0.12345 ± 0.00678", without the error if it is None; large numbers get few digits."""
     values = [mean] if standard_error is None else [mean, standard_error]
     return " ± ".join(f"{value:.5f}" if abs(value) < 1e5 else f"{value:.3g}" for value in values)
 

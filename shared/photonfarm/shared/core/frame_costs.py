@@ -1,7 +1,7 @@
 """What the parts of one frame cost on a machine, and what kind of surface each pixel shows, as one file.
 
-The renderer measures and writes it, and reports read it, where no renderer may be. Shape letters: N rows of the store,
-H W image, T timed frames, K sizes of image.
+The renderer measures and writes it; reports read it without a renderer. Shape letters: N rows of the store, H W image,
+T timed frames, K sizes of image.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class Seconds:
     """Wall time of a piece of work that was timed several times."""
 
     median: float
-    low: float  # below it are 10 % of the times, as far as so few tell
-    high: float  # above it are 10 %
+    low: float  # the 10th percentile
+    high: float  # the 90th percentile
 
     @classmethod
     def of(cls, times: NDArray[np.float64]) -> Self:
-        """Of some times, (T,); raises ValueError where there is none."""
+        """The median and percentiles of some times, (T,); raises ValueError if there are none."""
         if not len(times):
             raise ValueError("times is empty; a median needs at least one")
         low, median, high = np.quantile(times, (0.1, 0.5, 0.9)).tolist()
@@ -47,7 +47,7 @@ class Seconds:
 
 
 class Surface(IntEnum):
-    """The first surface that a ray meets between the near and the far plane, by how it scatters."""
+    """The kinds of first surface that a ray meets between the near and the far plane, by how they scatter."""
 
     NOTHING = 0  # there is none
     DIFFUSE = 1  # diffuse lobes only; also behind a mask
@@ -58,9 +58,9 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCosts:
-    """Seconds of wall time on one core, for each of some timed frames; and the first surfaces of some rows.
+    """Wall-clock seconds on one core for each timed frame, and the first surfaces of some rows.
 
-    Raises ValueError for arrays of other shapes or types than these, empty ones, and kinds that are no `Surface`.
+    Raises ValueError for arrays of other shapes or types than these, empty ones, and kinds that are not a `Surface`.
     """
 
     scene_id: str
@@ -68,10 +68,10 @@ class FrameCosts:
     surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
     edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
     buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal
-    guides_s: NDArray[np.float64]  # (T,) what is known of the view beside them, direct light above all
-    points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first, as modified, the view sees
-    photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without, as the next
-    photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees
+    guides_s: NDArray[np.float64]  # (T,) the view's guides, mainly direct light
+    points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first ones, the view sees
+    photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without photons
+    photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees; 0 likewise
     kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels
     render_s: NDArray[np.float64]  # (K, T) one half-estimate of it: `half_spp` samples of each of these pixels
 
@@ -89,11 +89,11 @@ class FrameCosts:
             raise ValueError(f"surface: holds {self.surface.max()}; kinds up to {max(Surface)} are allowed")
 
     def parts(self) -> dict[str, Seconds]:
-        """Of each part of a frame by its name in `PARTS`, over the timed frames."""
+        """The times of each part of a frame, by its name in `PARTS`, over the timed frames."""
         return {name: Seconds.of(getattr(self, name)) for name in PARTS}
 
     def renders(self) -> dict[int, Seconds]:
-        """Of a half-estimate of 1/k of the pixels by k, over the timed frames."""
+        """The times of a half-estimate of 1/k of the pixels, by k, over the timed frames."""
         return {k: Seconds.of(times) for k, times in zip(self.kept.tolist(), self.render_s, strict=True)}
 
     def medians(self) -> dict[str, float]:
@@ -105,12 +105,12 @@ class FrameCosts:
         return {k: render.median for k, render in self.renders().items()}
 
     def write(self, file: Path) -> None:
-        """Store them as a NumPy archive, whole or not at all; raises StoreError where the disk refuses."""
+        """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         write_arrays(file, {"scene_id": np.array(self.scene_id), **arrays}, "frame costs")
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """What `write` has stored; raises StoreError for anything else."""
+        """Read what `write` stored; raises StoreError for anything else."""
         with stored_arrays(file, "frame costs", "measure-frames") as stored:
             return cls(str(stored["scene_id"]), **{name: stored[name] for name in _ARRAYS})

@@ -1,4 +1,4 @@
-"""Processes that end with the one that started them or when asked to, and where the number of one means something."""
+"""Child processes that end with their parent, requests to stop, and the scope of process numbers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 def tied(command: Sequence[str]) -> list[str]:
-    """The command, to be started by the main thread: on Linux it gets SIGTERM when we end, however we do."""
+    """The command wrapped so that on Linux it gets SIGTERM however this process ends; the main thread must start it."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
 
 
@@ -30,7 +30,7 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-NAP_S = 0.1  # at the longest, until a `Stop` is noticed
+NAP_S = 0.1  # the longest delay until a `Stop` is noticed
 
 
 class Stop:
@@ -44,15 +44,15 @@ class Stop:
         self._is_set = False
 
     def set(self) -> None:
-        """Ask to stop."""
+        """Request a stop."""
         self._is_set = True
 
     def is_set(self) -> bool:
-        """Whether somebody has."""
+        """Whether a stop has been requested."""
         return self._is_set
 
     def wait(self, seconds: float) -> bool:
-        """Wait for it so long at most; whether somebody has asked."""
+        """Wait at most so many seconds for the request; returns whether there is one."""
         end = time.monotonic() + seconds
         while not self._is_set and (left := end - time.monotonic()) > 0:
             time.sleep(min(left, NAP_S))
@@ -61,7 +61,7 @@ class Stop:
 
 @cache
 def process_space() -> str:
-    """Where process numbers mean what they mean here: containers may share a host's name, but not its processes."""
+    """The scope in which process numbers are unique: containers may share a host's name, but not its processes."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text()[:8]
         space = f"{boot}{Path('/proc/self/ns/pid').stat().st_ino:x}"

@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 F32: TypeAlias = NDArray[np.float32]
 
 LIT_POINTS = 1024
-"""Points of the base cloud, its first, whose direct irradiance is among the guides of a view; all of a smaller one."""
+"""The number of points, the first of the base cloud, whose direct irradiance is stored among a view's guides.
+
+A smaller cloud has all its points there.
+"""
 
 STATIC = -1
 """The group index of what never moves."""
@@ -51,9 +54,9 @@ class BasePointCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewBuffers:
-    """What rays through each pixel meet first: one through its centre, and for albedo a grid of them; free of noise.
+    """The first hits of rays through each pixel, free of noise: of one through its centre, for albedo of a grid.
 
-    Zero where they meet nothing.
+    Values are zero where the rays meet nothing.
     """
 
     depth: F32  # (H, W) along the camera's forward axis; hit point = origin + ray · depth / (ray · forward)
@@ -63,18 +66,18 @@ class ViewBuffers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guides:
-    """What is known of a view before anything is learned: means over each pixel, of a grid of rays.
+    """The guides of a view, which are known before any learning: means over a grid of rays through each pixel.
 
     Pure mirrors, glass and null surfaces are followed, along their stronger lobe, to the first surface that scatters
     otherwise: `throughput` is the product of what they let through, and `beyond_*` describes that surface. All four are
     zero where a pixel's first surface scatters by itself. `direct`, `gloss` and `point_light` are noisy; they have
-    seeds of their own, so that they are independent of the radiance of every sample. Zero where a ray meets nothing,
-    but for the emission of environments.
+    seeds of their own, so that they are independent of the radiance of every sample. All are zero where a ray meets
+    nothing, except the emission of environments.
     """
 
     emission: F32  # (H, W, 3) radiance emitted towards the eye, also by what is seen in mirrors and through glass
-    direct: F32  # (H, W, 3) radiance of the diffuse reflection of what lights send directly, likewise
-    gloss: F32  # (H, W, 3) … of its reflection by all other lobes; with `direct` the whole, so that it may be below 0
+    direct: F32  # (H, W, 3) direct light reflected diffusely towards the eye, also in mirrors and through glass
+    gloss: F32  # (H, W, 3) direct light reflected by all other lobes: the whole minus `direct`; it may be below 0
     specular: F32  # (H, W, 3) directional albedo of all lobes but the diffuse one, at least 0
     roughness: F32  # (H, W) microfacet α of the surface: 0 for mirrors and glass, 1 for diffuse surfaces
     mean_depth: F32  # (H, W) along the camera's forward axis
@@ -83,7 +86,7 @@ class Guides:
     beyond_albedo: F32  # (H, W, 3) diffuse reflectance
     beyond_normal: F32  # (H, W, 3) as `mean_normal`, turned to where the path comes from
     beyond_depth: F32  # (H, W) length of the path from the eye, scene units
-    point_light: F32  # (L, 3) irradiance of the cloud's first points by what lights send directly, on the normal's side
+    point_light: F32  # (L, 3) direct irradiance of the cloud's first points, on the normal's side
 
 
 @dataclass(frozen=True, slots=True, eq=False)

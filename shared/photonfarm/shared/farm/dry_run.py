@@ -1,4 +1,4 @@
-"""What a request would plan, store and cost, and what would be learned more from at that cost; nothing is written."""
+"""What a request would plan, store and cost, and how the same cost would be spent best; nothing is written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.processes import usable_cores
 from photonfarm.shared.farm.submission import Submission
-from photonfarm.shared.plan.allocation import Allocation, Terms
+from photonfarm.shared.plan.allocation import Allocation, CostModel
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
@@ -22,31 +22,31 @@ from photonfarm.shared.store.io.storage import is_vacant
 VERB = ("scene", "cost")  # of the renderer
 
 WORTH_A_CHANGE = 0.05
-"""Share of the excess error that a suggestion must save: costs and noise are medians of a few views."""
+"""The share of the excess error that a suggestion must save: costs and noise are medians of a few views."""
 
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """Settings of a spec and a request that should teach more than those asked for, at their cost."""
+    """A `half_spp` and a request with less predicted error than the user's, at the same cost."""
 
     half_spp: int
     modifications: int | None  # None of a static scene, as its views are all that there is to choose
-    views: int | None  # of each configuration; None of a static scene
-    samples: int  # of one pass each
+    views: int | None  # None in a static scene, which has only views to choose
+    samples: int  # in all, of one pass each
 
 
 @dataclass(frozen=True, slots=True)
 class DryRun(Submission):
-    """What would become of a request. What follows from a measurement is None where there is none."""
+    """What a request would do. Fields that follow from measured costs are None without them."""
 
     extent: Extent = field(kw_only=True)
     size_bytes: int = field(kw_only=True)  # before compression
     cores: int = field(kw_only=True)  # of this machine, as far as this process may use them
     costs: SampleCosts | None = field(default=None, kw_only=True)
-    core_s: float | None = field(default=None, kw_only=True)  # of rendering what would be planned
+    core_s: float | None = field(default=None, kw_only=True)  # to render what would be planned
     wall_s: float | None = field(default=None, kw_only=True)  # with a worker on each of the cores
-    reduction: float | None = field(default=None, kw_only=True)  # of the excess error by the best of the same cost
-    suggestion: Suggestion | None = field(default=None, kw_only=True)  # that one, if it is worth a change
+    reduction: float | None = field(default=None, kw_only=True)  # of the excess error, by the best of the same cost
+    suggestion: Suggestion | None = field(default=None, kw_only=True)  # that allocation, if it is worth a change
 
 
 def rehearse(
@@ -55,18 +55,18 @@ def rehearse(
     request: Request,
     *,
     measure: bool,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
     shard_rows: int | None = None,
 ) -> DryRun:
-    """What `submission.submit` would plan; with `measure`, also what it costs, and whether that is well spent.
+    """What `submission.submit` would plan; with `measure`, also its cost, and how the same cost would be spent best.
 
-    `tell` is told why nothing is known of the cost. Raises SpecError and StoreError as `submit` does.
+    `log` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
     loaded = load_spec(spec)
     found = _counted(loaded, request, store, shard_rows)
     costs = measured_costs(spec) if measure and found.planned else None
     if isinstance(costs, str):
-        tell(f"cost and time are not known: {costs}")
+        log(f"cost and time are not known: {costs}")
     return with_costs(found, loaded, request, costs) if isinstance(costs, SampleCosts) else found
 
 
@@ -83,7 +83,10 @@ def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: 
 
 
 def measured_costs(spec: str) -> SampleCosts | str:
-    """What the renderer measures of a spec, or has measured before; or why it does not: what it said is on stderr."""
+    """The costs that the renderer measures for a spec, or has kept; else the reason why there are none.
+
+    The renderer's own messages go to stderr.
+    """
     name = " ".join(VERB)
     if not is_installed(".".join(VERB)):
         return "the renderer, which measures them, is not installed here"
@@ -99,8 +102,8 @@ def measured_costs(spec: str) -> SampleCosts | str:
 def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
     """What would be planned, with its cost, and the suggestion.
 
-    There is none where samples of the request are planned already: another half_spp would be another scene, and
-    render all of them again.
+    There is no suggestion if some samples of the request are planned already: another half_spp makes another scene, in
+    which all of them would be rendered again.
     """
     of, spp = found.extent, 2 * spec.transport.half_spp
     core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
@@ -113,8 +116,8 @@ def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCos
 
 
 def _best(spec: SceneSpec, wanted: Request, costs: SampleCosts) -> tuple[float, Allocation]:
-    """The share of the excess error that the best allocation of the request's cost saves, at least 0, and that one."""
-    terms = Terms.of(costs, static=not spec.groups)
+    """The best allocation of the request's cost, after the share of the excess error that it saves, at least 0."""
+    terms = CostModel.of(costs, static=not spec.groups)
     spp = 2 * spec.transport.half_spp
     asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
     if not spec.groups:

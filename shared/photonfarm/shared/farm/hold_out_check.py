@@ -1,4 +1,4 @@
-"""Whether a request leaves something to train on and something to validate on, asked before anything is rendered."""
+"""Whether a request leaves something to train on and something to validate on, checked before anything is rendered."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import SHARD_ROWS, Known, PlannedRows, Request, expand
+from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.plan.sampling import modification_keys, view_keys
 from photonfarm.shared.scene.modification import rest
 from photonfarm.shared.scene.spec import SceneSpec
@@ -19,9 +19,9 @@ from photonfarm.shared.store.io.storage import is_vacant
 
 
 def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Request) -> None:
-    """Raise SpecError if of all that is planned or requested nothing or everything would be held out.
+    """Raise SpecError if nothing or everything of what is planned and requested would be held out.
 
-    Nothing is written. The trainer finds the same, but only once all is rendered.
+    Nothing is written. The trainer checks the same, but only after everything is rendered.
     """
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
@@ -39,7 +39,7 @@ def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> Iterator[Pl
     """The rows of a scene's plans, and those of a request."""
     if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
         yield from (plan.rows for plan in opened.scene(spec.scene_id).plans())
-    new = expand(spec, wanted, Known(), first_job=0, shard_rows=SHARD_ROWS).rows
+    new = expand(spec, wanted, PlannedContent(), first_job=0, shard_rows=SHARD_ROWS).rows
     if new is not None:
         yield new
 

@@ -29,7 +29,7 @@ STOP_S = 20.0
 class EmbeddedRedis:
     """A context manager: a Redis server on a Unix socket, without a TCP port, whose data lie in a folder.
 
-    Started again on the same folder it goes on with what it had, but for the last second before a crash. On Linux it
+    A server started again on the same folder has its old data, except for the last second before a crash. On Linux it
     also ends when the thread that started it does. `url` stays the same for a folder.
     """
 
@@ -51,7 +51,7 @@ class EmbeddedRedis:
 
     @property
     def pid(self) -> int | None:
-        """The server's process; None if it does not run."""
+        """The server's process number; None if it does not run."""
         return self._process.pid if self._process else None
 
     def __enter__(self) -> Self:
@@ -76,12 +76,12 @@ class EmbeddedRedis:
         self.stop()
 
     def keep_running(self) -> None:
-        """Start the server again if it has ended; what it held is there again, but for its last second."""
+        """Start the server again if it has ended; its data are restored, except for the last second."""
         if self._process is not None and self._lock is not None and self._process.poll() is not None:
             self._wait_for_answer(self._start(self._lock))
 
     def stop(self) -> None:
-        """Ask our own server to end, which writes what it holds, and wait for it."""
+        """Stop our own server, which first writes its data, and wait for it."""
         if self._process is not None:
             self._process.terminate()
             try:

@@ -1,4 +1,4 @@
-"""From a spec's name and a few numbers to planned and queued samples."""
+"""Plan and queue samples, given a spec's name and a few numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from photonfarm.shared.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Submission:
-    """What became of a request."""
+    """The outcome of a request."""
 
     scene_id: str
     plan: int | None  # number of the new plan; None if nothing was new or nothing was written
@@ -29,10 +29,10 @@ class Submission:
 
 @dataclass(frozen=True, slots=True)
 class TopUpSubmission(Submission):
-    """What became of a top-up."""
+    """The outcome of a top-up."""
 
     spp_per_pass: int = field(kw_only=True)  # samples per pixel of one pass, both halves together
-    passes: int = field(kw_only=True)  # how many passes the samples per pixel are that were asked for, rounded up
+    passes: int = field(kw_only=True)  # the requested samples per pixel as passes, rounded up
 
 
 def submit(
@@ -44,10 +44,10 @@ def submit(
     retry: bool = False,
     shard_rows: int | None = None,
 ) -> Submission:
-    """Plan what is new of a request, and queue all that is missing of the store unless `redis_url` is None.
+    """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
-    Jobs that have failed are tried again; those that were set aside as well with `retry`.
-    Raises SpecError, StoreError, or QueueError; the plan is kept then, and idle workers queue it later.
+    Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
+    QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     loaded = load_spec(spec)
     opened = Store(store, create=True)
@@ -68,7 +68,7 @@ def top_up(
     retry: bool = False,
     dry_run: bool = False,
 ) -> TopUpSubmission:
-    """Plan more passes of what is planned, and queue all that is missing of the store unless `redis_url` is None.
+    """Plan more passes of planned views, and queue every missing job of the store unless `redis_url` is None.
 
     `spp` and `where` are as `TopUp.of` takes them. Raises what `submit` does.
     """
@@ -102,10 +102,10 @@ def queue_missing(
     stored: str = "The plan is stored",
     verb: str = "submits",
 ) -> int:
-    """Queue all that is missing of a store, or of one scene; how many jobs that were.
+    """Queue every missing job of a store, or of one scene; returns how many.
 
-    Jobs that have failed are tried again; those that were set aside as well with `retry`. Raises QueueError, which says
-    what is `stored` nevertheless, and what --no-queue {verb} without Redis.
+    Failed jobs are queued again; with `retry` also those that were set aside. Raises QueueError; its message says what
+    is `stored` nevertheless, and that --no-queue {verb} without Redis.
     """
     try:
         connection = queue.connect(redis_url)

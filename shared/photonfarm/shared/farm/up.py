@@ -30,13 +30,13 @@ from photonfarm.shared.scene.spec import SCENES_VARIABLE, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5
-PLAIN_LINE_S = 15.0  # between lines where there is no terminal to draw bars on
-STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives us 10 s
-AT_ONCE_S = 1.0  # for them to end when asked again, which is in the middle of a job
+PLAIN_LINE_S = 15.0  # between progress lines where there is no terminal for bars
+STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives this one 10 s
+AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
 
 Process = subprocess.Popen[bytes]
 Count = tuple[int, int]
-"""How many are committed, and how many planned."""
+"""The number committed, and the number planned."""
 
 
 def run_farm(
@@ -55,12 +55,12 @@ def run_farm(
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
-    So many of the first views that are held out get `reference_spp` samples per pixel, and the report shows and
-    measures networks against them.
+    The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
+    with them.
 
-    What the trainer would refuse is refused before anything is written: SpecError for a hold-out that leaves one side
-    empty, click's UsageError for settings. Started again after any interruption it goes on where it was, as the store
-    and the trainer's checkpoints last.
+    Settings that the trainer would refuse are refused before anything is written: SpecError for a hold-out that leaves
+    one side empty, click's UsageError for the others. After any interruption the same call resumes, as the store and
+    the trainer's checkpoints remain.
     """
     training = ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
     if train_steps:
@@ -100,7 +100,7 @@ def run_farm(
                     beside = ["--references", folder]
                 _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
         except IncompleteError:
-            _call(preview, environment)  # what has been rendered can still be looked at
+            _call(preview, environment)  # the samples rendered so far can still be looked at
             raise
         _call(preview, environment)
 
@@ -118,7 +118,7 @@ def _check_arguments(arguments: list[str]) -> None:
 
 @contextmanager
 def _unwound_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM end us as Ctrl-C does, so that what we started is stopped."""
+    """Let SIGTERM raise as Ctrl-C does, so that the child processes are stopped."""
     before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         yield
@@ -127,7 +127,7 @@ def _unwound_by_sigterm() -> Iterator[None]:
 
 
 def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]:
-    """What our processes are told; also the folder of the spec, where its scene file may lie."""
+    """The environment of the child processes; it adds the spec's folder, where its scene file may lie."""
     scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
     told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
     return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
@@ -143,7 +143,7 @@ def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
 def _processes(
     verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, console: Console
 ) -> Iterator[dict[str, Process]]:
-    """Each verb as a process of its own; on the way out all are asked to stop at once, and waited for together."""
+    """Run each verb as a process of its own; at the end all are asked to stop at once, and waited for together."""
     running: dict[str, Process] = {}
     try:
         for name, verb in verbs.items():
@@ -166,7 +166,7 @@ def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> P
 
 
 def _stop(processes: list[Process]) -> None:
-    """End them gracefully, or less so after STOP_S or at a second Ctrl-C or SIGTERM; none is left."""
+    """Stop all processes: gracefully at first, forcibly after STOP_S or at a second Ctrl-C or SIGTERM."""
     try:
         _ask(processes, STOP_S)
     finally:
@@ -187,7 +187,7 @@ def _ask(processes: list[Process], seconds: float) -> None:
 
 
 class _Farm:
-    """Where rendering and training are, as their files say."""
+    """The progress of rendering and training, read from their files."""
 
     def __init__(self, scene: SceneStore, run: Path, steps: int) -> None:
         self.scene = scene
@@ -197,7 +197,7 @@ class _Farm:
         self.note = ""
 
     def look(self) -> tuple[Count, Count]:
-        """Samples by now, and further passes of their views; `step` and `note` follow the trainer's log."""
+        """Count the samples and the further passes of their views; updates `step` and `note` from the trainer's log."""
         for record in self._records():
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
@@ -207,7 +207,7 @@ class _Farm:
         return (found.committed_samples - passes[0], found.planned_samples - passes[1]), passes
 
     def _records(self) -> list[dict[str, Any]]:
-        """The trainer's log as it is now; read whole, since a trainer that resumes takes back what it will redo."""
+        """The trainer's log, read whole each time, as a trainer that resumes removes the records it will repeat."""
         path = self.run / "metrics.jsonl"
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
         return [json.loads(line) for line in lines if line.endswith("\n")]
@@ -241,7 +241,7 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, co
 
 
 def _line(farm: _Farm, samples: Count, passes: Count) -> str:
-    """How far it is, in words."""
+    """The progress in words."""
     further = f"  further passes {passes[0]}/{passes[1]}" if passes[1] else ""
     return f"samples {samples[0]}/{samples[1]}{further}  steps {farm.step}/{farm.steps}{farm.note}"
 

@@ -1,7 +1,7 @@
 """`photonfarm store upgrade`: scenes of older stores get guides, and no sample is rendered again.
 
-All that is written here is one small file for each scene, which asks for guides; workers render them, as jobs that are
-missing. So an upgrade may be broken off anywhere, and asked for again.
+The upgrade writes only one small file for each scene, which requests guides; workers render them as missing jobs. So it
+may be interrupted at any point, and repeated.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from photonfarm.shared.store.write.status import scene_status
 
 @dataclass(frozen=True, slots=True)
 class SceneUpgrade:
-    """How far the guides of one scene are."""
+    """The progress of one scene's guides."""
 
     scene_id: str
     name: str
-    asked: bool  # they were asked for now, or would be; False: before
-    light_samples: int  # that they are rendered with
+    asked: bool  # requested now, or would be; False: requested before
+    light_samples: int  # of the settings that they are rendered with
     views: int  # planned
-    views_lacking: int  # of these, those without guides
-    jobs_lacking: int  # to render for them
+    views_lacking: int  # the planned views without guides
+    jobs_lacking: int  # jobs to render for these views
     bytes_per_sample: float | None  # of what is stored, without guides; None while no sample is complete
     guide_bytes_per_sample: float  # that guides of all views add, at most
 
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """What became of an upgrade."""
+    """The outcome of an upgrade."""
 
     scenes: tuple[SceneUpgrade, ...]
     queued: int | None  # jobs queued, with those that were missing before; None: not queued
@@ -52,11 +52,11 @@ def upgrade(
     light_samples: int | None = None,
     dry_run: bool = False,
 ) -> Upgrade:
-    """Ask for guides of every scene of a store, or of one, and queue what is missing unless `redis_url` is None.
+    """Request guides for every scene of a store, or for one, and queue missing jobs unless `redis_url` is None.
 
-    A scene that has guides keeps the settings that it has. Damage of one scene concerns no other. Raises SpecError for
-    a number of light samples that cannot be, StoreError for a store or the one scene that cannot be read, and
-    QueueError; guides are asked for then, and idle workers queue them later.
+    A scene whose guides were requested before keeps its settings. Damage of one scene does not affect the others.
+    Raises SpecError for an invalid number of light samples, StoreError for a store or the one scene that cannot be
+    read, and QueueError; in the last case the request is kept, and idle workers queue the jobs later.
     """
     wanted, opened = _wanted(light_samples), Store(store)
     scene_id = None if scene is None else scene_named(opened, scene)
@@ -80,7 +80,7 @@ def _wanted(light_samples: int | None) -> GuideSpec:
 
 
 def _scene_upgrade(scene: SceneStore, wanted: GuideSpec, *, dry_run: bool) -> SceneUpgrade:
-    """Ask for guides unless the scene has been asked; how far they are."""
+    """Request guides unless they were requested before; returns their progress."""
     asked = scene.guides.settings() is None if dry_run else scene.guides.ask(wanted)
     settings = scene.guides.settings() or wanted
     status, found = scene_status(scene), scene.plans()

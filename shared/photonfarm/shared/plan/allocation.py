@@ -34,19 +34,20 @@ from photonfarm.shared.plan.sample_costs import SampleCosts
 
 KAPPA = 0.34
 """κ, how much of the noise the network averages away over pixels and views: fitted to `light_transport`, preset
-`small`, in two rooms by bench/noise_budget.py. Its 95 % range is 1.6 and less, down to the end of what was searched.
+`small`, in two rooms by bench/studies/noise_budget.py. Its 95 % range is 1.6 and less, down to the end of what was
+searched.
 """
 
 RHO = 1.8
 """ρ, how much configurations differ beside what their views show: fitted with κ; its range is 0.43 … 8.7."""
 
 MOST_SPP, MOST_VIEWS = 1024, 16
-"""Of what `Terms.best` looks at."""
+"""The largest samples per pixel and views per configuration that `CostModel.best` considers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Allocation:
-    """Samples of a scene: how many of what, and how many samples per pixel of each."""
+    """A number of configurations, of views and passes of each, and of samples per pixel."""
 
     modifications: int  # configurations, M
     views: int  # of each configuration, V
@@ -55,46 +56,46 @@ class Allocation:
 
     @property
     def samples(self) -> int:
-        """How many it has."""
+        """The number of samples."""
         return self.modifications * self.views * self.passes
 
 
 def seconds(costs: SampleCosts, of: Allocation) -> float:
-    """Core-seconds of an allocation."""
+    """The core-seconds of an allocation."""
     views = of.modifications * of.views
     return costs.seconds(of.spp, configurations=of.modifications, views=views, samples=views * of.passes)
 
 
 def excess(noise: float, of: Allocation, *, kappa: float = KAPPA, rho: float = RHO) -> float:
-    """The excess of the held-out error, in the module's units, by the relative `noise` of one sample per pixel."""
+    """The excess of the held-out error in the module's units; `noise`: relative variance at 1 sample per pixel."""
     of_view = 1 + noise / (kappa * of.passes * of.spp)
     return (rho + of_view / of.views) / of.modifications
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
-    """What samples of a scene cost, and what its held-out error is taken to follow from."""
+class CostModel:
+    """The costs of a scene's samples, and the constants of its predicted error."""
 
     costs: SampleCosts
     kappa: float = KAPPA
     rho: float = RHO
-    most_views: int = MOST_VIEWS  # of a configuration that `best` looks at
+    most_views: int = MOST_VIEWS  # per configuration, that `best` considers
 
     @classmethod
     def of(cls, costs: SampleCosts, *, static: bool) -> Self:
-        """Those of a scene that was measured.
+        """The terms of a scene whose costs were measured.
 
-        A static scene has one configuration, paid for once and no source of error: its views are what is drawn first,
-        and stand in an allocation as configurations of one view.
+        A static scene has one configuration, which is paid for once and is no source of error: its views are the first
+        stage, and stand in an allocation as configurations of one view.
         """
         return cls(replace(costs, configuration_s=0.0), rho=0.0, most_views=1) if static else cls(costs)
 
     def seconds(self, of: Allocation) -> float:
-        """Core-seconds of an allocation."""
+        """The core-seconds of an allocation."""
         return seconds(self.costs, of)
 
     def excess(self, of: Allocation) -> float:
-        """The excess of its held-out error."""
+        """The predicted excess of the held-out error."""
         return excess(self.costs.relative_variance, of, kappa=self.kappa, rho=self.rho)
 
     def best_spp(self, views: int, passes: int = 1) -> float:
@@ -110,10 +111,10 @@ class Terms:
         return math.sqrt(gained / paid) / passes if paid else math.inf
 
     def best(self, budget_s: float) -> Allocation:
-        """The allocation of least excess that a budget of core-seconds pays for, of those that `_affordable` names.
+        """The allocation of least excess within a budget of core-seconds, among those of `_affordable`.
 
-        Of equals it is the one of fewer views, then of fewer samples per pixel. Raises ValueError for a budget that
-        pays for none.
+        Of equal ones, that with fewer views is taken, then that with fewer samples per pixel. Raises ValueError if the
+        budget pays for none.
         """
         found = list(self._affordable(budget_s))
         if not found:
@@ -121,10 +122,10 @@ class Terms:
         return min(found, key=self.excess)
 
     def _affordable(self, budget_s: float) -> Iterator[Allocation]:
-        """One pass of 2, 4, 8 … 1024 spp of each number of views, of as many configurations as the budget pays for."""
+        """One pass of 2, 4, 8 … 1024 spp for each number of views, of as many configurations as the budget pays for."""
         for views in range(1, self.most_views + 1):
             for spp in (2**power for power in range(1, MOST_SPP.bit_length())):
                 one = self.seconds(Allocation(1, views, 1, spp))
-                count = int(budget_s / one * (1 + 1e-9)) if one else 0  # rounding must not take one of those asked for
+                count = int(budget_s / one * (1 + 1e-9)) if one else 0  # rounding must not lose one
                 if count:
                     yield Allocation(count, views, 1, spp)

@@ -3,8 +3,8 @@
 Shape letters: R rows of a plan, G movable groups. J is `shard_rows`, the samples of one job.
 
 A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
-passes of each view. Configurations that come out equal (both objects removed, say) are one modification with
-as many views more, so that no view is drawn twice and the share of each configuration among the samples stays that
+passes of each view. Configurations that come out equal (both objects removed, say) are one modification, which gets the
+views of all of them, so that no view is drawn twice and the share of each configuration among the samples stays that
 of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
 different views of it. Views that come out equal, since the spec fixes the camera, are one view: no sample is planned
 twice.
@@ -33,31 +33,31 @@ from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 
 SHARD_ROWS = 32
-"""Samples per job, where neither the caller nor an older plan of the scene says otherwise."""
+"""The default number of samples per job, if neither the caller nor an older plan of the scene sets it."""
 
 MAX_SHARD_ROWS = 4096
 MAX_SAMPLES = 10_000_000
-"""Samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
+"""The most samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
 
 UNUSED = -1
-"""A row reference of a row that holds nothing."""
+"""The reference in rows that hold nothing."""
 
 Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """What is rendered for new samples, beside themselves."""
+    """What is rendered for new samples, apart from their radiance."""
 
-    configurations: int = 0  # that they show, new or not
-    modifications: int = 0  # of them, the new ones: their photons are stored
+    configurations: int = 0  # of the samples, new or not
+    modifications: int = 0  # the new ones among them: their photons are stored
     views: int = 0  # new ones: their buffers are stored
 
 
 class Request(Frozen):
     """What to plan: modifications × views × passes, under one master seed."""
 
-    kind: Literal["samples"] = "samples"  # tells it from other requests in the store
+    kind: Literal["samples"] = "samples"  # distinguishes it from other requests in the store
     modifications: Count = 1
     views_per_modification: Count = 1
     passes: Annotated[int, Field(ge=1, le=65536)] = 1
@@ -71,11 +71,11 @@ class Request(Frozen):
 
     @property
     def samples(self) -> int:
-        """How many samples it names, planned already or not."""
+        """The number of samples it names, planned already or not."""
         return self.modifications * self.views_per_modification * self.passes
 
     def extent(self, spec: SceneSpec) -> Extent:
-        """What is rendered for it where nothing is planned, if no two of its configurations are equal."""
+        """The extent of the request in a scene without plans, if no two of its configurations are equal."""
         configurations = self.modifications if spec.groups else 1
         return Extent(configurations, configurations, self.modifications * self.views_per_modification)
 
@@ -112,8 +112,8 @@ class PlannedRows:
         )
 
 
-class Known:
-    """What the older plans of a scene hold, for lookup by content; each table is made when it is first asked for."""
+class PlannedContent:
+    """The content of a scene's older plans, for lookup; each table is built at its first use."""
 
     def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
         """Take the plans in their order, each with the number of its first row."""
@@ -160,13 +160,13 @@ def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int6
 
 
 def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[bytes]:
-    """What views (N, 6) of the modifications in some rows (N,) are looked up by."""
+    """The lookup keys of views (N, 6), given the rows (N,) of their modifications."""
     rows = modification_rows.astype("<i8").tobytes()
     return [rows[8 * i : 8 * i + 8] + view for i, view in enumerate(contents(views))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
+class SamplesToPlan:
     """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
 
     modification: F32  # (M, G, 4)
@@ -196,11 +196,11 @@ class Expansion:
     extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
 
 
-def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_job: int, shard_rows: int) -> Expansion:
     """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
 
     Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
-    the job of its first sample; so does everything that a job must render lie in the job's own rows.
+    the job of its first sample; so everything that a job must render lies in its own rows.
     """
     candidates, named = _candidates(spec, request, known)
     rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
@@ -208,8 +208,8 @@ def expand(spec: SceneSpec, request: Request, known: Known, *, first_job: int, s
     return Expansion(rows, new, named - new, candidates.extent())
 
 
-def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candidates, int]:
-    """The new samples of a request, and how many it names, known or new."""
+def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[SamplesToPlan, int]:
+    """The new samples of a request, and the number that it names, new or planned already."""
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)
     index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -223,7 +223,7 @@ def _candidates(spec: SceneSpec, request: Request, known: Known) -> tuple[Candid
     keys = sample_keys(spec.scene_id, modifications[of_view[view]], views[view], pass_)
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
-    found = Candidates(
+    found = SamplesToPlan(
         modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
     )  # fmt: skip
@@ -249,7 +249,7 @@ def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.
     return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
 
 
-def pack(candidates: Candidates, *, first_row: int, shard_rows: int) -> PlannedRows | None:
+def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> PlannedRows | None:
     """Samples as rows from `first_row` on, in their order; None if there are none."""
     count = len(candidates.sample_pass)
     if not count:

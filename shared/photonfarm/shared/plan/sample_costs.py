@@ -1,6 +1,6 @@
 """What samples of a scene cost on a machine, and how noisy they are: `photonfarm scene cost` measures it.
 
-Others read it as JSON, where no renderer may be.
+Services without a renderer read it as JSON.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.records import F32
 
 BLOCK = 8
-"""Pixels along each side of the blocks that say how bright it is around a pixel; films are divisible by it."""
+"""The side, in pixels, of the blocks over which local brightness is averaged; film sizes are divisible by it."""
 
 FLOOR = 0.1
-"""Share of an image's mean that every pixel counts as being bright at least, so that black corners do not rule."""
+"""The least brightness of a pixel, as a share of the image's mean, so that black corners do not dominate."""
 
 SECONDS = ("configuration_s", "view_s", "pass_s", "spp_s")
 
@@ -28,15 +28,16 @@ SECONDS = ("configuration_s", "view_s", "pass_s", "spp_s")
 class SampleCosts:
     """Core-seconds on one machine, and noise: medians over some views, each of a configuration of its own.
 
-    Raises ValueError for numbers that are negative or not finite. Storing is not in it, nor what a worker needs once.
+    They leave out storing samples, and what a worker does once. Raises ValueError for numbers that are negative or not
+    finite.
     """
 
     scene_id: str
     configuration_s: float  # bringing the scene into a new configuration: its points moved, its photons traced
     view_s: float  # a view's buffers and guides, and which points and photons it sees
-    pass_s: float  # a pass of a view, both halves, whatever its samples are
-    spp_s: float  # and for each sample per pixel of the whole image, of both halves together
-    relative_variance: float  # as of `relative_variance`; 0 where every view was black
+    pass_s: float  # a pass of a view, both halves, whatever its number of samples per pixel
+    spp_s: float  # each sample per pixel of the whole image, of both halves together
+    relative_variance: float  # as `relative_variance` estimates it; 0 if every view was black
     guides_s: float = 0.0  # the guides' part of `view_s`
 
     def __post_init__(self) -> None:
@@ -54,18 +55,18 @@ class SampleCosts:
         return configurations * self.configuration_s + views * self.view_s + of_samples
 
     def json(self) -> str:
-        """All of it, for `read`."""
+        """All fields as JSON, for `read`."""
         return json.dumps(asdict(self), indent=1)
 
     def line(self) -> str:
-        """All of it in words."""
+        """All fields in words."""
         times = " + ".join(f"{name.removesuffix('_s')} {getattr(self, name):.4f} s" for name in SECONDS)
         noise = f"relative variance of one sample per pixel {self.relative_variance:.3g}"
         return f"{times} × samples per pixel; guides {self.guides_s:.4f} s of a view; {noise}"
 
     @classmethod
     def read(cls, text: str | bytes) -> Self:
-        """What `json` has written; raises StoreError for anything else."""
+        """The costs that `json` wrote; raises StoreError for anything else."""
         try:
             stored = json.loads(text)
             wrong = [
@@ -88,8 +89,8 @@ def relative_variance(half_a: F32, half_b: F32, spp: float) -> float | None:
     8. (A − B)²/4 is the variance of (A + B)/2 in expectation, and `spp` times that the variance of one sample, as far
     as samples are independent; those of one half are stratified, so that it falls as they get more. It is taken
     relative to b² + (0.1 g)², b the mean of (A + B)/2 over the pixel's block of 8 × 8 and over channels, g over the
-    image, as the trainer's losses weigh errors by brightness; so any factor on radiance cancels. None of a black
-    image.
+    image, as the trainer's losses weigh errors by brightness; so any factor on radiance cancels. Returns None for a
+    black image.
     """
     a, b = half_a.astype(np.float64), half_b.astype(np.float64)
     blocks = (a.shape[0] // BLOCK, BLOCK, a.shape[1] // BLOCK, BLOCK)

@@ -22,7 +22,7 @@ F64 = NDArray[np.float64]
 U64 = NDArray[np.uint64]
 
 _AT_ONCE = 1 << 9
-"""Streams drawn from at a time: the generator's intermediate results stay in the processor's cache."""
+"""The number of streams drawn from at a time, so that intermediate results stay in the processor's cache."""
 
 
 def modification_vectors(spec: SceneSpec, seed: int, count: int) -> F32:
@@ -76,7 +76,7 @@ def view_vectors(spec: SceneSpec, modification_keys: list[Key], seed: int, indic
 
 
 def _looking_at_themselves(spec: SceneSpec, vectors: F32) -> list[int]:
-    """Views whose look-at point may be one that `sample_view` would draw again: about as near as its limit, or less."""
+    """The views whose look-at point is so near, give or take rounding, that `sample_view` may draw it again."""
     boxes = (spec.view.origin, spec.view.look_at)
     diagonal = np.linalg.norm(np.max([b.high for b in boxes], axis=0) - np.min([b.low for b in boxes], axis=0))
     apart = np.linalg.norm(vectors[:, 3:].astype(np.float64) - vectors[:, :3], axis=1)

@@ -1,8 +1,8 @@
-"""Top-up: more noisy passes of views that are planned already, which is also how reference images come about.
+"""Top-up: more noisy passes of views that are planned already; reference images are made in the same way.
 
 A pass is one more sample of a view, with 2 · `half_spp` samples per pixel in its two halves. New passes are numbered on
-from those that are planned, so that their seeds, which follow from the number, are new; buffers and photons of
-the view and its modification are those that older rows have. Whoever loses a race for the next plan counts again.
+from those that are planned, so that their seeds, which follow from the number, are new; they share the stored buffers
+and photons of the view and its modification. A process that loses the race for the next plan counts again.
 
 Shape letters: V views, S samples of all plans.
 """
@@ -21,7 +21,16 @@ from pydantic import Field, ValidationError
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import MAX_SAMPLES, UNUSED, Candidates, Expansion, Known, PlannedRows, Request, pack
+from photonfarm.shared.plan.request import (
+    MAX_SAMPLES,
+    UNUSED,
+    Expansion,
+    PlannedContent,
+    PlannedRows,
+    Request,
+    SamplesToPlan,
+    pack,
+)
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 
@@ -33,11 +42,11 @@ Mask = NDArray[np.bool_]
 
 
 class TopUp(Frozen):
-    """What to plan: so many more samples per pixel, or so many in all, for each of the selected views."""
+    """What to plan: more samples per pixel for each of the selected views, by so many or up to a total."""
 
     kind: Literal["top-up"] = "top-up"
     spp: Annotated[int, Field(ge=1, le=1 << 30)]
-    adds: bool  # True: to what is planned; False: up to `spp` in all
+    adds: bool  # True: `spp` more than is planned; False: up to `spp` in all
     where: tuple[str, ...] = ()  # conditions that a view must meet, every one
 
     @classmethod
@@ -53,12 +62,12 @@ class TopUp(Frozen):
             raise SpecError(f"the request: {'; '.join(sentences(error))}") from error
 
     def passes(self, spec: SceneSpec) -> int:
-        """How many passes `spp` is, rounded up to whole ones."""
+        """The number of passes that have `spp` samples per pixel, rounded up."""
         return -(-self.spp // spp_per_pass(spec))
 
 
 AnyRequest = Annotated[Request | TopUp, Field(discriminator="kind")]
-"""What a plan was made for."""
+"""The request that a plan was made for."""
 
 
 def spp_per_pass(spec: SceneSpec) -> int:
@@ -66,10 +75,12 @@ def spp_per_pass(spec: SceneSpec) -> int:
     return 2 * spec.transport.half_spp
 
 
-def expand_top_up(spec: SceneSpec, request: TopUp, known: Known, *, first_job: int, shard_rows: int) -> Expansion:
+def expand_top_up(
+    spec: SceneSpec, request: TopUp, known: PlannedContent, *, first_job: int, shard_rows: int
+) -> Expansion:
     """The rows of a request's new passes, by modification, view and pass, in jobs from number `first_job` on.
 
-    Raises SpecError where nothing is planned or selected, or where it would be too much for one request.
+    Raises SpecError if nothing is planned or selected, or if it is too much for one request.
     """
     planned = _Planned.of(known)
     views = np.flatnonzero(_selected(spec, request.where, planned))
@@ -84,7 +95,7 @@ def expand_top_up(spec: SceneSpec, request: TopUp, known: Known, *, first_job: i
     return Expansion(rows, int(count.sum()), int(have.sum()))
 
 
-def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> Candidates:
+def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> SamplesToPlan:
     """The next `count` passes of each of some views."""
     modification_row, of_view = np.unique(planned.modification_row[views], return_inverse=True)
     modification = planned.vectors("modification", modification_row)
@@ -93,7 +104,7 @@ def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) ->
     number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
     keys = sample_keys(spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
-    return Candidates(
+    return SamplesToPlan(
         modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
     )  # fmt: skip
@@ -103,7 +114,7 @@ def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) ->
 class _Planned:
     """The views of a scene in the order of their rows, and the samples that show them."""
 
-    plans: list[tuple[int, PlannedRows]]  # with the number of their first rows
+    plans: list[tuple[int, PlannedRows]]  # each with the number of its first row
     sample_row: Rows  # (S,)
     sample_view: Rows  # (S,) row of the view
     view_row: Rows  # (V,)
@@ -112,7 +123,7 @@ class _Planned:
     next_pass: Rows  # (V,)
 
     @classmethod
-    def of(cls, known: Known) -> _Planned:
+    def of(cls, known: PlannedContent) -> _Planned:
         """Count the passes of every view; raises SpecError if there is none."""
         if not known.plans:
             raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")
@@ -203,7 +214,7 @@ Condition = tuple[Callable[[SceneSpec, _Planned, Any, Mask], Mask], Any]
 
 
 def _parsed(condition: str) -> Condition:
-    """What finds the views of a condition, and the value that it takes; raises SpecError for any other."""
+    """The function that selects the views of a condition, and its argument; raises SpecError for an unknown one."""
     match condition.split("="):
         case ["views", value] if re.fullmatch(r"first:[1-9]\d{0,8}", value):
             return _first, int(value.removeprefix("first:"))

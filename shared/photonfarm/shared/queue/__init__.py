@@ -1,28 +1,28 @@
-"""The queue: RQ, with jobs that are nothing but their names, and `reconcile`, which fills it from the store.
+"""The queue: RQ, whose jobs are only names, and `reconcile`, which fills it from the store.
 
-Redis is disposable: every job in it can be derived again from plans and markers. And it is not trusted: whoever can
-write to it can delay jobs, and can neither run code in a worker nor change what is stored. Keys of ours, beside RQ's:
+Redis is disposable: every job in it can be derived again from plans and markers. It is also not trusted: a client that
+can write to it can delay jobs, but can neither run code in a worker nor change what is stored. Our keys, beside RQ's:
 
-    alive:<job name>                    heartbeat of a job being rendered; the value is the worker's name
-    rq:photonfarm:failed:<job name>     why a job failed; it is not queued again while this lasts
-    rq:photonfarm:failures:<job name>   how often a job has failed
-    rq:photonfarm:starts:<job name>     how often a job was started without an end
-    rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
-    rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host with the process space, the
-                                        job it renders, or -, and the process of its supervisor
-    rq:photonfarm:paused:<worker name>  why a worker takes no jobs
-    rq:photonfarm:left:<scene id>:<worker name>  why a worker leaves a scene alone
-    rq:photonfarm:store                 the id of the store that this Redis serves, while somebody works with it
-    rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
+alive:<job name>                    heartbeat of a job being rendered; the value is the worker's name
+rq:photonfarm:failed:<job name>     why a job failed; it is not queued again while this lasts
+rq:photonfarm:failures:<job name>   how often a job has failed
+rq:photonfarm:starts:<job name>     how often a job was started without reporting an end
+rq:photonfarm:overdue:<job name>    how many of these starts the deadline has ended
+rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host with the process space, the
+job it renders, or -, and the process of its supervisor
+rq:photonfarm:paused:<worker name>  why a worker takes no jobs
+rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
+rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
+rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of
-from photonfarm.shared.queue.consumption import consumed_samples, tell_consumed
+from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
 from photonfarm.shared.queue.failures import (
     FAILED,
     FAILURES_ALLOWED,
-    Cause,
     Failure,
+    FailureCause,
     causes,
     count_overdue,
     count_start,
@@ -34,7 +34,7 @@ from photonfarm.shared.queue.failures import (
     repeating_command,
 )
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
-from photonfarm.shared.queue.idle_workers import HeldUp, forget_held_up, tell_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import (
     FUNCTION,
     OVERDUE,
@@ -61,9 +61,9 @@ __all__ = [
     "SERVED",
     "STARTS",
     "WORKER",
-    "Cause",
     "Failure",
-    "HeldUp",
+    "FailureCause",
+    "IdleReports",
     "OtherStoreError",
     "QueueStatus",
     "RenderArguments",
@@ -72,13 +72,13 @@ __all__ = [
     "bury",
     "causes",
     "check_served",
+    "clear_idle_report",
     "connect",
     "consumed_samples",
     "count_overdue",
     "count_start",
     "forget_failures",
     "forget_failures_of",
-    "forget_held_up",
     "forget_starts_of",
     "free_job",
     "has_password",
@@ -93,10 +93,10 @@ __all__ = [
     "record_failure",
     "release",
     "repeating_command",
+    "report_consumed",
+    "report_idle",
     "serve",
     "take",
     "take_name",
-    "tell_consumed",
-    "tell_held_up",
     "with_password_of",
 ]

@@ -15,13 +15,13 @@ from photonfarm.shared.core.errors import QueueError
 SOCKET_TIMEOUT_S = 30
 PASSWORD_VARIABLE = "PHOTONFARM_REDIS_PASSWORD_FILE"  # noqa: S105 - the name of a variable
 USER = "photonfarm"
-"""Who a URL without a name logs in as, when its password comes from a file."""
+"""The user of a URL without a name, if the password comes from a file."""
 
 
 def connect(url: str, *, only_s: float | None = None) -> Redis:
     """A connection that has answered once; raises QueueError with a sentence if there is no Redis or it refuses us.
 
-    With `only_s`, each answer is waited for so long and once, for somebody who looks at the terminal.
+    With `only_s`, each answer is awaited once, for so many seconds: for commands that a user waits for.
     """
     shown = without_password(url)
     retry = _retry() if only_s is None else Retry(NoBackoff(), 0)
@@ -42,7 +42,7 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
 
 
 def _reason(error: Exception, url: str) -> str:
-    """Why there is no connection, and what to do where nothing answers, or for want of a name or password."""
+    """Why there is no connection, and the remedy if no server answers or the login fails."""
     if isinstance(error, redis.ConnectionError) and not isinstance(
         error, redis.AuthenticationError | redis.BusyLoadingError
     ):
@@ -70,7 +70,7 @@ def _checked(url: str) -> str:
 
 
 def _retry() -> Retry:
-    """Three tries within a second, against hiccups; longer outages are the supervisor's to wait out."""
+    """Three tries within a second, for short faults; the supervisor waits out longer outages."""
     return Retry(ExponentialBackoff(cap=0.5, base=0.1), 3)
 
 
@@ -90,9 +90,9 @@ def has_password(url: str) -> bool:
 
 
 def with_password_of(file: Path | None, url: str) -> str:
-    """A URL of a TCP port with the password in a file, unless it has one already; raises QueueError.
+    """The URL of a TCP port with the password from a file, unless the URL has one; raises QueueError.
 
-    A file is where Docker puts secrets; unlike variables it shows in no `docker inspect` and is inherited by nobody.
+    Docker stores secrets in files; unlike variables, they do not show in `docker inspect` and are not inherited.
     """
     parts = urlsplit(url)
     if file is None or parts.scheme not in ("redis", "rediss") or ":" in parts.netloc.rpartition("@")[0]:

@@ -1,6 +1,6 @@
-"""What the trainer tells the workers: how many samples of a scene it has used, so that they need not run far ahead.
+"""The trainer's reports to the workers of how many samples of a scene it has used, so that they need not run far ahead.
 
-A number that is told again and again: a Redis that loses it has it back within seconds.
+The number is counts again and again: a Redis that loses it has it back within seconds.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from photonfarm.shared.queue.untrusted import beginnings
 
 CONSUMED = "rq:photonfarm:consumed:"
 CONSUMED_TTL_S = 7 * 86400
-"""A trainer that is down for a while, or has ended, is still waited for: that is what the ratio asks for."""
+"""How long workers wait for a trainer that is down or has ended, as the ratio demands."""
 
 
-def tell_consumed(connection: Redis, scene_id: str, samples: int) -> None:
-    """Say how many samples of a scene have been used, each counted once."""
+def report_consumed(connection: Redis, scene_id: str, samples: int) -> None:
+    """Report how many samples of a scene have been used, each counted once."""
     connection.set(CONSUMED + scene_id, samples, ex=CONSUMED_TTL_S)
 
 
 def consumed_samples(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
-    """How many samples of each of these scenes its trainer has used, by what it said last; 0 if it has said nothing."""
-    told = beginnings(connection, [CONSUMED + scene_id for scene_id in scene_ids], 20)
+    """How many samples of each of these scenes its trainer has used, by its last report; 0 without one."""
+    counts = beginnings(connection, [CONSUMED + scene_id for scene_id in scene_ids], 20)
     return {
-        scene_id: int(samples) if samples.isdecimal() else 0 for scene_id, samples in zip(scene_ids, told, strict=True)
+        scene_id: int(samples) if samples.isdecimal() else 0
+        for scene_id, samples in zip(scene_ids, counts, strict=True)
     }

@@ -1,7 +1,7 @@
 """Jobs that failed: why, how often, which are set aside, and what they have in common.
 
-A failed job is left alone for an hour and tried again; one that has failed three times is set aside, until
-`photonfarm submit --retry`. A Redis that loses its memory forgets this as well: the job fails three times again then.
+A failed job is not queued for an hour and then tried again; one that has failed three times is set aside, until
+`photonfarm submit --retry`. A Redis that loses its data forgets this as well: the job then fails three times again.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ FAILED = "rq:photonfarm:failed:"
 FAILURES = "rq:photonfarm:failures:"
 
 FAILURES_ALLOWED = 3
-"""Failures of one job after which it is set aside: by then it is no accident of one worker or one hour."""
+"""The failures of one job after which it is set aside: so many are no accident of one worker or one hour."""
 
 FAILURES_TTL_S = 7 * 86400
 STARTS_TTL_S = 6 * 3600
 REASON_LETTERS = 2000
 
 _VARYING = re.compile(r"\b[0-9a-f]{8,}\b|[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
-"""What differs between failures of one cause: ids and numbers."""
+"""The parts of a message that differ between failures of one cause: ids and numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +38,11 @@ class Failure:
 
     reason: str  # the error's class and message
     times: int  # how often it has failed
-    set_aside: bool  # else it is tried again within the hour
+    set_aside: bool  # False: it is tried again within the hour
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class FailureCause:
     """Failures whose error and message are the same but for ids and numbers."""
 
     cause: str  # the message with … for what differs
@@ -56,18 +56,18 @@ class Cause:
 
 
 def record_failure(connection: Redis, name: str, reason: str) -> Failure:
-    """Leave a job alone, and say why: for a while, or for good once it has failed too often."""
+    """Record why a job failed: it is not queued for an hour, or for good once it has failed too often."""
     remove_others(connection, {FAILURES + name: "counter"})
     times = int(connection.incr(FAILURES + name))
     connection.expire(FAILURES + name, FAILURES_TTL_S)
     set_aside = times >= FAILURES_ALLOWED
-    said = printable(reason[:REASON_LETTERS])
-    connection.set(FAILED + name, said, ex=None if set_aside else FAILURE_TTL_S)
-    return Failure(said, times, set_aside)
+    text = printable(reason[:REASON_LETTERS])
+    connection.set(FAILED + name, text, ex=None if set_aside else FAILURE_TTL_S)
+    return Failure(text, times, set_aside)
 
 
 def forget_failures(connection: Redis, *, set_aside: bool) -> None:
-    """Have failed jobs queued again; those that are set aside only if asked to, which then begin anew."""
+    """Let failed jobs be queued again; with `set_aside` also those that were set aside, counted from 0 again."""
     names = sorted(failed_names(connection))
     ttls = _ttls(connection, names)
     for some in batches([name for name in names if set_aside or ttls[name] >= 0]):
@@ -76,27 +76,27 @@ def forget_failures(connection: Redis, *, set_aside: bool) -> None:
 
 
 def forget_failures_of(connection: Redis, name: str) -> None:
-    """Forget what was counted against a job, which has ended well."""
+    """Reset all counts of a job, which has succeeded."""
     connection.delete(STARTS + name, OVERDUE + name, FAILURES + name, FAILED + name)
 
 
 def forget_starts_of(connection: Redis, name: str) -> None:
-    """Count nothing against a job that has ended, but its failures."""
+    """Reset the counts of a job's starts, which has ended; its failures stay."""
     connection.delete(STARTS + name, OVERDUE + name)
 
 
 def count_start(connection: Redis, name: str) -> int:
-    """Count a start of a job, until it ends; how many there were."""
+    """Count a start of a job; returns the starts since the job last ended."""
     return _count(connection, STARTS + name)
 
 
 def count_overdue(connection: Redis, name: str) -> int:
-    """Count a start of a job that the deadline has ended; how many there were."""
+    """Count a start of a job that the deadline has ended; returns their number."""
     return _count(connection, OVERDUE + name)
 
 
 def overdue(connection: Redis, name: str) -> int:
-    """How many of a job's starts the deadline has ended."""
+    """The number of a job's starts that the deadline has ended."""
     (times,) = beginnings(connection, [OVERDUE + name], 10)
     return int(times) if times.isdecimal() and times.isascii() else 0
 
@@ -109,7 +109,7 @@ def _count(connection: Redis, key: str) -> int:
 
 
 def failed_names(connection: Redis) -> set[str]:
-    """The jobs that are not to be queued, since they failed lately or too often."""
+    """The jobs that are not queued, since they failed recently or too often."""
     return {name for name in names_below(connection, FAILED) if _is_a_jobs(name)}
 
 
@@ -129,7 +129,7 @@ def read_failures(connection: Redis) -> dict[str, Failure]:
 
 
 def _ttls(connection: Redis, names: Sequence[str]) -> dict[str, int]:
-    """For how many seconds failures are remembered yet: -1 for good, -2 no longer."""
+    """The seconds for which each failure is still remembered: -1 for ever, -2 no longer."""
     found: list[int] = []
     for some in batches(names):
         with connection.pipeline(transaction=False) as pipeline:
@@ -139,17 +139,17 @@ def _ttls(connection: Redis, names: Sequence[str]) -> dict[str, int]:
     return dict(zip(names, found, strict=True))
 
 
-def causes(failures: Mapping[str, Failure]) -> list[Cause]:
+def causes(failures: Mapping[str, Failure]) -> list[FailureCause]:
     """Failures by their cause, the most frequent first."""
     grouped: dict[str, dict[str, Failure]] = {}
     for name, failure in sorted(failures.items(), key=lambda item: (not item[1].set_aside, item[0])):
         grouped.setdefault(_VARYING.sub("…", failure.reason), {})[name] = failure
-    found = [Cause(cause, sum(f.set_aside for f in jobs.values()), jobs) for cause, jobs in grouped.items()]
+    found = [FailureCause(cause, sum(f.set_aside for f in jobs.values()), jobs) for cause, jobs in grouped.items()]
     return sorted(found, key=lambda cause: -len(cause.jobs))
 
 
 def repeating_command(store: str | Path, name: str) -> str:
-    """What renders a job again in the foreground, and prints its error whole."""
+    """The command that renders a job again in the foreground, and prints its whole error."""
     job = RenderArguments.of(name)
     return shlex.join(["photonfarm", "work", "--store", str(store), "--scene", job.scene_id, "--job", str(job.job)])
 

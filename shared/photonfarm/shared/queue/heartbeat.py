@@ -1,4 +1,4 @@
-"""Who is alive: keys that Redis drops by its own clock unless they are written again."""
+"""Which workers are alive: keys that Redis drops by its own clock unless they are written again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ALIVE = "alive:"
 WORKER = "rq:photonfarm:worker:"
 
 HEARTBEAT_MOST_S = 3600
-"""What says for longer that something is alive, for good say, is no heartbeat of a worker."""
+"""A key that lasts longer than this, or for ever, is not the heartbeat of a worker."""
 
 _VALUE_BYTES = 1024
 
@@ -24,14 +24,14 @@ _VALUE_BYTES = 1024
 class _Heartbeat:
     host: str  # the supervisor's process space, in which `process` counts
     job: str | None
-    process: int  # of the supervisor; 0: not told
+    process: int  # of the supervisor; 0: unknown
 
 
 def take_name(connection: Redis, name: str, host: str, process: int, *, ttl_s: float) -> str:
-    """The name that a worker has from now on: this one, or with a number behind it while another worker has it.
+    """Take a name for a worker: this one, or with a number behind it while another worker has it.
 
-    One that was killed on this `host`, which is `processes.process_space()`, leaves its name, and its job, at once, and
-    not when its heartbeat has run out.
+    A worker that was killed on this `host`, which is `processes.process_space()`, gives up its name and its job at
+    once, not only when its heartbeat expires.
     """
     for number in count(1):
         own = name if number == 1 else f"{name}-{number}"
@@ -45,8 +45,8 @@ def take_name(connection: Redis, name: str, host: str, process: int, *, ttl_s: f
 
 
 def _is_gone(process: int) -> bool:
-    """Whether no process here, but perhaps our own, has that number."""
-    if process == os.getpid():  # that of a predecessor, which has ended
+    """Whether no other process on this machine has that number."""
+    if process == os.getpid():  # the number of a predecessor, which has ended
         return True
     try:
         os.kill(process, 0)
@@ -58,7 +58,7 @@ def _is_gone(process: int) -> bool:
 
 
 def beat(connection: Redis, worker: str, host: str, name: str | None, *, ttl_s: float, process: int = 0) -> None:
-    """Say for a time that a worker is alive on a `host`, as in `take_name`, and the job that it renders, if any."""
+    """Write the heartbeat of a worker on a `host`, as in `take_name`, and of the job that it renders, if any."""
     ttl_ms = int(ttl_s * 1000)  # the server's clock counts it down, not a client's
     with connection.pipeline() as pipeline:
         pipeline.set(WORKER + worker, f"{host} {name or '-'} {process}", px=ttl_ms)
@@ -68,14 +68,14 @@ def beat(connection: Redis, worker: str, host: str, name: str | None, *, ttl_s: 
 
 
 def bury(connection: Redis, worker: str) -> str | None:
-    """Say that a worker is gone, and free its job at once, instead of when its heartbeat runs out; the job's name."""
+    """Remove a worker's heartbeat, and free its job at once; returns the job's name."""
     name = free_job(connection, worker)
     connection.delete(WORKER + worker)
     return name
 
 
 def free_job(connection: Redis, worker: str) -> str | None:
-    """Let others have the job that a worker last said to render; its name."""
+    """Free the job that a worker last reported, so that others can take it; returns its name."""
     name = job_of_worker(connection, worker)
     if name:
         connection.delete(ALIVE + name)
@@ -83,7 +83,7 @@ def free_job(connection: Redis, worker: str) -> str | None:
 
 
 def job_of_worker(connection: Redis, worker: str) -> str | None:
-    """The job that a worker last said to render."""
+    """The job that a worker last reported."""
     heartbeat = _heartbeat_of(connection, worker)
     return None if heartbeat is None else heartbeat.job
 
@@ -100,10 +100,10 @@ def _parsed(value: str) -> _Heartbeat | None:
 
 
 def workers_alive(connection: Redis) -> set[str]:
-    """The workers with a heartbeat, but for those of this machine that have ended since their last one."""
+    """The workers with a heartbeat, except those of this machine whose process has ended since."""
     names = sorted(names_below(connection, WORKER))
-    said = beginnings(connection, [WORKER + name for name in names], _VALUE_BYTES)
-    return {name for name, held in zip(names, map(_parsed, said), strict=True) if not _has_ended(held)}
+    values = beginnings(connection, [WORKER + name for name in names], _VALUE_BYTES)
+    return {name for name, held in zip(names, map(_parsed, values), strict=True) if not _has_ended(held)}
 
 
 def _has_ended(held: _Heartbeat | None) -> bool:
@@ -111,6 +111,6 @@ def _has_ended(held: _Heartbeat | None) -> bool:
 
 
 def hosts(connection: Redis) -> set[str]:
-    """The hosts, each a process space, that have a worker alive."""
-    said = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
-    return {value.split()[0] for value in said if value.strip()}
+    """The hosts, each a process space, that have a live worker."""
+    values = beginnings(connection, [WORKER + name for name in names_below(connection, WORKER)], _VALUE_BYTES)
+    return {value.split()[0] for value in values if value.strip()}

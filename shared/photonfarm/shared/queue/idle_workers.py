@@ -1,6 +1,6 @@
-"""What holds workers up, by their own account: that they take no jobs, or leave a scene alone.
+"""Why workers are idle, as they report it: they take no jobs, or skip a scene.
 
-It is said with every heartbeat and gone with it, and is text for people: nothing is decided by it.
+A report is written with every heartbeat and expires with it. It is text for people: no decision depends on it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ _SCENE_AND_WORKER = re.compile("([0-9a-f]{32}):(.+)", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
-class HeldUp:
-    """What workers say, by name; printable."""
+class IdleReports:
+    """The workers' reports, by name; printable."""
 
     paused: dict[str, str]  # why a worker takes no jobs
-    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it leaves the scene alone
+    left: dict[str, dict[str, str]]  # by scene id, then by worker: why it skips the scene
 
 
-def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
-    """Say for a time why a worker takes no jobs, if it takes none, and which scenes it leaves alone."""
+def report_idle(connection: Redis, worker: str, paused: str | None, left: Mapping[str, str], *, ttl_s: float) -> None:
+    """Report why a worker takes no jobs, if it takes none, and which scenes it skips; expires after `ttl_s`."""
     ttl_ms = int(ttl_s * 1000)
     with connection.pipeline(transaction=False) as pipeline:
         if paused is None:
@@ -41,21 +41,21 @@ def tell_held_up(connection: Redis, worker: str, paused: str | None, left: Mappi
         pipeline.execute()
 
 
-def forget_held_up(connection: Redis, worker: str, left: Iterable[str]) -> None:
-    """A worker is held up by nothing any more, and leaves none of these scenes."""
+def clear_idle_report(connection: Redis, worker: str, left: Iterable[str]) -> None:
+    """Remove the reports of a worker: it takes jobs again, and skips none of these scenes."""
     connection.delete(PAUSED + worker, *(f"{LEFT}{scene_id}:{worker}" for scene_id in left))
 
 
-def read_held_up(connection: Redis) -> HeldUp:
-    """What workers say now."""
+def read_idle_reports(connection: Redis) -> IdleReports:
+    """The reports that workers have made."""
     left: dict[str, dict[str, str]] = {}
-    for name, reason in _said(connection, LEFT).items():
+    for name, reason in _reports(connection, LEFT).items():
         if found := _SCENE_AND_WORKER.fullmatch(name):
             left.setdefault(found[1], {})[printable(found[2])] = reason
-    return HeldUp({printable(name): reason for name, reason in _said(connection, PAUSED).items()}, left)
+    return IdleReports({printable(name): reason for name, reason in _reports(connection, PAUSED).items()}, left)
 
 
-def _said(connection: Redis, prefix: str) -> dict[str, str]:
+def _reports(connection: Redis, prefix: str) -> dict[str, str]:
     names = sorted(names_below(connection, prefix))
-    told = beginnings(connection, [prefix + name for name in names], 4 * REASON_LETTERS)
-    return {name: printable(reason)[:REASON_LETTERS] for name, reason in zip(names, told, strict=True) if reason}
+    reasons = beginnings(connection, [prefix + name for name in names], 4 * REASON_LETTERS)
+    return {name: printable(reason)[:REASON_LETTERS] for name, reason in zip(names, reasons, strict=True) if reason}

@@ -1,9 +1,9 @@
-"""Jobs as RQ has them: names, from which everything else follows.
+"""Jobs in RQ: names, from which everything else follows.
 
 RQ imports and calls any dotted name that stands in Redis, also for callbacks and with JSON as well as pickle, and
-sends webhooks anywhere. So a job here is its name, `<scene id>-<number>`, checked. What else Redis holds of it is JSON
-for RQ's own tools, and is never read here: neither function nor arguments, callbacks, time limits or dependents; it may
-be as large as it likes.
+sends webhooks anywhere. So a job here is its name, `<scene id>-<number>`, checked. The rest of a job in Redis is JSON
+for RQ's own tools and is never read here: no function, arguments, callbacks, time limits or dependents; so its size
+does not matter.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from photonfarm.shared.scene.spec import Frozen, sentences
 
 QUEUE = "photonfarm"
 FUNCTION = "photonfarm.renderer.jobs.render.render_shard"
-"""The one function that a job runs; a string, since whoever submits needs no renderer."""
+"""The one function that a job runs; a string, since submitting needs no renderer."""
 
 FAILURE_TTL_S = 3600
-"""A failed job is left alone for an hour: long enough not to burn cores on it, short enough to heal by itself."""
+"""A failed job is not queued for an hour: long enough not to burn cores on it, short enough to heal by itself."""
 
 RQ_TIMEOUT_S = 7 * 86400
-"""RQ's own time limit cannot interrupt native code, so it is out of the way; the worker's deadline counts."""
+"""RQ's own time limit cannot interrupt native code, so it is too long to matter; the worker has its own deadline."""
 
 STARTS = "rq:photonfarm:starts:"
 OVERDUE = "rq:photonfarm:overdue:"
 
 MAX_NAME = 64
-"""Bytes of a job's name at most; what is longer is not even fetched."""
+"""The most bytes of a job's name; longer ones are not even fetched."""
 
 _NAMES = f"""
 local names = {{}}
@@ -77,14 +77,14 @@ def job_name(scene_id: str, job: int) -> str:
 
 
 class RenderArguments(Frozen):
-    """What a job's arguments may be."""
+    """The valid arguments of a job."""
 
     scene_id: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", strict=True)]
     job: Annotated[int, Field(ge=0, lt=1 << 48, strict=True)]
 
     @classmethod
     def of(cls, name: str) -> RenderArguments:
-        """The arguments that a job's name tells; raises QueueError for a name that is none."""
+        """The arguments that a job's name stands for; raises QueueError for an invalid name."""
         scene_id, _, number = name.rpartition("-")
         try:
             arguments = cls(scene_id=scene_id, job=int(number) if number.isdecimal() else -1)
@@ -96,7 +96,7 @@ class RenderArguments(Frozen):
 
 
 class RenderJob(Job):
-    """A job that can only be ours, whatever Redis holds of it."""
+    """A job that can only render, whatever Redis holds of it."""
 
     _refusal: str | None = None
 
@@ -105,11 +105,11 @@ class RenderJob(Job):
         self._refusal = reason
 
     def refresh(self) -> None:
-        """Be the job of this name, without looking into Redis; raises QueueError if it is no job's."""
+        """Set up the job from its name, without reading Redis; raises QueueError for an invalid name."""
         self.restore({})
 
     def restore(self, raw_data: Any) -> None:  # noqa: ARG002
-        """Be the job of this name; what Redis holds of it is not looked at."""
+        """Set up the job from its name; what Redis holds of it is ignored."""
         self.func_name = FUNCTION
         self.instance, self.args, self.kwargs = None, (), RenderArguments.of(self.id).model_dump()
         self.origin, self.description = QUEUE, self.id
@@ -118,30 +118,30 @@ class RenderJob(Job):
         self._status = JobStatus.QUEUED
 
     def get_status(self, refresh: bool = True) -> JobStatus:  # noqa: ARG002
-        """The status as this worker left it, also once Redis has forgotten it."""
+        """The status that this worker set, even if Redis has lost it."""
         return self._status
 
     @property
     def func(self) -> Any:
-        """The one function; raises IncompleteError for a job that was refused."""
+        """The one function; raises IncompleteError for a refused job."""
         if self._refusal:
             raise IncompleteError(f"job {self.id} is not run: {self._refusal}")
         return import_attribute(FUNCTION)
 
 
 class RenderQueue(Queue):
-    """RQ's queue, whose jobs have no dependents: whoever wrote them into Redis."""
+    """RQ's queue, whose jobs have no dependents, even if a client wrote some into Redis."""
 
     job_class = RenderJob
 
     def enqueue_dependents(self, *args: Any, **options: Any) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 def open_queue(connection: Redis) -> RenderQueue:
     """The queue. A worker listens to this one alone: on several, RQ would lose a job with the worker that took it.
 
-    What is under its keys, and under RQ's registries, and is of another kind, has been removed. Raises RedisError.
+    Keys of the queue and of RQ's registries that hold another type are removed first. Raises RedisError.
     """
     queue = RenderQueue(QUEUE, connection=connection, job_class=RenderJob, serializer=JSONSerializer)
     remove_others(
@@ -160,10 +160,10 @@ def open_queue(connection: Redis) -> RenderQueue:
 
 
 def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str] = ()) -> tuple[RenderJob | None, int]:
-    """The next job, taken as RQ takes it, or None; and how many entries that were no jobs were thrown away.
+    """Take the next job as RQ does; returns it or None, and how many invalid entries were dropped.
 
-    Jobs of other scenes than `scene_id`, and of those to `leave`, stay where they are, for other workers. Whoever wants
-    to wait asks again: blocking, RQ fetches whatever stands in the list, of whatever size.
+    Jobs of other scenes than `scene_id`, and of the scenes in `leave`, stay in the queue for other workers. To wait,
+    call again: a blocking call of RQ would fetch any entry in the list, of any size.
     """
     keys = [queue.key, queue.intermediate_queue_key]
     name, dropped = queue.connection.register_script(_TAKE)(keys=keys, args=[scene_id or "", *leave])
@@ -177,7 +177,7 @@ def take(queue: RenderQueue, *, scene_id: str | None = None, leave: Iterable[str
 
 
 def put_back(queue: RenderQueue, name: str) -> None:
-    """Have a job that was taken be the next one to be taken, by a worker that can do it."""
+    """Return a taken job to the head of the queue, for a worker that can render it."""
     with queue.connection.pipeline() as pipeline:
         pipeline.lrem(queue.key, 0, name)
         pipeline.lpush(queue.key, name)
@@ -185,17 +185,17 @@ def put_back(queue: RenderQueue, name: str) -> None:
 
 
 def queued_names(queue: RenderQueue) -> list[str]:
-    """The names in the queue, in order, without those too long to be ours."""
+    """The names in the queue, in order, without those too long for a job."""
     return [name.decode(errors="replace") for name in _names(queue, queue.key, "LRANGE")]
 
 
 def taken_names(queue: RenderQueue) -> list[bytes]:
-    """The names that were taken and are not said to have ended, as they stand there; without those too long."""
+    """The names that were taken and not reported as ended, as stored; without those too long for a job."""
     return _names(queue, queue.intermediate_queue_key, "LRANGE")
 
 
 def running_names(queue: RenderQueue) -> list[bytes]:
-    """The entries of RQ's registry of running jobs, as they stand there: name, colon, execution."""
+    """The entries of RQ's registry of running jobs, as stored: name, colon, execution."""
     return _names(queue, queue.started_job_registry.key, "ZRANGE")
 
 

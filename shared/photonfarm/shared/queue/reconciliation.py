@@ -1,4 +1,4 @@
-"""Filling the queue from the store, which knows what is missing; there is no coordinator, whoever is idle does it."""
+"""Fills the queue from the store, which knows what is missing; any idle worker does it, without a coordinator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
-from photonfarm.shared.queue.idle_workers import HeldUp, read_held_up
+from photonfarm.shared.queue.idle_workers import IdleReports, read_idle_reports
 from photonfarm.shared.queue.job import (
     FAILURE_TTL_S,
     FUNCTION,
@@ -38,17 +38,17 @@ from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_b
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
-"""Jobs queued at most, at 1.9 kB of Redis memory each; the store holds the rest."""
+"""The most jobs in the queue, at 1.9 kB of Redis memory each; the store holds the rest."""
 
 LOCK_TTL_S = 10
-"""For so long one that died while it filled the queue keeps others from it; one that lives renews its lock."""
+"""How long the lock outlasts a process that died while it filled the queue; a live one renews it."""
 
 _LOCK = "rq:photonfarm:reconcile"
 
 log = logging.getLogger(__name__)
 
-_told: dict[str, str] = {}
-"""Why scenes were passed over, by scene id: an idle worker looks every few seconds, and says it once."""
+_logged: dict[str, str] = {}
+"""Why scenes were skipped, by scene id: an idle worker looks every few seconds, and logs each reason once."""
 
 _KINDS: dict[str, Kind] = {
     "rq:job:": "hash",
@@ -58,7 +58,7 @@ _KINDS: dict[str, Kind] = {
     OVERDUE: "counter",
     FAILURES: "counter",
 }
-"""Of the keys that are written of a job, by what precedes its name."""
+"""The types of the keys that are written for a job, by the prefix before its name."""
 
 
 def reconcile(
@@ -71,14 +71,14 @@ def reconcile(
     retry_failed: bool = False,
     retry_set_aside: bool = False,
 ) -> int:
-    """Queue every job that is planned, not committed, not queued, not alive and not failed; how many that were.
+    """Queue every job that is planned, not committed, not queued, not alive and not failed; returns how many.
 
-    Of one scene, or of all. One caller at a time: 0 if another one is at it for longer than `wait_s`. At most `limit`
-    jobs are queued in all; the rest follows later. Scenes share them alike, as one whose jobs nobody takes would hold
-    up the others: what one has beyond its share leaves the queue again when another needs the place. `retry_failed`
-    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. A scene that cannot be read
-    is passed over with a warning. Raises QueueError if Redis fails or serves another store, StoreError if the
-    store or the one scene cannot be read.
+    It works on one scene, or on all, and for one caller at a time: it returns 0 if another one is still at it after
+    `wait_s`. At most `limit` jobs are queued in all; the rest follows later. Scenes share these places equally, as a
+    scene whose jobs no worker takes would block the others: the jobs beyond a scene's share leave the queue when
+    another scene needs their places. `retry_failed` forgets failures first, and `retry_set_aside` also those of jobs
+    that failed too often. A scene that cannot be read is skipped with a warning. Raises QueueError if Redis fails or
+    serves another store, StoreError if the store or the one scene cannot be read.
     """
     serve(connection, store)
     try:
@@ -94,8 +94,8 @@ def reconcile(
 
 @contextlib.contextmanager
 def _alone(connection: Redis, wait_s: float) -> Iterator[bool]:
-    """Keep others from filling the queue until the block ends; False if another one still does after `wait_s`."""
-    remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # ours ends by itself by then
+    """Hold the lock until the block ends; yields False if another process still holds it after `wait_s`."""
+    remove_lasting(connection, [_LOCK], LOCK_TTL_S)  # our own expires by then
     lock = connection.lock(_LOCK, timeout=LOCK_TTL_S, thread_local=False)
     if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
         yield False
@@ -142,25 +142,25 @@ def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) ->
 
 
 def _lacking_by_scene(store: Store, only: str | None, busy: Set[str], limit: int) -> dict[str, list[int]]:
-    """`_lacking` of every scene that can be read; of one alone, whose error is raised."""
+    """`_lacking` of every scene that can be read; or of one scene, whose error is raised."""
     if only is not None:
         return {only: _lacking(store.scene(only), busy, limit)}
     lacking, failed = store.each(lambda scene: _lacking(scene, busy, limit))
     for scene_id, error in failed.items():
-        if _told.get(scene_id) != str(error):
+        if _logged.get(scene_id) != str(error):
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, error)
-        _told[scene_id] = str(error)
+        _logged[scene_id] = str(error)
     return lacking
 
 
 def _lacking(scene: SceneStore, busy: Set[str], limit: int) -> list[int]:
-    """The first missing jobs of a scene that are neither queued nor to be left alone: no more than can be queued."""
+    """The first missing jobs of a scene that are not in `busy`, at most `limit`."""
     missing = (job for job in scene.missing_jobs() if job_name(scene.scene_id, job) not in busy)
     return list(islice(missing, limit))
 
 
 def _by_scene(names: Iterable[str]) -> dict[str, list[str]]:
-    """Names by the scene id that they begin with, in order."""
+    """Names grouped by the scene id that they begin with, in order."""
     found: dict[str, list[str]] = {}
     for name in names:
         found.setdefault(name.rpartition("-")[0], []).append(name)
@@ -168,7 +168,7 @@ def _by_scene(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _shares(demand: Mapping[str, int], limit: int) -> dict[str, int]:
-    """How many places each gets: what it asks for, or as many as all others that ask for more than there is."""
+    """The number of places for each scene: its demand, or an equal share if the demands exceed the limit."""
     shares = {}
     for done, scene_id in enumerate(sorted(demand, key=lambda scene_id: demand[scene_id])):
         shares[scene_id] = min(demand[scene_id], limit // (len(demand) - done))
@@ -177,7 +177,7 @@ def _shares(demand: Mapping[str, int], limit: int) -> dict[str, int]:
 
 
 def _withdraw(queue: RenderQueue, names: Sequence[str]) -> None:
-    """Take jobs out of the queue again, the last ones of their scene; the store has them."""
+    """Remove jobs from the queue, the last ones of their scene; they stay in the store."""
     with queue.connection.pipeline(transaction=False) as pipeline:
         for name in names:
             pipeline.lrem(queue.key, -1, name)
@@ -193,7 +193,7 @@ def _enqueue(queue: RenderQueue, jobs: Sequence[tuple[str, int]]) -> None:
             FUNCTION,
             kwargs={"scene_id": scene_id, "job": job},
             timeout=RQ_TIMEOUT_S,
-            result_ttl=0,  # a finished job leaves nothing: the marker tells it
+            result_ttl=0,  # nothing remains of a finished job: it has its marker
             failure_ttl=FAILURE_TTL_S,
             description=f"{scene_id} job {job}",
             job_id=job_name(scene_id, job),
@@ -204,7 +204,7 @@ def _enqueue(queue: RenderQueue, jobs: Sequence[tuple[str, int]]) -> None:
 
 
 def _tidy(queue: RenderQueue, alive: set[str]) -> None:
-    """Take what dead workers left out of RQ's registries, which would otherwise be watched as if it were running."""
+    """Remove the entries of dead workers from RQ's registries, which would otherwise count as running."""
     stale = [entry for entry in running_names(queue) if _text(entry).split(":")[0] not in alive]
     if stale:
         queue.connection.zrem(queue.started_job_registry.key, *stale)
@@ -224,13 +224,13 @@ def _text(name: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class QueueStatus:
-    """What Redis knows."""
+    """The queue and the workers, as Redis has them."""
 
     queued: int
     running: int  # jobs with a heartbeat
-    workers: int  # with a heartbeat; of this machine only those that live
+    workers: int  # with a heartbeat; those of this machine only if their process lives
     failed: dict[str, Failure]  # by job name
-    held_up: HeldUp
+    idle_reports: IdleReports
 
 
 def queue_status(connection: Redis) -> QueueStatus:
@@ -241,7 +241,7 @@ def queue_status(connection: Redis) -> QueueStatus:
             running=len(names_below(connection, ALIVE)),
             workers=len(workers_alive(connection)),
             failed=read_failures(connection),
-            held_up=read_held_up(connection),
+            idle_reports=read_idle_reports(connection),
         )
     except redis.RedisError as error:
         raise QueueError(f"Redis failed while it was asked for its status: {error}") from error

@@ -1,7 +1,7 @@
-"""Which store a Redis serves: one at a time, as its workers take whatever job is queued.
+"""The store that a Redis serves: one at a time, as its workers take any queued job.
 
-A worker for another store would throw the jobs away that it does not know. So whoever queues and whoever works says
-which store that is for, and is refused while others say it of another one. A Redis whose workers are gone is free soon.
+A worker for another store would drop the jobs that it does not know. So every process that queues or works registers
+its store, and is refused while another store is registered. A registration ends soon after the last worker.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from photonfarm.shared.store import Store
 SERVED = "rq:photonfarm:store"
 
 SERVED_TTL_S = 120
-"""For so long it holds once nobody says it any more; workers do with every heartbeat."""
+"""How long a registration lasts unless it is renewed; workers renew it with every heartbeat."""
 
 _SERVE = """
 local function served()
@@ -41,20 +41,20 @@ end
 
 
 class OtherStoreError(QueueError):
-    """A Redis serves another store than the one that it is asked to."""
+    """A Redis serves another store than the caller's."""
 
 
 def serve(connection: Redis, store: Store) -> None:
-    """Say for a while that this Redis serves a store.
+    """Register for a while that this Redis serves a store.
 
-    Raises OtherStoreError if it serves another, and QueueError if it fails. What is no store's id, or would not end by
-    itself, is a stranger's, and counts for nothing.
+    Raises OtherStoreError if it serves another, and QueueError if it fails. A value that is not a store's id, or that
+    would not expire, is a stranger's and is ignored.
     """
     _ask(connection, store, "say")
 
 
 def check_served(connection: Redis, store: Store) -> None:
-    """Return unless this Redis serves another store; raises OtherStoreError if it does, QueueError if it fails."""
+    """Check that this Redis serves no other store; raises OtherStoreError if it does, QueueError if it fails."""
     _ask(connection, store, "ask")
 
 
@@ -74,6 +74,6 @@ def _ask(connection: Redis, store: Store, how: str) -> None:
 
 
 def release(connection: Redis, store: Store) -> None:
-    """Have this Redis serve any store again, once its last worker has ended. Raises redis.RedisError."""
+    """End the registration of a store when its last worker has ended. Raises redis.RedisError."""
     if not names_below(connection, WORKER):
         connection.register_script(_RELEASE)(keys=[SERVED], args=[store.store_id])

@@ -1,7 +1,7 @@
-"""What is read of a Redis that strangers may write to: short names, short values, keys of the kind that is expected.
+"""Reads from a Redis that strangers may write to: short names, short values, keys of the expected type.
 
-What is too long is left in Redis, by scripts. A key of ours that has become one of another kind would make every
-command on it fail, for good, as one that does not run out would hold what it holds; both are removed.
+Scripts leave longer entries in Redis. One of our keys with another type would make every command on it fail, for good,
+and one that does not expire would keep its value for good; both are removed.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Literal
 from redis import Redis
 
 NAME_BYTES = 256
-"""Of a key, or of a worker in RQ's registry, at most: a host's name, and a worker's, and a job's are in it."""
+"""The most bytes of a key, or of a worker's name in RQ's registry: they contain names of hosts, workers and jobs."""
 
 AT_ONCE = 1000
-"""Keys that are asked after in one request."""
+"""The number of keys in one request."""
 
 Kind = Literal["string", "counter", "list", "set", "zset", "hash", "stream"]
 
@@ -60,7 +60,7 @@ end
 
 
 def names_below(connection: Redis, prefix: str) -> set[str]:
-    """What follows a prefix in the keys that have it, without those too long to be ours."""
+    """The rest of every key that begins with a prefix, except keys too long to be ours."""
     scan, cursor, found = connection.register_script(_SCAN), b"0", set()
     while True:
         cursor, keys = scan(args=[cursor, f"{prefix}*"])
@@ -70,7 +70,7 @@ def names_below(connection: Redis, prefix: str) -> set[str]:
 
 
 def beginnings(connection: Redis, keys: Sequence[str], size: int) -> Iterator[str]:
-    """The first bytes of the strings at keys, in their order, as text; "" where there is none, or something else."""
+    """The first bytes of the strings at keys, in their order, as text; "" for a missing key or another type."""
     for some in batches(keys):
         with connection.pipeline(transaction=False) as pipeline:
             for key in some:
@@ -80,12 +80,12 @@ def beginnings(connection: Redis, keys: Sequence[str], size: int) -> Iterator[st
 
 
 def printable(text: str) -> str:
-    """A line for terminals, which obey what is in it that does not print."""
+    """The text as one line without control characters, which a terminal would obey."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def remove_others(connection: Redis, kinds: Mapping[str, Kind]) -> int:
-    """Remove the keys that are not of the kind they have to be, or absent; how many.
+    """Remove the keys that exist with another type than required; returns how many.
 
     A counter is a string of at most nine digits.
     """
@@ -94,21 +94,21 @@ def remove_others(connection: Redis, kinds: Mapping[str, Kind]) -> int:
 
 
 def remove_lasting(connection: Redis, keys: Sequence[str], most_s: int) -> None:
-    """Remove the keys that would not run out within a time, or never."""
+    """Remove the keys that would expire later than after `most_s`, or never."""
     end = connection.register_script(_END)
     for some in batches(keys):
         end(keys=some, args=[most_s])
 
 
 def forget_dead_workers(connection: Redis, of_queue: str, of_all: str) -> None:
-    """Take the workers without a key, and what is no worker's name, out of RQ's registries of a queue and of all.
+    """Remove workers without a key, and invalid names, from RQ's registries of a queue and of all workers.
 
-    RQ's own function fetches every entry, and asks after keys that we may not ask after. Of a larger registry than a
-    farm's a part is looked at, another one the next time.
+    RQ's own function fetches every entry, and reads keys that we may not read. Of a registry larger than a farm's, each
+    call looks at another part.
     """
     connection.register_script(_FORGET)(keys=[of_queue, of_all])
 
 
 def batches(keys: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Keys, so many at a time as one request should ask after."""
+    """The keys in batches, as many as one request should read."""
     return (keys[start : start + AT_ONCE] for start in range(0, len(keys), AT_ONCE))

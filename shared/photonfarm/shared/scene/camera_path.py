@@ -36,7 +36,7 @@ class KeyView(_Frozen):
 
 
 class CameraPath(_Frozen):
-    """What a file says: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}."""
+    """A path's file: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}."""
 
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
     views: Annotated[tuple[KeyView, ...], Field(min_length=1)]
@@ -44,7 +44,7 @@ class CameraPath(_Frozen):
 
     @classmethod
     def load(cls, file: Path) -> CameraPath:
-        """The path in a JSON file; raises SpecError for what is none."""
+        """The path in a JSON file; raises SpecError for an invalid file."""
         try:
             return cls.model_validate(json.loads(file.read_text()))
         except ValidationError as error:
@@ -73,7 +73,7 @@ class CameraPath(_Frozen):
 def orbit(spec: SceneSpec, frames: int) -> list[View]:
     """Once around: on an ellipse in the middle of the spec's box of origins, looking at the middle of the other box.
 
-    It lies across the axis nearest to up. What stands in the way is walked through.
+    The ellipse is perpendicular to the axis nearest to up. It may pass through objects.
     """
     low, high = np.array(spec.view.origin.low), np.array(spec.view.origin.high)
     target = 0.5 * (np.array(spec.view.look_at.low) + np.array(spec.view.look_at.high))

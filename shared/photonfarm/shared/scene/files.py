@@ -12,7 +12,7 @@ from pathlib import Path
 from photonfarm.shared.core.errors import SpecError
 
 BUILTIN_REVISION = 1
-"""Raised whenever a built-in room changes, as its content is code and not a file."""
+"""Incremented whenever a built-in room changes, as its content is code and not a file."""
 
 _CORNELL = "floor ceiling back-wall left-wall right-wall tall-block short-block ceiling-light"
 _ROOM = """
@@ -23,16 +23,16 @@ _ROOM = """
 """
 
 BUILTIN_SHAPES = {"cornell": frozenset(_CORNELL.split()), "room": frozenset(_ROOM.split())}
-"""The shape ids of the built-in rooms, said here so that a spec can be checked without Mitsuba."""
+"""The shape ids of the built-in rooms, listed here so that a spec can be checked without Mitsuba."""
 
 BUILTIN_EMITTING = {
     "cornell": frozenset({"ceiling-light"}),
     "room": frozenset({"lamp-shade", "ceiling-light-1", "ceiling-light-2"}),
 }
-"""Those of them that are lights."""
+"""The shapes among them that emit light."""
 
 ENVIRONMENT = "environment"
-"""The name of the light that comes from all around; a scene has one at most."""
+"""The name of the light that surrounds the scene; a scene has one at most."""
 
 _ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 
@@ -58,7 +58,7 @@ class SceneFile:
     path: Path
     shape_ids: frozenset[str]
     emitting: frozenset[str]  # ids of the shapes that are lights
-    shapeless: frozenset[str]  # of the lights that are no shapes: ENVIRONMENT, and the ids of others that have one
+    shapeless: frozenset[str]  # lights that are not shapes: ENVIRONMENT, and the ids of others that have one
     digest: str  # of the file and of every file it names
 
     @classmethod
@@ -81,12 +81,12 @@ def _shapeless(root: ElementTree.Element) -> Iterator[str]:
     for node in root.findall("emitter"):
         if node.get("type") in _ENVIRONMENTS:
             yield ENVIRONMENT
-        elif node.get("type") != "area" and node.get("id"):  # one of type area is for a shape to refer to
+        elif node.get("type") != "area" and node.get("id"):  # one of type area is there for shapes to refer to
             yield node.get("id", "")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Up to three known names like a wrong one, for a message."""
+    """Up to three known names that resemble an unknown one, for a message."""
     return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.3)) or "none"
 
 

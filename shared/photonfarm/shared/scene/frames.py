@@ -1,7 +1,7 @@
-"""What views show that are not in a store, such as those of a camera path, as one file: buffers, and what they see.
+"""Views that are not in a store, such as those of a camera path, as one file: buffers, and which points they see.
 
-The renderer writes it, and whoever has a network for the scene reads it. Shape letters: F frames, G movable groups,
-H W image, P points, K photon slots.
+The renderer writes it, and the trainer reads it. Shape letters: F frames, G movable groups, H W image, P points, K
+photon slots.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ class Frames:
         return len(self.views)
 
     def buffers(self, frame: int) -> ViewBuffers:
-        """Those of one frame."""
+        """The buffers of one frame."""
         return ViewBuffers(self.depth[frame], self.albedo[frame], self.normal[frame])
 
     def visibility(self, frame: int) -> Visibility:
-        """What one frame sees."""
+        """Which points and photons one frame sees."""
         return Visibility(self.point_seen[frame], self.photon_seen[frame])
 
     def guides_of(self, frame: int) -> Guides | None:
-        """Those of one frame."""
+        """The guides of one frame; None in a scene without."""
         if self.guides is None:
             return None
         return Guides(**{name: values[frame] for name, values in arrays_of(self.guides).items()})
 
     def write(self, file: Path) -> None:
-        """Store them as a NumPy archive, whole or not at all; raises StoreError where the disk refuses."""
+        """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
         arrays: dict[str, NDArray[Any]] = {
             "scene_id": np.array(self.scene_id),
             "modification": self.modification.vector,
@@ -70,7 +70,7 @@ class Frames:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """What `write` has stored; raises StoreError for anything else."""
+        """Read what `write` stored; raises StoreError for anything else."""
         with stored_arrays(file, "buffers", "buffers") as stored:
             views = tuple(View.from_vector(vector) for vector in stored["view"])
             photons = None

@@ -31,13 +31,13 @@ Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 BUILTIN_ROOMS = ("cornell", "room")
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
 INPUT_SHOWN = 100
-"""Characters of a wrong value that a message repeats: it may be a whole file."""
+"""The most characters of a wrong value that a message repeats, as the value may be a whole file."""
 FEW = 3
-"""So many lights are all named, where one of another name is asked for."""
+"""Up to so many lights, a message about an unknown light names them all."""
 
 
 class Frozen(BaseModel):
-    """A model that cannot change and knows no keys but its own."""
+    """A model that cannot change and refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -173,7 +173,7 @@ class PhotonSpec(Frozen):
 
 
 class GuideSpec(Frozen):
-    """What is rendered beside each view's noise-free buffers, and what it may cost; no sample depends on it."""
+    """The settings of the guides, which are rendered beside each view's buffers; no sample depends on them."""
 
     light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
 
@@ -181,8 +181,8 @@ class GuideSpec(Frozen):
 class Emitters(Frozen):
     """Factors on the radiance of the scene's own lights: those of its file or built-in room that no `Light` moves."""
 
-    all: Factor = 1.0  # of each: 0 switches it off
-    by_id: dict[str, Factor] = {}  # of some instead, by the id of their shape; "environment": of what surrounds all
+    all: Factor = 1.0  # for every light: 0 switches it off
+    by_id: dict[str, Factor] = {}  # for single lights instead, by the id of their shape, or "environment"
 
     @model_validator(mode="before")
     @classmethod
@@ -193,7 +193,7 @@ class Emitters(Frozen):
         return said
 
     def factor(self, name: str) -> float:
-        """Of one light, by its id."""
+        """The factor of one light, by its id."""
         return self.by_id.get(name, self.all)
 
     def __str__(self) -> str:
@@ -203,7 +203,7 @@ class Emitters(Frozen):
 
 
 class Credits(Frozen):
-    """Whom the scene is owed to, and under which terms: it goes with the data, into reports."""
+    """The authorship and licence of a scene; they go with the data, into reports."""
 
     title: Annotated[str, Field(min_length=1, max_length=200)]
     author: Annotated[str, Field(min_length=1, max_length=200)]
@@ -215,11 +215,11 @@ class SceneSpec(Frozen):
     """A scene and everything that shapes its samples. No movable group: a static scene."""
 
     name: Name
-    credits: Credits | None = None  # None: not said
+    credits: Credits | None = None  # None: not given
     scene: Source
     objects: tuple[Movable, ...] = ()
     lights: tuple[Light, ...] = ()
-    emitters: Emitters = Field(default=Emitters(), exclude_if=lambda said: said == Emitters())  # not in ids then either
+    emitters: Emitters = Field(default=Emitters(), exclude_if=lambda said: said == Emitters())  # then left out of ids
     view: ViewSpec
     film: Film = Film()
     transport: Transport = Transport()
@@ -252,7 +252,7 @@ class SceneSpec(Frozen):
         return make_key("scene", _canonical(described)).hex()
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A changed copy; pydantic would keep the id of the one that was copied."""
+        """A changed copy; pydantic would keep the id of the original."""
         copied = super().model_copy(update=update, deep=deep)
         copied.__dict__.pop("scene_id", None)
         return copied
@@ -322,7 +322,7 @@ def _validate(described: dict[str, Any], where: str) -> SceneSpec:
 
 
 def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str]:
-    """One sentence for each fault that a model found: its key, the value and the rule; `known` are keys it may have."""
+    """One sentence for each fault that a model found: its key, the value and the rule; `known` are the allowed keys."""
     for fault in error.errors():
         key = ".".join(map(str, fault["loc"]))
         rule = fault["msg"].removeprefix("Value error, ")

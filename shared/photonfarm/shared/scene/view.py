@@ -64,7 +64,7 @@ class Camera:
     def rays(self, u: float = 0.5, v: float = 0.5) -> NDArray[np.float32]:
         """Unit world directions through one point of each pixel, (H, W, 3): normalise(T⁻¹ K⁻¹ (x+u, y+v, 1)).
 
-        Through the pixels' centres, unless told otherwise.
+        By default they go through the pixels' centres.
         """
         x = (np.arange(self.width) + u - 0.5 * self.width) / self.focal_px
         y = (np.arange(self.height) + v - 0.5 * self.height) / self.focal_px

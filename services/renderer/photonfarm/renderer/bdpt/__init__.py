@@ -19,6 +19,6 @@ from photonfarm.renderer.bdpt.variant import require_variant
 require_variant()
 
 from photonfarm.renderer.bdpt.integrator import BidirectionalPathTracer  # noqa: E402
-from photonfarm.renderer.bdpt.photons import Photons, trace_photons  # noqa: E402
+from photonfarm.renderer.bdpt.photons import TracedPhotons, trace_photons  # noqa: E402
 
-__all__ = ["BidirectionalPathTracer", "Photons", "trace_photons"]
+__all__ = ["BidirectionalPathTracer", "TracedPhotons", "trace_photons"]

@@ -1,4 +1,4 @@
-"""The sensor's side of light tracing, and what of sensor and film this integrator accepts."""
+"""The sensor's side of light tracing, and the sensors and films that this integrator accepts."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_cu
 from photonfarm.renderer.bdpt.selection import LightIndex, Selection, read_selection
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
-"""How a light is treated. EYE_ONLY: no light paths start there; HIT_ONLY: hits alone, at weight 1."""
+"""The kinds of light. EYE_ONLY: no light paths start there; HIT_ONLY: eye paths hit it by chance alone, weight 1."""
 
 _KIND_BY_CLASS = {
     "AreaLight": AREA,
@@ -41,7 +41,7 @@ _KIND_BY_CLASS = {
     "DirectionalEmitter": DIRECTION,
 }
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
-"""How the names of the parameters begin that say how brightly a light shines."""
+"""The beginnings of the names of parameters that scale a light's brightness."""
 
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 
@@ -153,8 +153,8 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
 def is_flat(mesh: mi.Mesh) -> mi.Bool:
     """Whether a mesh light's vertex normals are its faces' normals, as data [1].
 
-    Where they are not, Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such
-    lights are left to hits, with selection probability 0.
+    Otherwise Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such lights
+    get selection probability 0, and only hits find them.
     """
     if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
         return mi.Bool(True)
@@ -316,7 +316,7 @@ def hit_densities(
 
 @dataclass(slots=True)
 class Emission:
-    """The start of light paths: a ray and what the weights at the first hit need to know of y₀."""
+    """The start of light paths: a ray, and what the weights at the first hit depend on at y₀."""
 
     ray: mi.Ray3f
     throughput: mi.Spectrum  # Le·cos₀/e

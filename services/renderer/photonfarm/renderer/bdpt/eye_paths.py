@@ -43,7 +43,7 @@ class EyeState:
 
 @dataclass(slots=True)
 class Connectable:
-    """Light vertices, and which of them this pass's eye paths are joined to."""
+    """Light vertices, and the choice of those that this pass's eye paths are joined to."""
 
     vertices: LightVertices
     seen: mi.UInt32  # number each was drawn from

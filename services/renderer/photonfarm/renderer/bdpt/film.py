@@ -26,7 +26,7 @@ class Splat:
 
 
 @dataclass(slots=True)
-class Images:
+class ImageStack:
     """K images of one view."""
 
     radiance: mi.Spectrum  # [K·H·W]: mean over the samples of a pixel, with the light paths' share

@@ -11,7 +11,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
-from photonfarm.renderer.bdpt.film import Images, Splat
+from photonfarm.renderer.bdpt.film import ImageStack, Splat
 from photonfarm.renderer.bdpt.launches import Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.recording import Recorder
@@ -101,7 +101,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def render_seeds(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> mi.TensorXf:
         """Independent images of one view [K, H, W, 3], one for each seed; small ones in one launch.
 
-        Each is the image that ``render`` gives for its seed: bit by bit on one thread where an image's samples and its
+        Each is the image that ``render`` gives for its seed: bit by bit on one thread if an image's samples and its
         light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
         ``render`` does.
         """
@@ -118,7 +118,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             pixels = width * height
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
-            images = Images.black(len(seeds) * pixels)
+            images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio):
                 options = self._options(launch, pixels)
                 own = seeds[launch.first_image : launch.first_image + launch.images]
@@ -174,7 +174,7 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
         connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
-    images = Images.black(lanes.images * lanes.pixels)
+    images = ImageStack.black(lanes.images * lanes.pixels)
     place = image * lanes.pixels + pixel
     dr.scatter_add(images.radiance, radiance * lanes.eye_scale, place)
     dr.scatter_add(images.hit, lanes.eye_scale, place, hit)
@@ -195,7 +195,7 @@ def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
 
 
 def connection_count(connections: int, max_depth: int) -> float:
-    """Technique count of connections: n_C over a nominal number of vertices per light path.
+    """The technique count of connections: n_C over a nominal number of vertices per light path.
 
     A connection picks one of a path's vertices at random, so each (s, t) gets n_C/length of them on average. Any
     constant keeps the estimate unbiased (the counts only shape the weights); 3 is about the length in the closed rooms

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 LAUNCH_PATHS = 1 << 20
-"""Most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
+"""The most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)

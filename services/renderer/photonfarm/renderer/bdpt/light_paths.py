@@ -82,7 +82,7 @@ class LightState:
 
 
 def empty_vertices(n: int) -> LightVertices:
-    """Room for one vertex of each of n light paths."""
+    """Memory for one vertex of each of n light paths."""
     return LightVertices(
         *(
             dr.empty(kind, n)

@@ -49,7 +49,7 @@ def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorde
     check_scene(scene, light_paths=True)
     if not scene.emitters():
         zeros = np.zeros((paths * depth, 3), np.float32)
-        return Photons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(paths * depth, -1, np.int32))
+        return TracedPhotons(zeros, zeros.copy(), zeros.copy(), zeros.copy(), np.full(paths * depth, -1, np.int32))
     with dr.suspend_grad():
         lights = read_lights(scene)
         keys = randomness.image_keys([seed & 0xFFFFFFFF])
@@ -57,7 +57,7 @@ def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorde
         traced = partial(recorder, (paths, depth, lights.kinds)) if recorder else trace
         out, bounce = traced(scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
-    return Photons(position, direction, normal, power / np.float32(paths), np.array(bounce))
+    return TracedPhotons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 
 
 def trace(

@@ -1,14 +1,14 @@
 """Random numbers: Owen-scrambled Sobol' points, in pairs of dimensions, each with its own scramble.
 
-A *sequence* is what is stratified together: the samples of one pixel for eye paths, all light paths of an image for
-light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol' whose index and
+The points of a *sequence* are stratified together: the samples of one pixel for eye paths, all light paths of an image
+for light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol' whose index and
 coordinates are scrambled as Owen does, by hashing (Burley, *Practical Hash-based Owen Scrambling*, JCGT 2020; the
 permutation is that of Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point is uniform, and
 an estimate from them has the expectation of independent ones; sequences of different seeds, pixels or purposes are
 independent of each other.
 
-Seeds enter the kernels as data, so another seed never compiles anything. The sensor's own sampler only says how many
-samples a pixel gets by default: two kinds of path would use it up differently.
+Seeds enter the kernels as data, so another seed never compiles anything. The sensor's own sampler only sets the default
+number of samples per pixel: the two kinds of path would consume it differently.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LIGHT, EYE, PAIRING, PHOTONS = range(4)
 _ULP = 1 / (1 << 24)
 
 SHIFTS = 64
-"""Depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
+"""The depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
 
 
 def image_keys(seeds: Sequence[int]) -> mi.UInt32:

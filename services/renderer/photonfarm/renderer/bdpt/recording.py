@@ -15,7 +15,7 @@ State = TypeVarTuple("State")
 log = logging.getLogger(__name__)
 
 RECORDINGS = 16
-"""Kinds of launch kept ready: the oldest makes room for a new one."""
+"""The number of recordings kept: the oldest makes room for a new one."""
 
 ATTEMPTS = 2
 

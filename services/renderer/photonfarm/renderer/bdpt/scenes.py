@@ -1,4 +1,4 @@
-"""What this integrator accepts of a scene."""
+"""The scenes that this integrator accepts."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Which light to choose: a table of probabilities over a coarse grid of the scene, made from the lights as they are.
 
-In each cell a light is chosen in proportion to the irradiance it would cast there if nothing stood between, estimated
-from a few samples of the light seen from points of the cell; a share stays with the lights' own sampling weights, since
-what is not in between is not known. The table is data: it is made on the device at the start of each render, and any
+In each cell a light is chosen in proportion to the irradiance it would cast there without occluders, estimated from a
+few samples of the light seen from points of the cell; a share stays with the lights' own sampling weights, since
+occluders are not known. The table is data: it is made on the device at the start of each render, and any
 positive probabilities leave the estimate unbiased (cf. Shirley, Wang and Zimmerman, *Monte Carlo Techniques for Direct
 Lighting Calculations*, 1996, who choose by an unshadowed estimate at each point).
 """
@@ -21,7 +21,7 @@ CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell
 _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
-_MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: no wall lies between two cells by its design
+_MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
 
 LightIndex: TypeAlias = "mi.Int32 | mi.UInt32"
 """Numbers of lights; ``dr.binary_search`` finds signed ones."""

@@ -1,4 +1,4 @@
-"""What this package needs of Mitsuba's variant, said once, and checked on import."""
+"""The requirements on Mitsuba's variant, checked on import."""
 
 from __future__ import annotations
 

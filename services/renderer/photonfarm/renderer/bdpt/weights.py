@@ -27,7 +27,7 @@ Number: TypeAlias = "mi.Float | float"
 """What the weights are made of: arrays of the renderer, or plain numbers of the tests."""
 
 LARGEST = 1e30
-"""Sums are held below this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
+"""Sums are clamped to this, so that no infinity meets a zero; weights of such samples are below 1e-20 either way."""
 
 
 def light_start(nee_density: Number, emission: Number) -> Number:

@@ -1,1 +1,1 @@
-"""Jobs: what a render job computes, and the buffers along a camera path."""
+"""Jobs: rendering a job's samples, and the buffers along a camera path."""

@@ -1,4 +1,4 @@
-"""`photonfarm buffers`: what a network needs to show views that nobody rendered, such as those of a camera path."""
+"""`photonfarm buffers`: a network's inputs for views without samples, such as those of a camera path."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from photonfarm.shared.store.read.find import scene_named
 
 
 def write_buffers(store: str | Path, scene: str, modification: str | None, path: CameraPath | int, out: Path) -> int:
-    """Render what a camera path shows, or an orbit of so many frames, into a file; how many frames it has.
+    """Render the buffers of a camera path, or of an orbit of so many frames, into a file; returns the number of frames.
 
-    Raises StoreError for a scene that the store does not hold, SceneNotHereError where its files are not here,
-    SpecError for a configuration that the scene cannot have.
+    Raises StoreError for a scene that the store does not hold, SceneNotHereError if its files are not on this machine,
+    SpecError for an impossible configuration.
     """
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
@@ -54,9 +54,9 @@ def frames_of(
     load: SceneLoader = load_scene,
     guides: GuideSpec | None = None,
 ) -> Frames:
-    """The buffers of views of one configuration, its photons if the scene has some, and what the views see of them.
+    """The buffers of views of one configuration, its photons if the scene has some, and which of them the views see.
 
-    With their guides, rendered as is told; None: without.
+    With `guides` also their guides, rendered with these settings.
 
     The photons are those that the store holds of the configuration, or would: their seed follows from its key. `cloud`
     is the stored base cloud; without one it is sampled, as a job would. Raises IncompleteError for values that are not
@@ -80,10 +80,10 @@ def frames_of(
 
 
 def _guides(
-    scene: SceneRenderer, modification: Modification, views: Sequence[View], told: tuple[str, GuideSpec, BasePointCloud]
+    scene: SceneRenderer, modification: Modification, views: Sequence[View], of: tuple[str, GuideSpec, BasePointCloud]
 ) -> Guides:
-    """The guides of all views, stacked; `told` is the scene's id, how they are rendered, and its base cloud."""
-    scene_id, wanted, cloud = told
+    """The guides of all views, stacked; `of` holds the scene's id, the guides' settings, and the base cloud."""
+    scene_id, wanted, cloud = of
     key, lit = modification.key(scene_id), lit_points(cloud, modification)
     found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]
     return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

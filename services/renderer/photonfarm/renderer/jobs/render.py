@@ -1,7 +1,7 @@
 """One job: one shard of samples, rendered in the order that edits the scene least, and committed.
 
 Seeds are functions of content keys: sample key and "half A" or "half B", modification key and "photons". A render with
-a non-finite value is thrown away and drawn again with the next seed of its kind; nothing is replaced or clamped.
+a non-finite value is discarded and drawn again with the next seed of its kind; no value is replaced or clamped.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 
 ATTEMPTS = 3
-"""Seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
+"""The seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
 
 SCENES_KEPT = 2
-"""Loaded scenes kept warm: jobs of two scenes may alternate in the queue."""
+"""The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
 
 _PACKAGES = ("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "numpy", "zarr")
 
@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneRenderer(Protocol):
-    """A loaded scene that is edited in place: what a job needs of `LoadedScene` in `renderer.scene.loaded_scene`."""
+    """A loaded scene that is edited in place: the part of `renderer.scene.loaded_scene.LoadedScene` that jobs use."""
 
     def apply(self, modification: Modification) -> None:
         """Put the scene into a configuration."""
@@ -62,16 +62,16 @@ class SceneRenderer(Protocol):
         """The image-space buffers of a view."""
 
     def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
-        """What is known of a view beside its buffers, rendered as is wanted; `key` is the view's.
+        """The guides of a view, rendered as `wanted`; `key` is the view's.
 
-        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        `lit` are positions and normals (L, 3) of the points whose irradiance is required.
         """
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether a view sees points (N, 3) of the current configuration, (N,)."""
 
     def photons(self, seed: int) -> Photons | None:
-        """Light sub-paths of the current configuration; None if the spec wants none."""
+        """Light sub-paths of the current configuration; None for a spec without photons."""
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud of the scene at rest."""
@@ -95,13 +95,13 @@ _serving: ShardRenderer | None = None
 
 
 def serve(renderer: ShardRenderer) -> None:
-    """Make `render_shard` work in this process; the store is the worker's own choice and never comes from the queue."""
-    global _serving  # RQ calls a module's function, and what is loaded lives as long as the process
+    """Enable `render_shard` in this process; the worker itself chooses the store, which never comes from the queue."""
+    global _serving  # RQ calls a module's function, and a loaded scene lives as long as the process
     _serving = renderer
 
 
 def render_shard(scene_id: str, job: int) -> None:
-    """Render and commit one job: the one function that the queue may name."""
+    """Render and commit one job: the one function that RQ calls."""
     if _serving is None:
         raise IncompleteError("render_shard runs inside `photonfarm work` only, which says where the store is")
     _serving.render(scene_id, job)
@@ -109,14 +109,14 @@ def render_shard(scene_id: str, job: int) -> None:
 
 @dataclass(slots=True, eq=False)
 class _Loaded:
-    """A scene that is loaded, and what the store has of it."""
+    """A loaded scene, and its place in the store."""
 
     stored: SceneStore
     scene: SceneRenderer
     _cloud: BasePointCloud | None = None
 
     def cloud(self) -> BasePointCloud:
-        """The base point cloud that is stored; it is written first, with the geometry, where it is not there."""
+        """The stored base point cloud; it is written first, with the geometry, if it is missing."""
         if not self.stored.has_base():
             self.stored.write_base(*self.scene.base())
             self._cloud = None
@@ -126,20 +126,20 @@ class _Loaded:
 
 
 class ShardRenderer:
-    """Renders jobs of a store, keeping the scenes it has loaded last."""
+    """Renders jobs of a store, keeping the most recently used scenes loaded."""
 
     def __init__(self, store: Store, *, worker: str, load: SceneLoader = load_scene) -> None:
-        """Take a store; `worker` is the name that markers get."""
+        """Take a store; `worker` is the name written into markers."""
         self._store = store
         self._worker = worker
         self._load = load
-        self._scenes: dict[str, _Loaded] = {}  # last used last
+        self._scenes: dict[str, _Loaded] = {}  # in the order of their last use
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit what one job lacks; False if it lacked nothing, or another worker was first meanwhile.
+        """Render and commit what a job lacks; False if it lacked nothing, or another worker committed it meanwhile.
 
-        That is its guides, where the scene has some, and then its samples. False too if a repair took its files
-        meanwhile: it is missing then, and comes again.
+        It renders the job's guides, if the scene has some, and then its samples. It also returns False if a repair
+        removed the job's files meanwhile: the job is then missing, and queued again.
 
         Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
         the planned one, IncompleteError if renders stay non-finite or buffers are.
@@ -154,7 +154,7 @@ class ShardRenderer:
         return self._render_samples(loaded, job) if not stored.is_committed(job) else guided
 
     def _render_guides(self, loaded: _Loaded, job: int) -> bool:
-        """Render and commit the guides of a job's new views; False if another worker was first."""
+        """Render and commit the guides of a job's new views; False if another worker was faster."""
         stored, scene, began = loaded.stored, loaded.scene, self._now()
         rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
         cloud = loaded.cloud()
@@ -187,7 +187,7 @@ class ShardRenderer:
         return time.monotonic(), time.process_time()
 
     def _figures(self, began: tuple[float, float], redrawn: int) -> Figures:
-        """What was done since `began`, for a marker."""
+        """The cost of the work since `began`, for a marker."""
         wall, core = self._now()
         return Figures(
             core_s=core - began[1],
@@ -202,18 +202,18 @@ class ShardRenderer:
             self._scenes[scene_id] = self._scenes.pop(scene_id)
         else:
             stored = self._store.scene(scene_id)
-            spec = located(stored.spec)  # before another scene is let go for it
+            spec = located(stored.spec)  # before another scene is unloaded for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
-            gc.collect()  # Dr.Jit finds no kernel in its cache while an older scene is still half alive
+            gc.collect()  # while an older scene is still partly alive, Dr.Jit finds no kernel in its cache
             self._scenes[scene_id] = _Loaded(stored, self._load(spec))
         return self._scenes[scene_id]
 
 
 def located(spec: SceneSpec) -> SceneSpec:
-    """The spec, once its scene file has been found on this machine and is the one that was planned.
+    """The spec, once its scene file has been found on this machine and is the planned one.
 
-    Raises SceneNotHereError otherwise: that is the machine's fault and not the job's, which others may do.
+    Raises SceneNotHereError otherwise: other machines may still render the job.
     """
     try:
         here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
@@ -229,7 +229,7 @@ def located(spec: SceneSpec) -> SceneSpec:
 
 @cache
 def versions() -> Mapping[str, str]:
-    """Versions of what renders, by package."""
+    """The versions of the packages that affect renders."""
     found = {}
     for package in _PACKAGES:
         try:
@@ -250,7 +250,7 @@ def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, 
 def visibility_of(
     scene: SceneRenderer, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
 ) -> Visibility:
-    """What a view sees of the current configuration: of its cloud, as `rebuild` gives it, and of its photons."""
+    """Which points a view sees in the current configuration: of its cloud, as `rebuild` returns it, and its photons."""
     position, present = points
     if photons is None:
         return Visibility(scene.sees(view, position) & present, np.zeros(0, np.bool_))
@@ -259,7 +259,7 @@ def visibility_of(
 
 
 class _Rendering:
-    """One pass over a job's samples: each modification applied once, each new view looked at once."""
+    """One pass over a job's samples: each modification is applied once, and each new view's buffers rendered once."""
 
     def __init__(self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter) -> None:
         self._scene = scene
@@ -269,10 +269,10 @@ class _Rendering:
         self._redrawn = 0
 
     def run(self, rows: JobRows) -> int:
-        """Hand every row of the job to its writer; how many renders were thrown away.
+        """Pass every row of the job to its writer; returns the number of discarded renders.
 
-        Photons that another job stores, with the modification, are traced for the views that are new here: their seed
-        follows from the modification's key, so that they come out the same. That job counts what it throws away.
+        Photons that another job stores, with the modification, are traced again for this job's new views: their seed
+        follows from the modification's key, so that they are equal. That job counts the renders discarded for them.
         """
         new_views = set(rows.new_views)
         for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
@@ -296,7 +296,7 @@ class _Rendering:
         return self._redrawn
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
-        """They know no seed, so that another try would not help."""
+        """Render the buffers of a view, without a second attempt: they depend on no seed."""
         buffers = self._scene.buffers(view)
         _check_finite(arrays_of(buffers), f"view {sample.view_row}", f" (sample {sample.key.hex()})")
         return buffers
@@ -313,41 +313,41 @@ class _Rendering:
         return halves
 
     def _again(self, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> F32:
-        """Another estimate for one that came out non-finite; other seeds than those that are `taken`."""
-        self._throw_away(key, purpose)
+        """Render another estimate in place of a non-finite one, with seeds that are not `taken`."""
+        self._discard(key, purpose)
         for seed in islice(_seeds(key, purpose, taken), ATTEMPTS - 1):
             image = self._scene.render_halves(view, (seed,))[0]
             if np.isfinite(image).all():
                 return image
-            self._throw_away(key, purpose)
+            self._discard(key, purpose)
         raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
-    def _throw_away(self, key: Key, purpose: str) -> None:
+    def _discard(self, key: Key, purpose: str) -> None:
         self._redrawn += 1
-        _tell_thrown_away(key, purpose)
+        _log_discarded(key, purpose)
 
 
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
-    """Raise IncompleteError unless all values of what knows no seed are finite."""
+    """Raise IncompleteError unless all values of arrays that depend on no seed are finite."""
     for name, values in arrays.items():
         if not np.isfinite(values.astype(np.float32)).all():
             raise IncompleteError(f"{name} of {what} came out non-finite{more}")
 
 
 def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:
-    """The photons of the current configuration, by its key, and how often they were not finite before.
+    """The photons of the current configuration, by its key, and the number of attempts that were not finite.
 
-    None if the spec wants none. Raises IncompleteError if they stay non-finite.
+    None for a spec without photons. Raises IncompleteError if they stay non-finite.
     """
     for thrown, seed in enumerate(islice(_seeds(key, "photons", ()), ATTEMPTS)):
         photons = scene.photons(seed)
         if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
             return photons, thrown
-        _tell_thrown_away(key, "photons")
+        _log_discarded(key, "photons")
     raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
 
 
-def _tell_thrown_away(key: Key, purpose: str) -> None:
+def _log_discarded(key: Key, purpose: str) -> None:
     log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
 
 

@@ -1,7 +1,7 @@
-"""`photonfarm scene exposure`: the exposure at which a scene's pictures are as bright, on the average, as is wanted.
+"""`photonfarm scene exposure`: the exposure that gives a scene's pictures a wanted mean brightness.
 
-How bright they are is their display mean, that of clip(exposure · I, 0, 1)^(1/2.2) over pixels, channels and views. It
-grows with the exposure, so bisection finds the exposure in images that are rendered once.
+Brightness is the display mean: the mean of clip(exposure · I, 0, 1)^(1/2.2) over pixels, channels and views. It grows
+with the exposure, so bisection finds the exposure in images that are rendered once.
 
 Shape letters: N views, H W image.
 """
@@ -26,52 +26,52 @@ from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import sample_view
 
 TARGET = 0.45
-"""Display mean of a picture that is neither dark nor bright."""
+"""The display mean of a picture that is neither dark nor bright."""
 
 FRAMES = 24
-"""Views that are rendered, unless told otherwise: they differ more in brightness than noise is worth removing."""
+"""The default number of views: their brightness differs so much that less noise would not help."""
 
 SIDE = 64
-"""Pixels along the longer side that are enough: the display mean hardly knows the resolution."""
+"""The pixels along the longer side: the display mean hardly depends on the resolution."""
 
 PATHS = 1 << 17
-"""Eye paths of a half of an image: 32 samples per pixel of a square one."""
+"""The eye paths of a half of an image: 32 samples per pixel of a square one."""
 
 RANGE = (-40.0, 40.0)
-"""Exposures that are looked among, as powers of 2."""
+"""The range of the search, as powers of 2."""
 
 EXACT = 1e-4
-"""Width of the powers' range at which the search ends."""
+"""The range of powers at which the search ends."""
 
 SEED = 0
-"""Master seed of configurations and views, as `submit` has it unless told otherwise."""
+"""The master seed of configurations and views, the same as the default of `submit`."""
 
-Talk = Callable[[str], None]
-"""Takes a line on what is going on."""
+Log = Callable[[str], None]
+"""A function that takes a line about the progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """An exposure, and how well it is known."""
+    """An exposure, and its uncertainty."""
 
     scene_id: str
-    target: float  # the display mean that is wanted
-    exposure: float  # that gives it
-    low: float  # where the mean over the views is a standard error below, and above; None where no exposure gives that
+    target: float  # the wanted display mean
+    exposure: float  # the exposure that gives it
+    low: float  # with the mean over the views a standard error lower, and higher; None if no exposure gives that
     high: float | None
     standard_error: float  # of the display mean, over views
-    noise: float  # by how much noise would lower the display mean; it is taken out
+    noise: float  # the amount by which noise would lower the display mean; it is taken out
     present: float  # the spec's exposure
     present_mean: float  # the display mean at that
     frames: int
     half_spp: int
 
     def document(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """All fields, for JSON."""
         return asdict(self)
 
     def line(self) -> str:
-        """All of it in words."""
+        """All fields in words."""
         high = "no upper end" if self.high is None else f"{self.high:.3g}"
         return (
             f"exposure {self.exposure:.3g} ({self.low:.3g} … {high}): display mean {self.target:g} ± "
@@ -87,15 +87,16 @@ class Pictures:
     halves: F32  # (N, 2, H, W, 3) linear radiance
 
     def display_means(self, exposure: float) -> NDArray[np.float64]:
-        """Of each view, (N,), without noise.
+        """The display mean of each view without noise, (N,).
 
-        The display's curve is concave, and so noise lowers the mean, in proportion to its variance where that is small.
-        The whole image has half the variance of its halves: by what they are lower, it is itself too low.
+        The display's curve is concave, so noise lowers the mean, in proportion to its variance if that is small. The
+        whole image has half the variance of its halves: what they lose against it, it loses against the noise-free
+        image.
         """
         return self.noisy_means(exposure) + self._lowered(exposure)
 
     def noisy_means(self, exposure: float) -> NDArray[np.float64]:
-        """Of each view's whole image, (N,), noise and all."""
+        """The display mean of each view's whole image with its noise, (N,)."""
         return _means(self.halves.mean(axis=1), exposure)
 
     def _lowered(self, exposure: float) -> NDArray[np.float64]:
@@ -103,7 +104,7 @@ class Pictures:
         return self.noisy_means(exposure) - np.mean(halves, axis=0)
 
     def exposure(self, target: float) -> float | None:
-        """The one at which the mean over all views is `target`; None where none is high enough."""
+        """The exposure at which the mean over all views is `target`; None if none is high enough."""
         low, high = RANGE
         if self.display_means(2**high).mean() < target:
             return None
@@ -119,15 +120,15 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, talk: Talk, *, target: float = TARGET, frames: int = FRAMES
+    spec: SceneSpec, beside: Path | None, log: Log, *, target: float = TARGET, frames: int = FRAMES
 ) -> Proposal:
-    """Render some views, each of a random configuration of its own, and look for the exposure in them.
+    """Render some views, each of a random configuration of its own, and search for the exposure.
 
-    The backend must have been loaded. Raises SpecError as loading does, and where too much is black for any exposure.
+    The backend must have been loaded. Raises SpecError as loading does, and if too much is black for any exposure.
     """
     small = _small(spec)
     spp = _half_spp(small.film)
-    talk(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
+    log(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
     pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp))))
     exposure = pictures.exposure(target)
     if exposure is None:

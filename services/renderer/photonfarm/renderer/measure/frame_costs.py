@@ -1,6 +1,6 @@
-"""`photonfarm measure-frames`: what the parts of one frame cost on this machine, and what its pixels show.
+"""`photonfarm measure-frames`: the cost of the parts of one frame on this machine, and the surfaces in its pixels.
 
-Times are wall times until a part's result lies in numpy's memory, in a process whose thread pool is one thread.
+A part is timed on the wall clock until its result is in numpy's memory, in a process whose thread pool is one thread.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.find import scene_named
 
 WARM_UPS = 2
-"""Frames before those that count: the first compiles kernels, the second is the first to replay recorded launches."""
+"""The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """What a row of the store shows."""
+class TimedFrame:
+    """The configuration and the view of a row of the store."""
 
     row: int
     modification: Modification
@@ -53,8 +53,8 @@ def write_frame_costs(
     """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
 
     The backend must have been loaded, with one thread.
-    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError where the scene's files are
-    not here.
+    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError if the scene's files are
+    not on this machine.
     """
     opened = Store(store)
     reader = SceneReader(store, scene_id := scene_named(opened, scene))
@@ -77,17 +77,17 @@ def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
         )
 
 
-def _frame(reader: SceneReader, row: int) -> Frame:
+def _frame(reader: SceneReader, row: int) -> TimedFrame:
     modification, view, _ = reader.inputs(row)
-    return Frame(row, modification, reader.modification_key(row), view)
+    return TimedFrame(row, modification, reader.modification_key(row), view)
 
 
 def frame_costs(
-    scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[Frame], kept: Sequence[int], timed: int
+    scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[TimedFrame], kept: Sequence[int], timed: int
 ) -> FrameCosts:
     """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
 
-    Frames are taken again where there are fewer than are timed.
+    If there are fewer frames than are timed, they are repeated.
     """
     films = [PartialFilm(scene.spec, k) for k in kept]
     surface = np.stack([_surfaces(scene, frame) for frame in frames])
@@ -102,16 +102,16 @@ def frame_costs(
     )
 
 
-def in_turn(frames: Sequence[Frame]) -> Iterator[Frame]:
+def in_turn(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
     """The frames without end, one of each configuration in turn: neighbours differ in it, unless all have the same."""
-    of_configuration: dict[Key, list[Frame]] = {}
+    of_configuration: dict[Key, list[TimedFrame]] = {}
     for frame in frames:
         of_configuration.setdefault(frame.key, []).append(frame)
     for turn in cycle([cycle(alike) for alike in of_configuration.values()]):
         yield next(turn)
 
 
-def _surfaces(scene: LoadedScene, frame: Frame) -> NDArray[np.uint8]:
+def _surfaces(scene: LoadedScene, frame: TimedFrame) -> NDArray[np.uint8]:
     scene.apply(frame.modification)
     return surface_kinds(scene.scene, frame.view, scene.spec)
 
@@ -120,20 +120,20 @@ def _surfaces(scene: LoadedScene, frame: Frame) -> NDArray[np.uint8]:
 
 
 def _seconds(
-    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[Frame], timed: int
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[TimedFrame], timed: int
 ) -> NDArray[np.float64]:
-    """Of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
+    """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
     stays = len({frame.key for frame in frames}) == 1
     measured = []
     for seed, frame in enumerate(islice(in_turn(frames), WARM_UPS + timed)):
-        if stays:  # there would be nothing to edit
+        if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
         measured.append(_time_frame(scene, cloud, films, frame, seed))
     return np.array(measured[WARM_UPS:]).T
 
 
 def _time_frame(
-    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: Frame, seed: int
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: TimedFrame, seed: int
 ) -> list[float]:
     edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
     buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
@@ -144,8 +144,8 @@ def _time_frame(
     return [edit_s, buffers_s, guides_s, points_s, *photons, *render_s]
 
 
-def _time_photons(scene: LoadedScene, frame: Frame) -> tuple[float, float]:
-    """Seconds to trace the configuration's photons, and to find which the view sees; zeros for a scene without."""
+def _time_photons(scene: LoadedScene, frame: TimedFrame) -> tuple[float, float]:
+    """Seconds to trace the configuration's photons, and to find those that the view sees; zeros for a scene without."""
     photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
     if photons is None:
         return 0.0, 0.0
@@ -158,12 +158,12 @@ def _edit(scene: LoadedScene, modification: Modification) -> None:
     dr.sync_thread()
 
 
-def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> Guides:
+def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> Guides:
     key = view_key(frame.key, frame.view.vector)
     return scene.guides(frame.view, key, scene.spec.guides, lit_points(cloud, frame.modification))
 
 
-def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: Frame) -> NDArray[np.bool_]:
+def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> NDArray[np.bool_]:
     position, present = rebuild(cloud, frame.modification)
     return scene.sees(frame.view, position) & present
 

@@ -1,8 +1,8 @@
-"""Images of 1/k of the pixels: what rendering the pixels that a method keeps costs.
+"""Images of 1/k of the pixels: the cost of rendering only the pixels that a method keeps.
 
-They stand for pixels of the whole image: as wide a view on a smaller film, with as many light paths as the whole image
-has, since what these splat onto the lens cannot be kept to some of its pixels. The integrator takes 64 light paths per
-eye path at most, so that an image that would need more is charged too little. Sides are rounded to whole pixels, so
+They stand for some pixels of the whole image: the same field of view on a smaller film, with as many light paths as the
+whole image has, since their splats cannot be limited to some of its pixels. The integrator allows 64 light paths per
+eye path at most, so that the cost of an image that would need more is too low. Sides are rounded to whole pixels, so
 that the image may have a few more or fewer than 1/k.
 """
 
@@ -20,11 +20,11 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 
 MOST_LIGHT_PATHS = 64.0
-"""Light paths per eye path that the integrator allows."""
+"""The most light paths per eye path that the integrator allows."""
 
 
 class PartialFilm:
-    """About 1/k of the pixels of a spec's film, and what renders them; k = 1 gives the spec's own images."""
+    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images."""
 
     def __init__(self, spec: SceneSpec, k: int) -> None:
         self.spec = part_of(spec, k)
@@ -44,6 +44,6 @@ def part_of(spec: SceneSpec, k: int) -> SceneSpec:
     height = max(1, round(spec.film.height / sqrt(k)))
     width = max(1, round(pixels / (k * height)))
     light_ratio = min(spec.transport.light_ratio * pixels / (width * height), MOST_LIGHT_PATHS)
-    film = spec.film.model_copy(update={"width": width, "height": height})  # no spec: it need not divide by 8
+    film = spec.film.model_copy(update={"width": width, "height": height})  # sides need not be divisible by 8
     transport = spec.transport.model_copy(update={"light_ratio": light_ratio})
     return spec.model_copy(update={"film": film, "transport": transport})

@@ -1,7 +1,7 @@
 """`photonfarm scene cost`: what samples of a scene cost on this machine, and how noisy they are.
 
-Times are CPU times of a process whose thread pool is one thread, until a part's result lies in numpy's memory: what a
-worker takes, without what it takes once for a scene, and without storing.
+Times are CPU times of a process whose thread pool is one thread, until a part's result is in numpy's memory: the time
+of a worker without what it does once for a scene, and without storing.
 """
 
 from __future__ import annotations
@@ -32,79 +32,81 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 
 SEED = 0
-"""Master seed of configurations and views, as `submit` has it unless told otherwise."""
+"""The master seed of configurations and views, the same as the default of `submit`."""
 
 FRAMES = 6
-"""Views that are measured, unless told otherwise."""
+"""The default number of measured views."""
 
 RANGE = 4
-"""How many times as many samples the larger of the two timed passes has, which tells the fixed part from theirs."""
+"""The ratio of samples between the two timed passes, which separates the fixed part from the cost of samples."""
 
 MOST_PATHS = 1 << 21
-"""Eye paths of a half of the larger pass, unless one sample of each pixel needs more: those of clean images would
-take minutes, and beyond a launch of the integrator time is proportional to samples anyway."""
+"""The most eye paths of a half of the larger pass, unless one sample of each pixel needs more.
 
-TALK_SECONDS = 10.0
-"""Least seconds between two lines of progress."""
+Clean images would take minutes, and beyond one launch of the integrator time is proportional to samples anyway.
+"""
+
+LOG_SECONDS = 10.0
+"""The least seconds between two lines of progress."""
 
 Result = TypeVar("Result")
-Talk = Callable[[str], None]
-"""Takes a line on what is going on."""
+Log = Callable[[str], None]
+"""A function that takes a line about the progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """What was measured of one view, named as in `SampleCosts`."""
+    """The measurements in one view, named as in `SampleCosts`."""
 
     configuration_s: float
     view_s: float  # with guides
     guides_s: float
     pass_s: float
     spp_s: float
-    noise: float | None  # None where nothing is seen, or not all of it is finite
+    noise: float | None  # None if nothing is seen, or values are not finite
 
 
-def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, talk: Talk) -> SampleCosts:
-    """The costs that were measured here before of as many frames, unless they are wanted again; else those of now.
+def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Log) -> SampleCosts:
+    """The costs kept from an earlier measurement here of as many frames; with `again`, or without one, measured now.
 
     The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
     """
     file = cache.file_of("costs", cache.digest_here("sample costs with guides", spec.scene_id, str(frames)))
     if not again and (kept := _kept(file)) is not None:
         return kept
-    talk(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
-    costs = measured_costs(spec, beside, frames, talk)
+    log(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
+    costs = measured_costs(spec, beside, frames, log)
     try:
         cache.write_whole(file, costs.json())
     except OSError as error:
-        talk(f"the measurement could not be kept: {error}")
+        log(f"the measurement could not be kept: {error}")
     return costs
 
 
 def _kept(file: Path) -> SampleCosts | None:
     try:
         return SampleCosts.read(file.read_bytes())
-    except (OSError, StoreError):  # none, or none that can be used
+    except (OSError, StoreError):  # no measurement, or an unusable one
         return None
 
 
 def measured_costs(
-    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, talk: Talk | None = None
+    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, log: Log | None = None
 ) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
-    return sample_costs(LoadedScene.load(spec, beside), frames, talk)
+    return sample_costs(LoadedScene.load(spec, beside), frames, log)
 
 
-def sample_costs(scene: LoadedScene, frames: int, talk: Talk | None = None) -> SampleCosts:
-    """Medians over the views of so many random configurations, one of each, after some that do not count."""
+def sample_costs(scene: LoadedScene, frames: int, log: Log | None = None) -> SampleCosts:
+    """The medians over views of `frames` random configurations, one view of each, after some untimed ones."""
     cloud = scene.base()[1]
-    measured, told = [], time.monotonic()
+    measured, logged = [], time.monotonic()
     for number in range(WARM_UPS + frames):
         measured.append(_measured(scene, cloud, number))
-        if talk is not None and time.monotonic() - told > TALK_SECONDS:
-            talk(f"view {number + 1} of {WARM_UPS + frames}")
-            told = time.monotonic()
+        if log is not None and time.monotonic() - logged > LOG_SECONDS:
+            log(f"view {number + 1} of {WARM_UPS + frames}")
+            logged = time.monotonic()
     measured = measured[WARM_UPS:]
     noise = [frame.noise for frame in measured if frame.noise is not None]
     return SampleCosts(
@@ -134,7 +136,7 @@ def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
 
 
 def fewer_samples(spec: SceneSpec) -> int:
-    """Samples per pixel of a half of the smaller pass: the spec's own, or fewer where 4 times these are many."""
+    """The samples per pixel of a half of the smaller pass: the spec's own, or fewer if 4 times as many are too many."""
     of_film = RANGE * spec.film.width * spec.film.height
     return int(np.clip(MOST_PATHS // of_film, 1, spec.transport.half_spp))
 
@@ -149,7 +151,7 @@ def _configure(
     scene: LoadedScene, cloud: BasePointCloud, modification: Modification
 ) -> tuple[tuple[F32, NDArray[np.bool_]], Photons | None]:
     scene.apply(modification)
-    dr.sync_thread()  # what is not evaluated by then would be charged to the view
+    dr.sync_thread()  # pending evaluations would be charged to the view
     return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.scene_id))[0]
 
 

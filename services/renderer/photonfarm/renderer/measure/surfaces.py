@@ -1,8 +1,8 @@
 """The kind of the first surface at each pixel's centre, by the lobes that its BSDF has.
 
-Flags tell of a whole BSDF and not of a point on it: a blend or a `principled` whose glossy part is textured away
-somewhere is glossy there too, and a two-sided surface has the lobes of both sides. A null lobe, as masks have beside
-those of what they mask, lets light through as if nothing was there, and makes nothing a coated surface.
+Flags describe a whole BSDF and not a point on it: a blend or a `principled` whose glossy part is textured away
+somewhere is glossy there too, and a two-sided surface has the lobes of both sides. A null lobe, which masks have beside
+the lobes of what they mask, lets light pass unchanged, and does not count as a coat.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from photonfarm.shared.scene.view import Camera, View
 
 
 def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
-    """What a view shows at each pixel's centre, (H, W) of `Surface`, between the planes that its buffers keep to."""
+    """The kind of surface at each pixel's centre, (H, W) of `Surface`, between the view's clipping planes."""
     camera = Camera.of(view, spec)
     si = first_surfaces(scene, camera, camera.rays(), spec)
     kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _by_lobes(si.bsdf().flags()))
@@ -30,7 +30,7 @@ def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
 
 
 def _by_lobes(flags: Any) -> Any:
-    """DIFFUSE, SPECULAR or MIRROR (UInt32) for a BSDF's flags."""
+    """The kind DIFFUSE, SPECULAR or MIRROR (UInt32), by a BSDF's flags."""
     diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
     glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy)
     delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)

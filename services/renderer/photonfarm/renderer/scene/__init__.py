@@ -1,1 +1,1 @@
-"""A scene in Mitsuba: loaded once, edited in place, and seen as buffers."""
+"""Scenes in Mitsuba: loaded once, edited in place, and rendered as buffers."""

@@ -1,14 +1,14 @@
-"""Embree told that a scene will change, so that it is rebuilt 4 to 6 times faster.
+"""Embree set up for a scene that will change, so that it is rebuilt 4 to 6 times faster.
 
 Mitsuba has Embree build for scenes that never change: one hierarchy over all triangles, with spatial splits, 1 µs a
-triangle. That was nearly all of what an edit cost, as every edit builds it anew. Embree's low quality, meant for
+triangle. That was nearly all of the cost of an edit, as every edit builds it anew. Embree's low quality, meant for
 dynamic scenes, makes one hierarchy per mesh and a small one above them. In the furnished rooms rays then take 0.7 to
 1.1 times as long (medians by scene and kind of ray), images 0.9 to 1.02 times. Its medium quality traces about as fast
-and takes a third longer to build. What rays meet is the same, but for which of two surfaces that touch comes first.
+and takes a third longer to build. Rays meet the same surfaces, except where two surfaces touch.
 
-Mitsuba has no parameter for it, so Embree is told directly, through its own C interface. The only way to its scene is
+Mitsuba has no parameter for it, so it is set directly, through Embree's own C interface. The only way to its scene is
 the graph of a ray that is not yet traced, which names two addresses: Embree's entry point and the scene. Nothing is
-done unless the first is where libembree3 has it, so that the second is what it must be.
+done unless the first is an address that libembree3 exports, so that the second must be the scene.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ _EDGE = re.compile(r"^\s*(\d+) -> (\d+)\b", re.MULTILINE)
 def expect_changes(scene: Any) -> bool:
     """Have Embree build the scene for changes from its next rebuild on.
 
-    Returns whether it will: False where Embree does not trace (CUDA, another build of Mitsuba), where edits then cost
-    what they cost.
+    Returns whether it will: False if Embree does not trace (CUDA, another build of Mitsuba), where edits keep their
+    cost.
     """
     library = _embree()
     if library is None:
@@ -52,7 +52,7 @@ def expect_changes(scene: Any) -> bool:
 
 
 def _embree() -> Any:
-    """The library libembree3 that Mitsuba has loaded, with the functions needed; None if it has not."""
+    """The library libembree3 that Mitsuba has loaded, with the functions needed; None if it is not loaded."""
     path = Path(mi.__file__).parent / "libembree3.so"
     if not mi.variant().startswith("llvm") or not path.is_file():
         return None
@@ -68,7 +68,7 @@ def _entry_points(library: Any) -> set[int]:
 
 
 def _traced_by(scene: Any) -> tuple[int, int]:
-    """Addresses of the function that traces a shadow ray of this scene, and of Embree's scene; zeros if not found."""
+    """The addresses of the function that traces a shadow ray here, and of Embree's scene; zeros if not found."""
     pending = scene.ray_test(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)))
     graph = dr.graphviz(as_string=True)
     pointers = {int(node): int(address, 16) for node, address in _POINTER.findall(graph)}
@@ -78,7 +78,7 @@ def _traced_by(scene: Any) -> tuple[int, int]:
 
 
 def _inputs_of_trace(graph: str, result: int) -> list[int]:
-    """What goes into the one traced ray that `result` comes from, in order; nothing if there is not one."""
+    """The inputs of the one traced ray that `result` depends on, in order; empty unless there is exactly one."""
     inputs = defaultdict(list)
     for source, target in _EDGE.findall(graph):
         inputs[int(target)].append(int(source))

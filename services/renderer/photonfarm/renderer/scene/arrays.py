@@ -1,4 +1,4 @@
-"""Arrays of numpy handed to Dr.Jit and back."""
+"""Conversions between arrays of numpy and of Dr.Jit."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.records import F32
 
 ALIGNMENT_BYTES = 64
-"""Width of the widest vector register."""
+"""The width of the widest vector register."""
 
 
 def floats(values: NDArray[Any]) -> Any:
     """All values, in order, as mi.Float in Dr.Jit's own memory.
 
-    Dr.Jit takes numpy's memory as it is, compiles a kernel anew for each combination of inputs that happen to lie on
-    odd addresses (numpy aligns to 16 bytes only), and `dr.freeze` does not notice when a mesh gets other such memory.
+    Dr.Jit uses numpy's memory without a copy, compiles a kernel anew for each combination of inputs at unaligned
+    addresses (numpy aligns to 16 bytes only), and `dr.freeze` does not notice when a mesh gets other such memory.
     """
     return _owned(mi.Float(_aligned(values, np.float32)) * dr.opaque(mi.Float, 1))
 
 
 def integers(values: NDArray[Any]) -> Any:
-    """The same for mi.UInt32."""
+    """All values, in order, as mi.UInt32 in Dr.Jit's own memory."""
     return _owned(mi.UInt32(_aligned(values, np.uint32)) * dr.opaque(mi.UInt32, 1))
 
 
@@ -49,7 +49,7 @@ def points(values: NDArray[Any]) -> Any:
 
 
 def matrix(values: NDArray[np.float64]) -> Any:
-    """A (4, 4) matrix as mi.Matrix4f whose entries the compiler does not know."""
+    """A (4, 4) matrix as mi.Matrix4f whose entries are opaque to the compiler."""
     return mi.Matrix4f(*(dr.opaque(mi.Float, float(entry)) for entry in values.ravel()))
 
 

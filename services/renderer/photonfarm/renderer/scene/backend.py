@@ -1,7 +1,7 @@
-"""Mitsuba made ready: LLVM found, the variant chosen, the integrator plugin registered. All set-up is here.
+"""The set-up of Mitsuba: LLVM is found, the variant chosen, and the integrator plugin registered, all here.
 
 Dr.Jit compiles through a libLLVM that it opens by itself. On machines with AVX-512 LLVM 15 and 16 crash on Mitsuba's
-kernels ("Cannot select"), so that only versions known to work are chosen unasked; DRJIT_LIBLLVM_PATH overrules.
+kernels ("Cannot select"), so that only versions known to work are chosen by default; DRJIT_LIBLLVM_PATH overrides.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
 DEFAULT_VARIANT = "llvm_ad_rgb"
 LLVM_VERSIONS = ("19", "22")
-"""Tried with Mitsuba's kernels, in order of preference."""
+"""The versions tested with Mitsuba's kernels, in order of preference."""
 
 _FOLDERS = ("lib/*-linux-gnu", "lib64", "lib", "lib/llvm-*/lib", "local/lib")
 _INSTALL_LLVM = f"install LLVM 19 (Debian and Ubuntu: libllvm19), or set {LLVM_VARIABLE} to a libLLVM"
 
 
 def load(threads: int | None = None) -> Any:
-    """The module `mitsuba`, its variant set and the plugin `bdpt` registered; cheap when called again.
+    """Return the module `mitsuba` with its variant set and the plugin `bdpt` registered; later calls are cheap.
 
     `threads` is the size of Dr.Jit's thread pool (1 for a worker: two processes of one thread beat one of two).
-    Raises BackendError, in one sentence that says what to install or to set.
+    Raises BackendError, with one sentence on what to install or to set.
     """
     variant = os.environ.get(VARIANT_VARIABLE) or DEFAULT_VARIANT
     if variant.startswith("llvm"):
@@ -46,7 +46,7 @@ def load(threads: int | None = None) -> Any:
 def find_llvm(roots: Iterable[Path] = (Path(sys.prefix), Path("/usr"))) -> str:
     """The libLLVM to use: the one that DRJIT_LIBLLVM_PATH names, else a version that works in a library folder.
 
-    Raises BackendError where there is none, or where it cannot be opened.
+    Raises BackendError if there is none, or if it cannot be opened.
     """
     named = os.environ.get(LLVM_VARIABLE)
     if named:
@@ -73,7 +73,7 @@ def _opened(library: str, failure: str) -> str:
 
 
 def _import(name: str) -> Any:
-    """Import a module; Dr.Jit without libatomic fails with a NameError that does not say so."""
+    """Import a module; without libatomic, Dr.Jit fails with a NameError that does not mention it."""
     try:
         return importlib.import_module(name)
     except NameError as error:

@@ -36,7 +36,7 @@ def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
 
 
 def cloud_of(scene: Any, geometry: Geometry, count: int, scene_id: str) -> BasePointCloud:
-    """`count` points uniform on the scene's surfaces, as they are at rest; which ones follows from the scene id."""
+    """`count` points uniform on the scene's surfaces, as they are at rest; the scene id determines which."""
     face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", scene_id), "surface"))
     corners = geometry.vertices[geometry.faces[face]].astype(np.float64)  # (P, 3 corners, 3)
     position = np.einsum("pk,pkx->px", barycentric, corners)

@@ -27,12 +27,12 @@ def dim(scene: Any, spec: SceneSpec) -> None:
 
 
 def factor_of(emitter: Any, spec: SceneSpec) -> float:
-    """The factor that a spec has of a light, if it is one of the scene's own."""
+    """The factor that a spec gives to one of the scene's own lights."""
     return spec.emitters.factor(_name(emitter))
 
 
 def _name(emitter: Any) -> str:
-    """What a spec calls a light: the id of its shape, or else `ENVIRONMENT` or its own."""
+    """The name of a light in a spec: the id of its shape, or else `ENVIRONMENT` or its own id."""
     shape = emitter.get_shape()
     return str(shape.id() if shape is not None else ENVIRONMENT if emitter.is_environment() else emitter.id())
 

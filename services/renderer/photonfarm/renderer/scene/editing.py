@@ -1,11 +1,11 @@
-"""Movable groups edited in place: nothing is added, taken away or compiled again once the scene is loaded.
+"""Movable groups edited in place: nothing is added, removed or compiled again once the scene is loaded.
 
 A removed group is *parked*: its shapes are shrunk to 10⁻⁴ of their size into the lower corner of the static geometry's
 bounding box, and its lights shine with radiance 0, which `bdpt` and its photon tracer never select. So counts, types
 and order of everything stay, and with them the compiled kernels. In the room `room` the corner lies outside the walls;
-in a scene that is open there, what is parked has 10⁻⁸ of its area and does not shine.
+in a scene that is open there, a parked group keeps 10⁻⁸ of its area and does not shine.
 
-Positions are always made from those at rest, so that no rounding adds up: at rest they are what was loaded, bit by bit.
+Positions are always computed from those at rest, so that no rounding adds up: at rest they are bit by bit as loaded.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Parking = NDArray[np.float32]
 
 
 class MeshPlacement:
-    """Where a mesh stands: its vertices moved, its normals as modelled."""
+    """Places a mesh: its vertices move, its normals stay as modelled."""
 
     def __init__(self, shape: Any) -> None:
         self._parameters = mi.traverse(shape)
@@ -36,7 +36,7 @@ class MeshPlacement:
         self._normals = np.array(self._parameters["vertex_normals"], np.float32) if shape.has_vertex_normals() else None
 
     def move(self, translation: F32) -> None:
-        """Put the shape `translation` (3,) away from rest."""
+        """Place the shape at `translation` (3,) from rest."""
         self._put(self._rest + translation)
 
     def park(self, parking: Parking) -> None:
@@ -51,7 +51,7 @@ class MeshPlacement:
 
 
 class TransformPlacement:
-    """Where a rectangle, sphere, disk or cylinder stands: its transform, opaque to the compiler."""
+    """Places a rectangle, sphere, disk or cylinder by its transform, which is opaque to the compiler."""
 
     def __init__(self, shape: Any) -> None:
         self._parameters = mi.traverse(shape)
@@ -60,7 +60,7 @@ class TransformPlacement:
         self.move(np.zeros(3, np.float32))
 
     def move(self, translation: F32) -> None:
-        """Put the shape `translation` (3,) away from rest."""
+        """Place the shape at `translation` (3,) from rest."""
         self._put(_shifted(translation.astype(np.float64)) @ self._rest)
 
     def park(self, parking: Parking) -> None:
@@ -75,7 +75,7 @@ class TransformPlacement:
         self._parameters.update()
 
 
-class Shine:
+class LightSwitch:
     """The radiance of one area light, switched on and off."""
 
     def __init__(self, emitter: Any) -> None:
@@ -107,23 +107,23 @@ class MovableGroup:
     """The shapes of one movable group."""
 
     placements: tuple[MeshPlacement | TransformPlacement, ...]
-    shines: tuple[Shine, ...]
+    shines: tuple[LightSwitch, ...]
 
     @classmethod
     def of(cls, shapes: list[Any]) -> MovableGroup:
-        """The group of these shapes, which stand as modelled."""
-        shines = tuple(Shine(shape.emitter()) for shape in shapes if shape.is_emitter())
+        """The group of these shapes, which are placed as modelled."""
+        shines = tuple(LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter())
         return cls(tuple(_placement(shape) for shape in shapes), shines)
 
     def move(self, translation: F32, *, was_present: bool) -> None:
-        """Put the group `translation` (3,) away from rest."""
+        """Place the group at `translation` (3,) from rest."""
         for placement in self.placements:
             placement.move(translation)
         if not was_present:
             self._switch(True)
 
     def park(self, parking: Parking) -> None:
-        """Take the group out of the scene."""
+        """Remove the group from the scene."""
         for placement in self.placements:
             placement.park(parking)
         self._switch(False)

@@ -1,22 +1,22 @@
 """Image-space buffers of a view [supplement 1.3]. Free of noise.
 
-**Depth and normal** are of what one ray through each pixel centre meets first; **albedo** is a mean over the pixel's
-area, by a regular grid of 4 × 4 rays, as the radiance of a box filter is: one ray's albedo is another texel's, and at
-edges another surface's.
+**Depth and normal** are those of the first hit of one ray through each pixel centre; **albedo** is a mean over the
+pixel's area, by a regular grid of 4 × 4 rays, as the radiance of a box filter is: a single ray would show another
+texel, and at edges another surface.
 
 **Albedo** is the diffuse reflectance of the first surface, and 0 for surfaces without a diffuse part (glass, mirrors,
-metals, null). Mitsuba's `eval_diffuse_reflectance` answers for those that lack one of their own with π times the whole
-BSDF at normal exitance, highlights and all (25 for a rough conductor); so it is asked only where the BSDF's flags have
+metals, null). Mitsuba's `eval_diffuse_reflectance` returns, for those without one of their own, π times the whole
+BSDF at normal exitance, highlights and all (25 for a rough conductor); so it is called only if the BSDF's flags have
 a diffuse reflection. It is exact for diffuse, plastic and roughplastic, and for twosided, bumpmap, normalmap and mask
-around them; for principled it is the base colour, whatever metallic and spec_trans say; blendbsdf blends, and a rough
-conductor in a blend brings its highlight along. A texture is looked up without filtering. Two-sided materials answer
-for the side that is seen; a one-sided one answers with its reflectance from behind too, where it renders black.
+around them; for principled it is the base colour, whatever metallic and spec_trans are; blendbsdf blends, and a rough
+conductor in a blend adds its highlight. A texture is looked up without filtering. Two-sided materials return the
+reflectance of the visible side; a one-sided one returns its reflectance from behind too, where it renders black.
 
 **Normals** are interpolated shading normals in world coordinates, of unit length, as modelled: the back of a surface,
-two-sided or not, has the normal of its front. Bump and normal maps are part of the BSDF and not in them.
+two-sided or not, has the normal of its front. Bump and normal maps are part of the BSDF and not of the normals.
 
-**Null and mask** surfaces count as surfaces: a mask shows the normal, depth and albedo of what it masks, whatever its
-opacity there, as the first intersection meets it.
+**Null and mask** surfaces count as surfaces: a mask has the normal, depth and albedo of what it masks, whatever its
+opacity there, as at the first intersection.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
 
 GRID = 4
-"""Rays along each axis of a pixel, of which albedo is the mean."""
+"""The rays along each axis of a pixel whose mean is the albedo."""
 
 RAYS = 1 << 20
-"""Rays traced at a time, at least those of one point of each pixel: 16 of them for an image of 256²."""
+"""The rays traced at a time, at least those of one point of each pixel: 16 of them for an image of 256²."""
 
 
 def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
-    """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is there.
+    """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is hit.
 
-    With a `recorder` of `look` Python runs but once, which is half of the time in scenes of many materials.
+    With a `recorder` of `look` Python runs only once, which is half of the time in scenes of many materials.
     """
     camera = Camera.of(view, spec)
     directions = camera.rays()
@@ -58,7 +58,7 @@ def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | N
 
 
 def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder | None) -> F32:
-    """Over the area of each pixel, (H, W, 3)."""
+    """The mean albedo over the area of each pixel, (H, W, 3)."""
     steps = (np.arange(GRID) + 0.5) / GRID
     within = [(u, v) for v in steps for u in steps]
     at_once = max(1, RAYS // (camera.height * camera.width))
@@ -72,11 +72,11 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder
 
 What = Literal["centre", "albedo"]
 Rays = tuple[Any, Any, Any]
-"""Origins (Point3f), directions (Vector3f) and how far they reach (Float)."""
+"""The origins (Point3f), directions (Vector3f) and lengths (Float) of rays."""
 
 
 def _seen(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
-    """What `look` returns, recorded by `what` and the number of rays."""
+    """The result of `look`, recorded by `what` and the number of rays."""
     if recorder is None:
         return look(scene, None, *rays, what)
     found: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
@@ -84,7 +84,7 @@ def _seen(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tupl
 
 
 def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
-    """Hit, normal and distance of the surfaces that rays meet first, or their albedo; zeros where they meet none."""
+    """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
     found: tuple[Any, ...] = (dr.select(hit, diffuse_reflectance(si, hit), 0),)
@@ -95,13 +95,13 @@ def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What
 
 
 def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
-    """What rays from the camera along unit directions (..., 3) meet between the near and the far plane."""
+    """The first hits between the near and the far plane of rays from the camera along unit directions (..., 3)."""
     origin, direction, reach = _rays(camera, directions, spec)
     return scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
 
 
 def _rays(camera: Camera, directions: F32, spec: SceneSpec) -> Rays:
-    """From the near to the far plane, along unit directions (..., 3)."""
+    """Rays from the near to the far plane, along unit directions (..., 3)."""
     flat = directions.reshape(-1, 3)
     along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis
     near, far = spec.view.near / along, spec.view.far / along

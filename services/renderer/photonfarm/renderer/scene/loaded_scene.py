@@ -1,4 +1,4 @@
-"""A scene loaded once and edited in place: what every sample of a scene is rendered from."""
+"""A scene that is loaded once and edited in place, and renders every sample."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class LoadedScene:
     def load(cls, spec: SceneSpec, beside: Path | None = None) -> Self:
         """The scene of a spec, at rest; `beside` is the spec's folder, where its scene file may lie.
 
-        Raises SpecError for a scene that cannot be loaded or rendered, BackendError where Mitsuba does not work. Every
-        movable group has been parked and brought back once, so that what this compiles is compiled.
+        Raises SpecError for a scene that cannot be loaded or rendered, BackendError if Mitsuba does not work. Every
+        movable group has been parked and brought back once, so that the kernels for this are compiled.
         """
         backend.load()
         from photonfarm.renderer.scene.acceleration import expect_changes
@@ -68,7 +68,7 @@ class LoadedScene:
         return loaded
 
     def apply(self, modification: Modification) -> None:
-        """Bring the scene into a configuration, whatever it was in; only groups that change are touched."""
+        """Bring the scene from any configuration into this one; only groups that change are edited."""
         for i, group in enumerate(self._groups):
             present, was_present = bool(modification.present[i]), bool(self._state.present[i])
             translation = modification.translation[i]
@@ -82,8 +82,8 @@ class LoadedScene:
     def _refresh(self) -> None:
         """Let Mitsuba rebuild what depends on all shapes.
 
-        It tells environment lights of the scene's bounding sphere before it knows the new one, and directional lights
-        never; so they are told once more.
+        It gives environment lights the scene's bounding sphere before it knows the new one, and never gives it to
+        directional lights; so they are updated once more.
         """
         if self._groups:
             self.scene.parameters_changed([])
@@ -91,15 +91,15 @@ class LoadedScene:
                 emitter.set_scene(self.scene)
 
     def render_halves(self, view: View, seeds: Sequence[int], half_spp: int | None = None) -> F32:
-        """Half-estimates of linear radiance for each seed, (K, H, W, 3): the spec's integrator and `half_spp`.
+        """Half-estimates of linear radiance for each seed, (K, H, W, 3), by the spec's integrator.
 
-        Or as many samples per pixel as are given.
+        They have the spec's `half_spp` samples per pixel unless it is given.
         """
         spp = half_spp or self.spec.transport.half_spp
         return np.array(self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, spp), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
-        """One of them, (H, W, 3)."""
+        """One half-estimate, (H, W, 3)."""
         return self.render_halves(view, (seed,))[0]
 
     def render(self, view: View, seed: int, integrator: Any = None, spp: int | None = None) -> F32:
@@ -116,15 +116,15 @@ class LoadedScene:
         return np.array(image, np.float32)
 
     def buffers(self, view: View) -> ViewBuffers:
-        """Depth, albedo and normal of what each pixel's centre sees in the present configuration."""
+        """The depth, albedo and normal buffers of a view in the present configuration."""
         from photonfarm.renderer.scene.gbuffer import view_buffers
 
         return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
 
     def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
-        """What is known of a view beside its buffers; `key` is the view's, by which its direct light is sampled.
+        """The guides of a view; `key` is the view's, from which the seed of direct light is derived.
 
-        `lit` are positions and normals (L, 3) of the points whose irradiance is wanted.
+        `lit` are positions and normals (L, 3) of the points whose irradiance is required.
         """
         from photonfarm.renderer.scene.guides import point_light, view_guides
 
@@ -138,7 +138,7 @@ class LoadedScene:
         return seen_points(self.scene, view, self.spec, position)
 
     def photons(self, seed: int) -> Photons | None:
-        """Surface hits of light sub-paths in the present configuration; None if the spec wants none."""
+        """Surface hits of light sub-paths in the present configuration; None for a spec without photons."""
         from photonfarm.renderer.bdpt.photons import trace_photons
 
         wanted = self.spec.photons

@@ -1,4 +1,4 @@
-"""From a scene spec to a Mitsuba scene: the file or built-in room, with the lights that the spec adds."""
+"""Load a scene spec as a Mitsuba scene: the file or built-in room, with the lights that the spec adds."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from photonfarm.shared.scene.spec import SceneSpec, find_scene
 
 
 def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
-    """The Mitsuba scene of a spec; its cameras, films and integrators are left aside, as the spec has its own.
+    """The Mitsuba scene of a spec; its cameras, films and integrators are ignored, as the spec has its own.
 
-    Shapes stay apart (`optimize=False`), as single objects could not be moved otherwise. Raises SpecError for a file
-    that is not there, that changed since the spec was read, or that Mitsuba or the integrator cannot take.
+    Shapes stay separate (`optimize=False`), as merged ones could not move. Raises SpecError for a file that is missing,
+    that changed since the spec was read, or that Mitsuba or the integrator refuses.
     """
     scene = _builtin(spec) if spec.scene.builtin else _from_file(spec, beside)
     try:
@@ -37,7 +37,7 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
 
 
 def _check_lights(spec: SceneSpec, scene: Any) -> None:
-    """Raise SpecError for mesh lights with smooth normals: they can be hit only, and would give next to pure noise."""
+    """Raise SpecError for mesh lights with smooth normals: only hits find them, which would give almost pure noise."""
     for shape in scene.shapes():
         if shape.is_emitter() and shape.is_mesh() and not np.array(is_flat(shape)).all():
             raise SpecError(
@@ -75,7 +75,7 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
 
 @contextmanager
 def _threads_to_read_with() -> Iterator[None]:
-    """Two threads at least: the decoder of OpenEXR files waits for ever in a pool of one."""
+    """Use two threads at least: the decoder of OpenEXR files waits for ever in a pool of one."""
     count = dr.thread_count()
     dr.set_thread_count(max(count, 2))
     try:
@@ -85,7 +85,7 @@ def _threads_to_read_with() -> Iterator[None]:
 
 
 def _joined(parts: list[Any], added: dict[str, Any]) -> Any:
-    """A scene of loaded parts, which keep their ids, and of others to load."""
+    """A scene of loaded parts, which keep their ids, and of added ones that are loaded here."""
     ids = [part.id() for part in parts]
     keys = [f"_part_{i}" for i in range(len(parts))]  # ids need not be there, and may have dots, which no key may
     scene = mi.load_dict({"type": "scene", **dict(zip(keys, parts, strict=True)), **added}, optimize=False)

@@ -1,4 +1,4 @@
-"""What guides have to know of a scene's materials, which no edit changes: asked once, when the scene is loaded."""
+"""The properties of a scene's materials that guides need; no edit changes them, so they are read once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from photonfarm.shared.core.records import F32
 
 ROUGHNESS = frozenset({"alpha", "alpha_u", "alpha_v", "roughness"})
-"""Parameters of Mitsuba's materials that state it."""
+"""The names under which Mitsuba's materials state roughness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +27,7 @@ class Materials:
 
     @classmethod
     def of(cls, scene: Any) -> Self:
-        """Those of a scene."""
+        """The materials of a scene."""
         bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0]) for bsdf in bsdfs]
         roughness = np.ones(max(numbers, default=0) + 1, np.float32)
@@ -39,18 +39,18 @@ class Materials:
 
 
 def is_pure_delta(flags: Any) -> Any:
-    """Whether a BSDF of these flags has delta lobes alone."""
+    """Whether a BSDF with these flags has delta lobes alone."""
     return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
 
 
 def has_other_lobes(flags: Any) -> Any:
-    """Whether a BSDF of these flags has lobes beside a diffuse one, and not delta lobes alone."""
+    """Whether a BSDF with these flags has lobes beside a diffuse one, and not delta lobes alone."""
     smooth = mi.has_flag(flags, mi.BSDFFlags.Smooth)
     return smooth & (mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy))
 
 
 def _alpha(bsdf: Any) -> float:
-    """α of a BSDF: the mean of those that its parameters name; without any 0 of pure delta lobes, otherwise 1."""
+    """The α of a BSDF: the mean of its roughness parameters; without any, 0 for pure delta lobes, otherwise 1."""
     found = [
         mean ** (2 if "roughness" in key else 1)  # of `principled`: α = roughness²
         for key, mean in _stated(bsdf, ROUGHNESS).items()
@@ -61,10 +61,10 @@ def _alpha(bsdf: Any) -> float:
 
 
 def _diffuse_kept(bsdf: Any) -> float:
-    """The share of the diffuse reflectance that a BSDF returns where it is asked for its other lobes alone.
+    """The share of the diffuse reflectance that a BSDF includes when only its other lobes are evaluated.
 
-    0 of all but Mitsuba's `principled`, alone or in another one: it always answers with all of its lobes, of which the
-    diffuse one has about the share (1 − metallic) (1 − spec_trans) of the base colour; by the means of textures.
+    It is 0 for all but Mitsuba's `principled`, alone or nested: that always evaluates all of its lobes, of which the
+    diffuse one has about the share (1 − metallic) (1 − spec_trans) of the base colour; textures enter by their means.
     """
     if not _stated(bsdf, {"base_color"}):
         return 0.0
@@ -73,7 +73,7 @@ def _diffuse_kept(bsdf: Any) -> float:
 
 
 def _stated(bsdf: Any, names: Set[str]) -> dict[str, float]:
-    """The parameters of these names, of a BSDF and of those in it: means, by key."""
+    """The parameters of these names in a BSDF and in nested ones: means, by key."""
     return {
         key: float(np.mean(np.array(value)))
         for key, value in mi.traverse(bsdf)

@@ -1,6 +1,6 @@
-"""Triangles of Mitsuba's shapes, for the base point cloud; light transport meets the shapes themselves.
+"""Triangles of Mitsuba's shapes, for the base point cloud; light transport uses the shapes themselves.
 
-Meshes, rectangles and cubes are taken as they are. Spheres, disks and cylinders become fine meshes whose vertices lie
+Meshes, rectangles and cubes are used unchanged. Spheres, disks and cylinders become fine meshes whose vertices lie
 on the surface (128 sections around, 64 from pole to pole): the area is short by at most 0.1 %.
 """
 
@@ -27,7 +27,7 @@ class Triangles:
 
 
 def triangles_of(shape: Any) -> Triangles:
-    """The triangles of one shape. Raises SpecError for curves, instances, ellipsoids and other exotic shapes."""
+    """The triangles of one shape. Raises SpecError for curves, instances, ellipsoids and other unsupported shapes."""
     if shape.is_mesh():
         positions = np.array(shape.vertex_positions_buffer(), np.float32)
         faces = np.array(shape.faces_buffer(), np.uint32)
@@ -75,7 +75,7 @@ def _cylinder() -> NDArray[np.float64]:
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:
-    """Two triangles per cell of a grid of vertices; those at poles that have no area are never drawn."""
+    """Two triangles per cell of a grid of vertices; those at poles have no area and are never drawn."""
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     quads = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=1)
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.uint32)

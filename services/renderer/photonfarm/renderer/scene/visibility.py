@@ -1,7 +1,7 @@
 """Which points a view sees, by one shadow ray to each: exact, and free of noise. Shape letter: N points.
 
-No depth buffer can say it as well: a point's pixel also shows what stands before and behind it, and within a pixel a
-surface that is seen at an angle has many depths.
+A depth buffer is less exact: a point's pixel also shows what is before and behind it, and a surface seen at an angle
+has many depths within a pixel.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera, View
 
 SELF_HIT = 1e-4
-"""A ray ends this share of the distance from the eye before its point, so that it does not meet the point's surface."""
+"""The share of its length by which a ray ends before its point, so that it does not meet the point's surface."""
 
 
 def seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArray[np.bool_]:
@@ -37,7 +37,7 @@ def seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArr
 
     distance = np.where(ahead, np.linalg.norm(offset, axis=1), 1.0)
     direction = offset / distance[:, None]
-    near = spec.view.near * distance / z  # of where the line to the point crosses the near plane
+    near = spec.view.near * distance / z  # at which the line to the point crosses the near plane
     ray = mi.Ray3f(o=points(camera.origin + near[:, None] * direction), d=mi.Vector3f(points(direction)))
     ray.maxt = floats(np.where(in_image, (1 - SELF_HIT) * distance - near, 0.0))
     hidden = scene.ray_test(ray, active=ray.maxt > 0)

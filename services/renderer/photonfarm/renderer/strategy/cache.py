@@ -18,9 +18,9 @@ _DECIDED = ("connections", "light_ratio", "half_spp")
 
 
 def digest(spec: SceneSpec) -> str:
-    """32 hexadecimal digits: the scene without what a plan decides, the candidates, the machine, all code that renders.
+    """32 hexadecimal digits: the scene without the settings that a plan decides, the candidates, machine, and code.
 
-    So a plan that is written into its spec does not call for another one.
+    So a plan that is written into its spec does not require another one.
     """
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
@@ -29,12 +29,12 @@ def digest(spec: SceneSpec) -> str:
 
 
 def digest_here(*parts: str) -> str:
-    """32 hexadecimal digits: what was measured, by some parts, on which machine, and all code that renders."""
+    """32 hexadecimal digits: the `parts` that identify a measurement, the machine, and all code that renders."""
     return make_key(*parts, repr(_machine()), _revision()).hex()
 
 
 def _machine() -> tuple[object, ...]:
-    """What times depend on beside the scene and the code: processor, cores, variant, versions of the packages.
+    """All that times depend on beside the scene and the code: processor, cores, variant, versions of the packages.
 
     The number of threads is not among them, as a pilot has one.
     """
@@ -44,7 +44,7 @@ def _machine() -> tuple[object, ...]:
 
 
 def _processor() -> str:
-    """The model's name, where the system tells it; its kind elsewhere."""
+    """The model's name, if the system states it; else its kind."""
     try:
         described = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -56,7 +56,8 @@ def _processor() -> str:
 def _revision() -> bytes:
     """A digest of the renderer's source: a checkout has one version for many renderers.
 
-    How configurations and views are drawn is not in it; it stays as it is, since the keys of stored samples rest on it.
+    It leaves out how configurations and views are drawn: that never changes, since the keys of stored samples depend on
+    it.
     """
     hashed = hashlib.sha256()
     for file in sorted(Path(__file__).parents[1].rglob("*.py")):
@@ -65,13 +66,13 @@ def _revision() -> bytes:
 
 
 def file_of(folder: str, digest: str) -> Path:
-    """Where a measurement of one kind, which has a folder of its own, is kept."""
+    """The file of a measurement; each kind has a folder of its own."""
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(root) / "photonfarm" / folder / f"{digest}.json"
 
 
 def write_whole(file: Path, text: str) -> None:
-    """Write a file that appears whole. Raises OSError where it cannot be written."""
+    """Write a file that appears whole. Raises OSError if it cannot be written."""
     file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_suffix(f".{os.getpid()}.part")
     aside.write_text(text)
@@ -83,7 +84,7 @@ def _file(spec: SceneSpec) -> Path:
 
 
 def find(spec: SceneSpec) -> Measurement | None:
-    """The measurement of this scene, unless there is none, or one that cannot be read or used."""
+    """The kept measurement of this scene; None if it is missing, unreadable or unusable."""
     try:
         return Measurement.model_validate_json(_file(spec).read_bytes())
     except (OSError, ValidationError):
@@ -91,7 +92,7 @@ def find(spec: SceneSpec) -> Measurement | None:
 
 
 def keep(spec: SceneSpec, measurement: Measurement) -> Path:
-    """Keep a measurement; returns its file, which appears whole. Raises OSError where it cannot be written."""
+    """Keep a measurement; returns its file, which appears whole. Raises OSError if it cannot be written."""
     file = _file(spec)
     write_whole(file, measurement.model_dump_json(indent=1) + "\n")
     return file

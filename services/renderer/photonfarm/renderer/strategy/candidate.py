@@ -1,4 +1,4 @@
-"""What is chosen among: settings of `bdpt` that leave its mean as it is."""
+"""Candidates for the settings of `bdpt`, which all have the same mean."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from photonfarm.shared.core.records import F32
 
 @dataclass(frozen=True, slots=True, order=True)
 class Candidate:
-    """Settings of `bdpt` that leave its mean as it is."""
+    """Settings of `bdpt`; all candidates have the same mean."""
 
     connections: int  # light vertices joined to each eye vertex
     light_ratio: float  # light paths per eye path; 0: plain path tracing
@@ -24,10 +24,10 @@ class Candidate:
 
 
 PLAIN = Candidate(0, 0.0)
-"""Plain path tracing with next event estimation: what others are measured against."""
+"""Plain path tracing with next event estimation: the baseline of all comparisons."""
 
 DEFAULT = Candidate(1, 1.0)
-"""The settings of a spec that names none."""
+"""The settings of a spec that states none."""
 
 Render: TypeAlias = Callable[[Candidate, int, int], F32]
 """(candidate, seed, samples per pixel) → one unbiased noisy image (H, W, 3) of one configuration and view."""

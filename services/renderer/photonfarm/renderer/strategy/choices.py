@@ -1,26 +1,26 @@
-"""Candidates at equal cost: what each makes of the CPU time that a spec accepts for a half-estimate."""
+"""Candidates at equal cost: the error of each in the CPU time that a spec accepts for a half-estimate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import Measured, saving
-from photonfarm.renderer.strategy.measurement import Measurement, Row
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, saving
+from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement
 from photonfarm.renderer.strategy.pilot import longest
 
 
 @dataclass(frozen=True, slots=True)
-class Offer(Measured):
-    """A candidate at the samples per pixel that the time buys; `time_s` is that of such a half-estimate."""
+class CandidateAtCost(MeasuredCandidate):
+    """A candidate at the samples per pixel that fit the time; `time_s` is that of such a half-estimate."""
 
     half_spp: int
     half_error: float  # relMSE of such a half-estimate
     fits: bool  # whether a sample per pixel costs about that time or less
 
 
-def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
-    """Every candidate that was measured, at the samples that `half_s` buys it.
+def offers(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
+    """Every measured candidate, at the samples per pixel that fit `half_s`.
 
     The variance of an image is that of a sample over their number, so error × time is error a sample × time / samples.
     """
@@ -28,11 +28,11 @@ def offers(measurement: Measurement, half_s: float) -> dict[Candidate, Offer]:
     return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
 
 
-def _offer(row: Row, plain: Row, spp: int, half_s: float) -> Offer:
+def _offer(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> CandidateAtCost:
     samples = row.cost.bought(half_s)
     cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
     relative = row.errors.relative_spread(plain.errors)
-    return Offer(
+    return CandidateAtCost(
         candidate=row.candidate,
         errors=row.errors,
         missed=row.missed,
@@ -45,25 +45,25 @@ def _offer(row: Row, plain: Row, spp: int, half_s: float) -> Offer:
     )
 
 
-def _per_sample_s(row: Row, half_s: float) -> float:
+def _per_sample_s(row: CandidateRow, half_s: float) -> float:
     samples = row.cost.bought(half_s)
     return row.cost.time_s(samples) / samples
 
 
-def best(offered: dict[Candidate, Offer]) -> Offer:
-    """Of least error × time, among those measured longest."""
+def best(offered: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:
+    """The offer of least error × time, among those measured longest."""
     return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
 
 
-def _cost(offer: Offer) -> float:
+def _cost(offer: CandidateAtCost) -> float:
     return offer.relative_cost
 
 
 def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
-    """The settings to take where those given are accepted now: themselves, unless others are significantly better.
+    """The settings to take if the given ones are accepted now: themselves, unless others are significantly better.
 
-    A whole number of samples changes the cost a little, at which something else may be better still; so gains are
-    followed until there is none, and a plan that is written asks for itself. Where they lead back, nothing is gained.
+    A whole number of samples changes the cost a little, at which another candidate may be better still; so gains are
+    followed until there is none, and a plan that is written confirms itself. A cycle gains nothing.
     """
     seen = [(candidate, half_spp)]
     while (better := _better(measurement, *seen[-1])) is not None:

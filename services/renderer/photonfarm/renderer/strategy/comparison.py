@@ -1,4 +1,4 @@
-"""How much sooner one candidate reaches the error of another, and how sure that is."""
+"""How much sooner one candidate reaches the error of another, and the uncertainty of that factor."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from photonfarm.renderer.strategy.candidate import Candidate
 from photonfarm.shared.scene.spec import Frozen
 
 CLEAR = 2.0
-"""Standard errors by which two candidates must differ to be told apart."""
+"""The standard errors by which two candidates must differ to be distinguished."""
 
 WORTHWHILE = 0.05
-"""Least gain for which settings are changed: a changed scene has another id, so all its samples are rendered again."""
+"""The least gain that changes settings: a changed scene has another id, so all its samples are rendered again."""
 
 
-class Errors(Frozen):
-    """relMSE of one image of a candidate by views, with what is inferred as missed; of a single view, by pairs.
+class RelativeErrors(Frozen):
+    """The relMSE of one image of a candidate, by views, with its unseen noise; for a single view, by pairs.
 
-    Beside it that of plain path tracing over the images of the same seeds: both have the same rare bright samples, so
-    that their ratio is known better than either.
+    It is accompanied by that of plain path tracing over the images of the same seeds: both have the same rare bright
+    samples, so that their ratio is known better than either.
     """
 
     images: int  # rendered, over all views
@@ -37,15 +37,15 @@ class Errors(Frozen):
 
     @property
     def ratio(self) -> float:
-        """That of one image over plain path tracing's."""
+        """The relMSE of one image over that of plain path tracing."""
         return self.mean / _mean(self.plain)
 
-    def relative_spread(self, other: Errors) -> float | None:
-        """Standard error of the ratio of two candidates' ratios, over itself; None of a single value each.
+    def relative_spread(self, other: RelativeErrors) -> float | None:
+        """The standard error of the ratio of two candidates' ratios, over itself; None for a single value each.
 
-        It is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over views: so it holds what the noise and
-        what the choice of views contribute; that of the times is next to nothing. Of equally many images plain path
-        tracing's cancel; otherwise the two ratios are taken as independent, which overstates it.
+        It is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over views: so it contains the
+        contributions of the noise and of the choice of views; that of the times is negligible. For equal numbers of
+        images, plain path tracing's cancel; otherwise the two ratios are taken as independent, which overstates it.
         """
         if self.images == other.images:
             return _standard_error(_scaled(self.own) - _scaled(other.own))
@@ -67,15 +67,15 @@ def _standard_error(residuals: NDArray[np.float64]) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """What is known of one candidate."""
+class MeasuredCandidate:
+    """The measurement of one candidate."""
 
     candidate: Candidate
-    errors: Errors
-    missed: float  # the part of the error that was not seen, but inferred from light that others found (see `noise`)
+    errors: RelativeErrors
+    missed: float  # the part of the error inferred from light in other candidates' images (see `noise`)
     time_s: float  # CPU time of one image
     relative_cost: float  # error × time over that of plain path tracing: the time to the same error
-    spread: float | None  # standard error of relative_cost; None of a single pair of images
+    spread: float | None  # standard error of relative_cost; None from a single pair of images
 
     @property
     def error(self) -> float:
@@ -93,24 +93,24 @@ class Saving:
 
     @property
     def deviations(self) -> float:
-        """Standard errors of log(factor) above 0, which treats a ratio and its inverse alike; 0 where none is known."""
+        """The standard errors of log(factor) above 0, which treats a ratio and its inverse alike; 0 if unknown."""
         if self.spread is None:
             return 0.0
         return math.log(self.factor) / max(self.spread / self.factor, 1e-9)
 
     @property
     def significant(self) -> bool:
-        """Whether it is worth a change of settings."""
+        """Whether the saving is worth a change of settings."""
         return self.factor >= 1 + WORTHWHILE and self.deviations >= CLEAR
 
 
-def saving(one: Measured, over: Measured) -> Saving:
-    """Of one candidate over another, both at their cost."""
+def saving(one: MeasuredCandidate, over: MeasuredCandidate) -> Saving:
+    """The saving of one candidate over another, both at their cost."""
     factor = over.relative_cost / one.relative_cost
     relative = over.errors.relative_spread(one.errors)
     return Saving(over.candidate, factor, None if relative is None else factor * relative)
 
 
-def is_alike(one: Measured, other: Measured) -> bool:
-    """Whether two candidates cannot be told apart."""
+def is_alike(one: MeasuredCandidate, other: MeasuredCandidate) -> bool:
+    """Whether the difference of two candidates is not significant."""
     return abs(saving(one, other).deviations) < CLEAR

@@ -1,4 +1,4 @@
-"""What a scene contains, and what follows from that alone, without measuring."""
+"""The content of a scene, and the restrictions that follow from it without a measurement."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _LIGHTS = {
 }
 _BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
 _CAMERAS = {"PerspectiveCamera": "pinhole", "ThinLensCamera": "thin lens"}
-"""Cameras that light paths can be joined to."""
+"""The cameras that light paths can be joined to."""
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
-    """The facts of one loaded scene, as it stands."""
+class SceneContent:
+    """The facts of one loaded scene in its present state."""
 
-    lights: Mapping[str, int]  # that shine, by kind
+    lights: Mapping[str, int]  # lights that shine, by kind
     dark: int  # lights of radiance 0: they are never selected
     surfaces: int
-    specular: int  # of them, those that only reflect or refract like a mirror or clear glass
+    specular: int  # of these, those that only reflect or refract like a mirror or clear glass
     camera: str  # "pinhole", "thin lens", or Mitsuba's name of another
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Something that is not modelled, and why."""
+    """A technique that is left out, and the reason."""
 
     what: str
     why: str
@@ -47,11 +47,11 @@ class LeftOut:
         return f"{self.what}: {self.why}"
 
 
-def read(scene: Any, camera: Any) -> Content:
-    """What a Mitsuba scene contains, seen by one of Mitsuba's sensors."""
+def read(scene: Any, camera: Any) -> SceneContent:
+    """Read the content of a Mitsuba scene, seen by one of Mitsuba's sensors."""
     shining = [emitter for emitter in scene.emitters() if _shines(emitter)]
     kinds = Counter(_LIGHTS.get(emitter.class_name(), emitter.class_name()) for emitter in shining)
-    return Content(
+    return SceneContent(
         lights=dict(kinds),
         dark=len(scene.emitters()) - len(shining),
         surfaces=len(scene.shapes()),
@@ -61,7 +61,7 @@ def read(scene: Any, camera: Any) -> Content:
 
 
 def _shines(emitter: Any) -> bool:
-    """Whether any of its brightness is above zero, and its scale and its image are, if it has them."""
+    """Whether any of its brightness parameters is above zero, and its scale and image too, if it has them."""
     import mitsuba as mi
 
     parameters = mi.traverse(emitter)
@@ -82,9 +82,9 @@ def _is_specular(shape: Any) -> bool:
 
 
 def restrict(
-    content: Content, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
+    content: SceneContent, max_depth: int, hit_share: float, candidates: Iterable[Candidate]
 ) -> tuple[list[Candidate], list[LeftOut]]:
-    """The candidates that may help, and what is left out. `hit_share`: of the light paths, those that hit a surface."""
+    """The candidates that may help, and what is left out; `hit_share`: the share of light paths that hit a surface."""
     candidates = list(candidates)
     reason = _why_no_light_paths(content, max_depth, hit_share)
     if reason:
@@ -92,7 +92,7 @@ def restrict(
     return candidates, []
 
 
-def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> str | None:
+def _why_no_light_paths(content: SceneContent, max_depth: int, hit_share: float) -> str | None:
     if not content.lights:
         return "there is no light that shines"
     if max_depth in (0, 1):
@@ -108,8 +108,8 @@ def _why_no_light_paths(content: Content, max_depth: int, hit_share: float) -> s
     return None
 
 
-def sentences(content: Content, max_depth: int) -> Sequence[str]:
-    """What is modelled in any case, and what lights that are off cost."""
+def sentences(content: SceneContent, max_depth: int) -> Sequence[str]:
+    """What every plan models, and the lights that are off."""
     lights = ", ".join(f"{count} {kind}" for kind, count in sorted(content.lights.items())) or "none"
     found = [
         f"lights: {lights}",

@@ -1,4 +1,4 @@
-"""How far the light gets: which photons are worth storing. Shape letters: N light paths, D bounces."""
+"""How far light paths reach, and so which photons are worth storing. Shape letters: N light paths, D bounces."""
 
 from __future__ import annotations
 
@@ -13,28 +13,30 @@ from photonfarm.shared.scene.spec import PhotonSpec, ViewSpec
 
 PATHS = 4096
 DEPTH = 16
-"""The largest depth that a spec can ask for."""
+"""The largest depth that a spec may have."""
 
 LEAST_SHARE = 0.01
-"""Of the light paths that reach the cameras' surroundings, below which photons are not worth their place; and of the
-power that arrives there, what the bounces left out may carry."""
+"""The smallest share of light paths near the cameras for which photons are stored.
+
+It is also the largest share of the power there that omitted bounces may carry.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class LightReach:
-    """Shares of light paths and of their power; (C, D): by configurations and bounces."""
+    """The shares of light paths, and of their power, that reach the cameras; (C, D): by configurations and bounces."""
 
-    hit: float  # of the light paths, those that hit any surface, mean over configurations
-    filled: tuple[float, ...]  # (D,) those with such a bounce, mean over configurations: the slots that are filled
-    near: tuple[tuple[float, ...], ...]  # (C, D) those with such a bounce in the cameras' surroundings
-    power: tuple[tuple[float, ...], ...]  # (C, D) of the power that arrives there, of each configuration sum 1 (or 0)
+    hit: float  # the share of light paths that hit any surface, mean over configurations
+    filled: tuple[float, ...]  # (D,) the share of light paths with such a bounce, mean over configurations
+    near: tuple[tuple[float, ...], ...]  # (C, D) the share with such a bounce in the cameras' surroundings
+    power: tuple[tuple[float, ...], ...]  # (C, D) the share of the power there; the sum over bounces is 1 (or 0)
 
 
 def measure(scenes: Iterable[Any], view: ViewSpec, seed: int) -> LightReach:
-    """Trace light paths in a scene in several configurations; each item is the scene, put into the next of them.
+    """Trace light paths in several configurations of a scene; each item is the scene in the next of them.
 
-    The surroundings are the box around all cameras and what they look at, larger by a quarter on every side: the sky's
-    light on a roof is no light in the room.
+    The surroundings are the box around all cameras and look-at points, larger by a quarter on every side: the sky's
+    light on a roof is not light in the room.
     """
     from photonfarm.renderer.bdpt import trace_photons
 
@@ -69,10 +71,10 @@ def _inside(position: NDArray[np.float32], view: ViewSpec) -> NDArray[np.bool_]:
 def recommend(
     wanted: PhotonSpec, near: Sequence[Sequence[float]], power: Sequence[Sequence[float]], max_depth: int
 ) -> tuple[PhotonSpec, str]:
-    """The photons worth storing, and why; never more than the spec wants. `near` and `power` as of `LightReach`.
+    """The photons worth storing, and the reason; never more than in the spec. `near` and `power` as in `LightReach`.
 
-    What is left out must be next to nothing in each configuration, as nothing measures it again. A hit of bounce d lies
-    on paths of d + 2 edges at least, so bounces that max_depth cuts off shine in no image.
+    The omitted part must be negligible in each configuration, as it is not measured again. A hit of bounce d lies
+    on paths of at least d + 2 edges, so bounces beyond max_depth contribute to no image.
     """
     if not wanted.paths:
         return wanted, "photons: none, as the spec says"

@@ -1,4 +1,4 @@
-"""What was measured of a spec's scene: everything a plan follows from, as it is kept on disk."""
+"""The measurement of a spec's scene: everything a plan follows from, as it is kept on disk."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
 from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
-from photonfarm.renderer.strategy.comparison import Errors, Measured
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
-from photonfarm.renderer.strategy.pilot_scene import SEED, Stage
+from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.scene.spec import Film, Frozen, SceneSpec
 
@@ -21,35 +21,35 @@ GRID = tuple(
     Candidate(c, r)
     for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25), (1, 1.0), (2, 1.0), (4, 1.0), (8, 1.0))
 )
-"""The candidates of every pilot; those that a scene's content makes pointless are left out.
+"""The candidates of every pilot, except those that a scene's content makes pointless.
 
-More light paths than eye paths are for light that only they find, in splats: connections use as many of them as there
-are eye vertices, so that a ratio above 1 would buy connections nothing.
+More light paths than eye paths help only with light that splats alone find: connections use as many of them as there
+are eye vertices, so that a ratio above 1 would gain them nothing.
 """
 
 FIRST_ROUND = 0.4
-"""Share of the pilot's time for its first round, at most: what follows decides between the best."""
+"""The largest share of the pilot's time for its first round: later rounds decide between the best."""
 
 TIMING = 0.2
-"""Share of the time for how long images take."""
+"""The share of the time for timing images."""
 
 LEAST_VIEWS, MOST_VIEWS = 3, 8
 
 LIT = 16
-"""Configurations in which light paths are traced: photons that shine in any of them are worth storing."""
+"""The configurations in which light paths are traced: photons that contribute in any of them are worth storing."""
 
-Talk = Callable[[str], None]
-"""Takes a line on what is going on."""
+Log = Callable[[str], None]
+"""A function that takes a line about the progress."""
 
 
-class Row(Frozen):
-    """One candidate: what `Measured` rests on, and what its time is made of."""
+class CandidateRow(Frozen):
+    """One candidate: the values of `MeasuredCandidate`, and the two parts of its time."""
 
     connections: int
     light_ratio: float
-    errors: Errors  # of images of `Measurement.spp`
-    missed: float  # as of `Measured`
-    fixed_s: float  # as of `ImageCost`, on the spec's film
+    errors: RelativeErrors  # of images of `Measurement.spp`
+    missed: float  # as in `MeasuredCandidate`
+    fixed_s: float  # as in `ImageCost`, on the spec's film
     sample_s: float
 
     @property
@@ -59,62 +59,62 @@ class Row(Frozen):
 
     @property
     def cost(self) -> ImageCost:
-        """CPU time of an image of the spec's film."""
+        """The CPU time of an image of the spec's film."""
         return ImageCost(self.fixed_s, self.sample_s)
 
 
 class Measurement(Frozen):
-    """One pilot of one scene. All that a plan rests on, whatever settings of those that it decides a spec has."""
+    """One pilot of one scene: all that a plan depends on, whatever the spec's settings for what plans decide."""
 
     film: Film  # of the pilot
     spp: int
-    half_s: float  # CPU time of a half-estimate that the spec had accepted: what the pilot compared at
+    half_s: float  # CPU time of a half-estimate that the spec accepted, at which the pilot compared
     views: int
     max_depth: int
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
-    rows: tuple[Row, ...]  # without any where every view is black
-    shared: float  # as of `Choice`
-    filled: tuple[float, ...]  # of light_reach
+    rows: tuple[CandidateRow, ...]  # empty if every view is black
+    shared: float  # as in `Choice`
+    filled: tuple[float, ...]  # as in `light_reach`, with the next two
     near: tuple[tuple[float, ...], ...]
     power: tuple[tuple[float, ...], ...]
     asked_s: float  # CPU time that the pilot was given
-    spent_s: float  # CPU time of everything
-    compiling_s: float  # of it: loading, kernels, and what the images are weighted with
+    spent_s: float  # CPU time in all
+    compiling_s: float  # the part for loading, kernels, and the images that give the weights
 
     def knows(self, candidate: Candidate) -> bool:
-        """Whether it was measured."""
+        """Whether a candidate was measured."""
         return any(row.candidate == candidate for row in self.rows)
 
-    def row(self, candidate: Candidate) -> Row:
-        """What was measured of a candidate."""
+    def row(self, candidate: Candidate) -> CandidateRow:
+        """The measurement of a candidate."""
         return next(row for row in self.rows if row.candidate == candidate)
 
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """The candidates' images: of which film and how many samples per pixel, and what the pilot found in them."""
+    """The candidates' images: their film and samples per pixel, and the pilot's results."""
 
     film: Film
     spp: int
     half_s: float
     choice: pilot.Choice
-    rows: tuple[Row, ...]
+    rows: tuple[CandidateRow, ...]
 
 
-def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) -> Measurement:
-    """Load the scene of a spec and measure what its light transport needs, in about `seconds` of CPU time.
+def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> Measurement:
+    """Load the scene of a spec and measure its light transport, in about `seconds` of CPU time.
 
-    The spec's settings are measured in any case. Raises SpecError and BackendError as loading does.
+    The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does.
     """
     begun = time.process_time()
-    talk(f"loading {spec.name}")
-    stage = Stage(spec, beside)
+    log(f"loading {spec.name}")
+    stage = PilotScene(spec, beside)
     found = content.read(stage.loaded.scene, stage.camera())
     reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
     candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
-    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, talk)
+    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, log)
     spent = time.process_time() - begun
     return Measurement(
         film=compared.film,
@@ -135,15 +135,17 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, talk: Talk) ->
     )
 
 
-def _compare(stage: Stage, beside: Path | None, candidates: list[Candidate], seconds: float, talk: Talk) -> _Compared:
+def _compare(
+    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, log: Log
+) -> _Compared:
     spec = stage.spec
     now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
     costs = time_images(stage.renders(1)[0], candidates, half_spp, TIMING * seconds, stage.clock)
     half_s = costs[now].time_s(half_spp)
     film, spp, views = _pilot_film(spec, costs, left_s)
     if film != spec.film:
-        stage = Stage(spec.model_copy(update={"film": film}), beside)
-    talk(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
+        stage = PilotScene(spec.model_copy(update={"film": film}), beside)
+    log(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
     pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
     choice = pilot.choose(
         stage.renders(views),
@@ -160,21 +162,21 @@ def _compare(stage: Stage, beside: Path | None, candidates: list[Candidate], sec
 
 
 def present(spec: SceneSpec) -> Candidate:
-    """The settings that a spec has."""
+    """The present settings of a spec."""
     return Candidate(spec.transport.connections, spec.transport.light_ratio)
 
 
 def _images(cost: ImageCost, half_s: float, spp: int) -> float:
-    """CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
+    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
     samples = cost.bought(half_s)
     return spp / samples * cost.time_s(samples)
 
 
 def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
-    """Film, samples per pixel and number of views whose first round takes no more than its share of the time.
+    """The film, samples per pixel and number of views whose first round takes no more than its share of the time.
 
-    Wanted are those of the spec, and as many views as there is time for. Samples are given up first; then the film is
-    halved, as long as the samples are what takes the time.
+    They are those of the spec, and as many views as there is time for. Samples are reduced first; then the film is
+    halved, as long as the samples dominate the time.
     """
     fixed, sample = sum(cost.fixed_s for cost in costs.values()), sum(cost.sample_s for cost in costs.values())
     images = 2 + max(1.0, SCOUTS / len(costs))
@@ -187,14 +189,14 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: Measured, cost: ImageCost, pilot_spp: float, half_spp: int) -> Row:
-    """The cost that was found beforehand, corrected by the many images of the pilot.
+def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
+    """The cost that was timed beforehand, corrected by the many images of the pilot.
 
-    Unless these are of far fewer samples: then what they take beside their samples says little of the samples' time.
+    If the pilot's images have far fewer samples, they are not used: their fixed part hides the time of their samples.
     """
     similar = RANGE * pilot_spp >= half_spp
     correction = measured.time_s / cost.time_s(pilot_spp) if similar else 1.0
-    return Row(
+    return CandidateRow(
         connections=measured.candidate.connections,
         light_ratio=measured.candidate.light_ratio,
         errors=measured.errors,

@@ -1,4 +1,4 @@
-"""How noisy a candidate's images are, also where the pilot is too short to see all of its noise.
+"""How noisy a candidate's images are, including noise that the pilot is too short to see.
 
 A candidate's error is the variance between its images, and where another finds significantly more light in some block
 of the image, the variance that it must have there to have missed that light. Rare bright samples that all candidates
@@ -61,23 +61,23 @@ from photonfarm.shared.core.statistics import block_means
 
 EPSILON = 0.01
 BLOCKS = (1, 4, 16)
-"""Blocks along each side of the image, for missing light."""
+"""The numbers of blocks along each side of the image, for missing light."""
 
 SIGNIFICANT = 4.0
-"""Standard errors, if known exactly: by chance once in 30 000 blocks, and then charged with next to nothing."""
+"""The limit in standard errors, if these were exact: exceeded by chance once in 30 000 blocks, at almost no charge."""
 
 SHARED = 8.0
-"""Times the median of what all candidates share, beyond which it is not counted."""
+"""The multiple of its median beyond which the part that all candidates share is not counted."""
 
 Blocks = NDArray[np.float64]
 
 
 def view_weights(images: Sequence[F32]) -> F32 | None:
-    """1/√(r² + ε·mean(r)²) of a view, (H, W, 3), from images that serve for nothing else; None of a black view.
+    """1/√(r² + ε·mean(r)²) of a view, (H, W, 3), from images that serve no other purpose; None for a black view.
 
-    These must not be among those that are weighted: a bright sample in r would divide itself away, and with it just the
-    noise that is looked for. r is the mean image, or where it is brighter its mean over 3 × 3 pixels: few images miss a
-    light that a pixel holds a corner of, but not in all pixels around.
+    The weighted images must not be among them: a bright sample in r would divide itself away, and with it the very
+    noise to be measured. r is the mean image, or its mean over 3 × 3 pixels where that is brighter: few images may miss
+    a light in the corner of a pixel, but not in all pixels around it.
     """
     pooled = np.mean(images, axis=0, dtype=np.float64)
     edged = np.pad(pooled, ((1, 1), (1, 1), (0, 0)), mode="edge")
@@ -87,13 +87,13 @@ def view_weights(images: Sequence[F32]) -> F32 | None:
 
 
 def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[float], float]:
-    """relMSE of one image by each candidate's pair of images, and what all of them share."""
+    """The relMSE of one image from each candidate's pair of images, and the part that all of them share."""
     squares = [((a.astype(np.float64) - b) * weights) ** 2 / 2 for a, b in pairs]
     return [float(square.mean()) for square in squares], float(np.minimum.reduce(squares).mean())
 
 
 def not_counted(shared: Sequence[float]) -> NDArray[np.float64]:
-    """The part that is not counted of what all candidates share, for each pair of images of a view."""
+    """The uncounted part of what all candidates share, for each pair of images of a view."""
     return np.maximum(np.array(shared) - SHARED * np.median(shared), 0)
 
 
@@ -110,7 +110,7 @@ class _Grid:
 
 @dataclass(frozen=True, slots=True)
 class _Evidence:
-    """What is known of the block means of y for one size of blocks, in V views."""
+    """The statistics of the block means of y for one size of blocks, in V views."""
 
     mean: Blocks  # (V, B, B)
     variance: Blocks  # (V, B, B), squared standard errors
@@ -119,14 +119,14 @@ class _Evidence:
 
 
 @dataclass(slots=True)
-class Tally:
+class BlockSums:
     """Sums over one candidate's images of all views, for the light that is missing."""
 
     _grids: dict[int, dict[int, _Grid]] = field(default_factory=dict)  # by size and view
     _ratios: dict[int, list[float]] = field(default_factory=dict)  # by size: the ratio that ρ is the mean of, by pairs
 
     def add(self, a: F32, b: F32, weights: F32, view: int = 0) -> None:
-        """Take two independent images of a view, (H, W, 3)."""
+        """Add two independent images of a view, (H, W, 3)."""
         grey = (np.stack([a, b]).astype(np.float64) * weights).mean(axis=-1, keepdims=True)
         variance = (grey[:1] - grey[1:]) ** 2 / 2
         for blocks in BLOCKS:
@@ -142,7 +142,7 @@ class Tally:
             self._ratios.setdefault(blocks, []).append(ratio)
 
     def evidence(self, blocks: int) -> _Evidence:
-        """Means, standard errors, N and ν of the module's docstring."""
+        """The means, standard errors, N and ν of the module's docstring."""
         grids, ratios = list(self._grids[blocks].values()), np.array(self._ratios[blocks])
         pairs = np.array([[[float(grid.pairs)]] for grid in grids])
         independent = np.stack([np.asarray(grid.pixel_variance) for grid in grids]) / (grids[0].pixels * pairs)
@@ -158,16 +158,16 @@ class Tally:
         )
 
 
-def missed(tally: Tally, others: Sequence[Tally]) -> float:
-    """The charge of the module's docstring, mean over the views: relMSE of an image that a pilot was too short to see.
+def missed(tally: BlockSums, others: Sequence[BlockSums]) -> float:
+    """The charge of the module's docstring, mean over the views: relMSE that the pilot was too short to see.
 
     All tallies are of the same views, in the same order.
     """
     return float(np.max([_missed_in_blocks(tally, others, blocks) for blocks in BLOCKS], axis=0).mean())
 
 
-def _missed_in_blocks(tally: Tally, others: Sequence[Tally], blocks: int) -> NDArray[np.float64]:
-    """(V,), by views."""
+def _missed_in_blocks(tally: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
+    """The charge of each view, (V,), for one size of blocks."""
     own = tally.evidence(blocks)
     charge = np.zeros_like(own.mean)
     for more in (other.evidence(blocks) for other in others):

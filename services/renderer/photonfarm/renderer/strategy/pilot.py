@@ -2,7 +2,7 @@
 
 Successive halving (Karnin, Koren and Somekh, ICML 2013): all candidates render a few images, the better half renders
 twice as many more, until one is left or the time is up. All candidates use the same seeds, so that their eye paths and
-with them most rare bright samples are the same, and differences between candidates are theirs.
+most rare bright samples are the same, and differences between candidates are due to their settings.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
-from photonfarm.renderer.strategy.comparison import Measured
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate
 from photonfarm.renderer.strategy.reasons import BLACK, reasons_for
 from photonfarm.renderer.strategy.rounds import Rounds
 
 LEAST_PAIRS = 4
-"""Pairs of images in the first round, over all views: fewer give no spread."""
+"""The pairs of images in the first round, over all views: fewer would give no standard error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The candidate to render with, and what that rests on."""
+    """The chosen candidate, and its evidence."""
 
     candidate: Candidate
-    measured: tuple[Measured, ...]  # in the order of the candidates given
+    measured: tuple[MeasuredCandidate, ...]  # in the order of the candidates given
     reasons: tuple[str, ...]  # sentences
-    shared: float  # relMSE of an image that all candidates share in rare bright samples: not in `error` (see `noise`)
-    views: int  # that were not black
+    shared: float  # relMSE of the rare bright samples that all candidates share: not in `error` (see `noise`)
+    views: int  # the views that were not black
     spent_s: float  # CPU time of the whole pilot
-    scouting_s: float  # the part of it before the first measurement: kernels, and what the images are weighted with
+    scouting_s: float  # the part before the first measurement: kernels, and the images that give the weights
 
-    def row(self, candidate: Candidate) -> Measured:
-        """What was measured of a candidate."""
+    def row(self, candidate: Candidate) -> MeasuredCandidate:
+        """The measurement of a candidate."""
         return next(row for row in self.measured if row.candidate == candidate)
 
 
@@ -50,12 +50,12 @@ def choose(
 ) -> Choice:
     """The candidate of least error × time over some views, each given by a function that renders it.
 
-    `seconds` of `clock` (CPU time) bound the pilot; its first round is run whatever it takes. It ends before that once
-    one candidate is left which seems to miss nothing. `keep` names candidates that are measured to the end for
-    comparison, as plain path tracing always is, being added if it is missing. Images are compared at `spp`, and their
-    time includes what an image costs whatever its samples are, so `spp` should be that of later use; or `later` says
-    for each candidate how many times longer than one image of the pilot it takes, in later use, to that image's error.
-    Raises ValueError for no views, or for images that are not finite.
+    `seconds` of `clock` (CPU time) bound the pilot; its first round is always completed. It ends earlier once one
+    candidate is left that seems to miss nothing. Candidates in `keep`, and plain path tracing, which is added if it is
+    missing, are measured to the end for comparison. Images are compared at `spp`, and their time includes an image's
+    fixed part, so `spp` should be that of later use; or `later` gives for each candidate the factor from the time of
+    one image of the pilot to the time in later use until the error is the same. Raises ValueError without views, or for
+    images that are not finite.
     """
     views = [renders] if callable(renders) else list(renders)
     if not views:
@@ -71,12 +71,12 @@ def choose(
 
 
 def _halve(rounds: Rounds, every: Sequence[Candidate], pairs: int, kept: set[Candidate], seconds: float) -> None:
-    """Drop the worse half and measure the others twice as long, again and again; all have `pairs` in each view."""
+    """Drop the worse half and measure the others twice as long, repeatedly; all have `pairs` in each view."""
     active = list(every)
     while len(active) > 1:
         ranked = sorted(active, key=rounds.cost)
         best = ranked[: (len(ranked) + 1) // 2]
-        if rounds.is_suspect(best[0]):  # what it misses only shows with more images: keep one that finds it
+        if rounds.is_suspect(best[0]):  # missing light shows only with more images: keep a candidate that finds it
             best += [c for c in ranked if not rounds.is_suspect(c)][:1]
         active = [c for c in every if c in best]
         pairs = rounds.affordable([*active, *(kept - set(active))], 2 * pairs, seconds)
@@ -98,6 +98,6 @@ def _choice(rounds: Rounds, every: Sequence[Candidate]) -> Choice:
 
 
 def longest(candidates: Sequence[Candidate], images: Callable[[Candidate], int]) -> list[Candidate]:
-    """Those of which the most images were rendered: of many, one that has few may be best by chance."""
+    """The candidates with the most images: among many, one with few may be best by chance."""
     most = max(map(images, candidates))
     return [c for c in candidates if images(c) == most]

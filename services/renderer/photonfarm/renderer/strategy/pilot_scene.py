@@ -1,4 +1,4 @@
-"""What the pilot of a spec is rendered on: a loaded scene, some configurations of it, and a view of each."""
+"""The scene of a pilot: a loaded scene, some configurations of it, and a view of each."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 
 SEED = 0
-"""Master seed of the configurations, views and images of pilots."""
+"""The master seed of a pilot's configurations, views and images."""
 
 
-class Stage:
+class PilotScene:
     """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
 
     def __init__(self, spec: SceneSpec, beside: Path | None) -> None:
-        """Load the scene of a spec, on a film as small as the pilot wants it."""
+        """Load the scene of a spec, on a film as small as the pilot requires."""
         self.spec = spec
         self.loaded = LoadedScene.load(spec, beside)
         self._integrators: dict[Candidate, Any] = {}
@@ -32,11 +32,11 @@ class Stage:
         self._editing_s = 0.0
 
     def clock(self) -> float:
-        """CPU seconds of this process, without those that editing the scene took: it costs all candidates the same."""
+        """CPU seconds of this process without those of edits, which cost all candidates the same."""
         return time.process_time() - self._editing_s
 
     def renders(self, count: int) -> list[Render]:
-        """A function for each of some configurations, which renders one view of it."""
+        """A function for each of some configurations; it renders one view of it."""
         return [partial(self._render, *drawn) for drawn in _draw(self.spec, count)]
 
     def configurations(self, count: int) -> Iterator[Any]:
@@ -46,7 +46,7 @@ class Stage:
             yield self.loaded.scene
 
     def camera(self) -> Any:
-        """Mitsuba's sensor, aimed anywhere."""
+        """Mitsuba's sensor, in any direction."""
         return AimedSensor(self.spec).sensor
 
     def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:

@@ -1,4 +1,4 @@
-"""What a spec should say about light transport, and why: `photonfarm scene plan`."""
+"""The plan of a spec's light transport, with reasons: `photonfarm scene plan`."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ from typing import Any
 
 from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.choices import Offer, offers, settled
+from photonfarm.renderer.strategy.choices import CandidateAtCost, offers, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
-from photonfarm.renderer.strategy.measurement import Measurement, Talk, measure, present
+from photonfarm.renderer.strategy.measurement import Log, Measurement, measure, present
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
-"""Times as long a half-estimate, or as short, to which a measurement is taken to apply: what an image costs whatever
-its samples are weighs on the choice where they are few. A plan that is written keeps the time, up to a sample."""
+"""The factor between times of half-estimates up to which a measurement still applies.
+
+The choice depends on an image's fixed part, which matters if samples are few. A written plan keeps the time, up to a
+sample.
+"""
 
 Settings = Mapping[str, Mapping[str, int | float]]
 """Table of a spec → key → number."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """The settings a spec should have, from what was measured and the cost it accepts now."""
+class TransportPlan:
+    """The settings a spec should have, given the measurement and the cost that the spec accepts now."""
 
     spec: SceneSpec
     measurement: Measurement
@@ -33,12 +36,12 @@ class Plan:
     half_spp: int  # of about the cost of the spec's settings now
     photons: PhotonSpec
     photons_reason: str
-    offers: Mapping[Candidate, Offer]  # all that were measured, at that cost; empty where every view is black
-    halves_overhead: float | None  # two half-estimates against one image of twice the samples: share of time added
+    offers: Mapping[Candidate, CandidateAtCost]  # all measured candidates, at that cost; empty if every view is black
+    halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
 
     @property
     def settings(self) -> Settings:
-        """The tables of a spec and what they should say."""
+        """The planned tables of the spec."""
         return {
             "transport": {
                 "connections": self.candidate.connections,
@@ -50,17 +53,17 @@ class Plan:
 
     @property
     def changes(self) -> Settings:
-        """Of the settings, the tables in which the spec says anything else now."""
+        """The planned tables that differ from the spec's present ones."""
         now = {"transport": self.spec.transport.model_dump(), "photons": self.spec.photons.model_dump()}
         return {table: keys for table, keys in self.settings.items() if now[table] != now[table] | dict(keys)}
 
     def saving(self, over: Candidate) -> Saving:
-        """Against other settings, which were measured."""
+        """The saving over other settings, which were measured."""
         return saving(self.offers[self.candidate], self.offers[over])
 
     @property
     def savings(self) -> tuple[Saving, ...]:
-        """Against plain path tracing, the default and the spec's settings now, as far as these are others."""
+        """The savings over plain path tracing, the default and the spec's settings now, as far as these differ."""
         others = dict.fromkeys((PLAIN, DEFAULT, present(self.spec)))
         return tuple(self.saving(c) for c in others if c in self.offers and c != self.candidate)
 
@@ -81,21 +84,21 @@ class Plan:
         }  # fmt: skip
 
 
-def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, talk: Talk) -> Plan:
-    """The plan of a spec: from the cache, if it is there, took no less than `seconds`, and is not wanted again."""
+def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, log: Log) -> TransportPlan:
+    """The plan of a spec; a cached measurement is used if it took at least `seconds`, unless `again` is set."""
     found = None if again else cache.find(spec)
     if found is not None and found.asked_s >= seconds and _knows(found, spec):
         return plan_of(spec, found, cached=True)
-    measurement = measure(spec, beside, seconds, talk)
+    measurement = measure(spec, beside, seconds, log)
     try:
         cache.keep(spec, measurement)
     except OSError as error:
-        talk(f"the measurement could not be kept: {error}")
+        log(f"the measurement could not be kept: {error}")
     return plan_of(spec, measurement, cached=False)
 
 
 def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
-    """Whether the settings of the spec were measured, and at about their cost; where all is black, nothing need be."""
+    """Whether the spec's settings were measured, and at about their cost; if all is black, none need be."""
     if not measurement.rows:
         return True
     now = present(spec)
@@ -105,16 +108,16 @@ def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
     return 1 / SIMILAR <= half_s / measurement.half_s <= SIMILAR
 
 
-def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Plan:
-    """What follows from a measurement for a spec as it is now; its settings are among those measured."""
+def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> TransportPlan:
+    """The plan that follows from a measurement for a spec as it is now; its settings are among those measured."""
     photons, reason = light_reach.recommend(spec.photons, measurement.near, measurement.power, spec.transport.max_depth)
     half_spp = spec.transport.half_spp
     if not measurement.rows:
-        return Plan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
+        return TransportPlan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
     now = present(spec)
     candidate, samples = settled(measurement, now, half_spp)
     cost = measurement.row(candidate).cost
-    return Plan(
+    return TransportPlan(
         spec=spec,
         measurement=measurement,
         cached=cached,

@@ -1,4 +1,4 @@
-"""Why a candidate is taken, in sentences that claim no more than was shown."""
+"""Why a candidate is chosen, in sentences that claim no more than was shown."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import math
 from collections.abc import Sequence
 
 from photonfarm.renderer.strategy.candidate import PLAIN
-from photonfarm.renderer.strategy.comparison import CLEAR, Measured, is_alike
+from photonfarm.renderer.strategy.comparison import CLEAR, MeasuredCandidate, is_alike
 
 BLACK = "every view of the pilot is black: there is no light to model, so plain path tracing does"
 
 SUSPICIOUS = 0.05
-"""Part of a candidate's error that is inferred from light it misses, beyond which that is looked into and told."""
+"""The share of a candidate's error inferred from light it misses above which that is examined and reported."""
 
 
-def reasons_for(chosen: Measured, rows: Sequence[Measured], shared: float) -> tuple[str, ...]:
-    """What speaks for a candidate among all that were measured.
+def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], shared: float) -> tuple[str, ...]:
+    """The reasons for a candidate among all that were measured.
 
     `shared`: relMSE of an image that all candidates share in rare bright samples (see `noise`).
     """
@@ -36,7 +36,7 @@ def reasons_for(chosen: Measured, rows: Sequence[Measured], shared: float) -> tu
     return tuple(reasons)
 
 
-def _against_plain(chosen: Measured, rows: Sequence[Measured]) -> str:
+def _against_plain(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate]) -> str:
     if chosen.candidate != PLAIN:
         share = plus_minus(chosen.relative_cost, chosen.spread)
         return f"{chosen.candidate} reaches the error of {PLAIN} in {share} of the time"
@@ -46,14 +46,14 @@ def _against_plain(chosen: Measured, rows: Sequence[Measured]) -> str:
 
 
 def plus_minus(value: float, spread: float | None) -> str:
-    """A value and its standard error, "0.34 ± 0.02", as `rounded`."""
+    """A value and its standard error, "0.34 ± 0.02", rounded by `rounded`."""
     return " ± ".join(filter(None, rounded(value, spread)))
 
 
 def rounded(value: float, spread: float | None) -> tuple[str, str]:
-    """A value and its standard error to the same decimal place; the second is empty where there is no error.
+    """A value and its standard error to the same decimal place; the second is empty if it is None.
 
-    It is that of the error's first digit, but tenths for errors of 1 to 10 and ones above.
+    The place is that of the error's first digit, but tenths for errors of 1 to 10 and ones above.
     """
     if not spread:
         return f"{value:.3g}", ""

@@ -1,4 +1,4 @@
-"""The images of a pilot: who has rendered how many, and what they tell."""
+"""The images of a pilot: how many each candidate has rendered, and their errors and times."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
-from photonfarm.renderer.strategy.comparison import Errors, Measured
-from photonfarm.renderer.strategy.noise import Tally, missed, not_counted, pair_errors, view_weights
+from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
+from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
 
 SCOUTS = 8
-"""Images of each view at least that only serve to weight the others."""
+"""The least images of each view that serve only to weight the others."""
 
 MOST_PAIRS = 32
-"""Pairs of images of one view: more would refine what depends on the views drawn anyway."""
+"""The most pairs of images of one view: more would refine a result that depends on the drawn views anyway."""
 
 
 @dataclass(slots=True)
@@ -31,7 +31,7 @@ class _Record:
 
 
 class Rounds:
-    """The views, the candidates and what is known so far."""
+    """The views, the candidates and the results so far."""
 
     def __init__(
         self,
@@ -52,13 +52,13 @@ class Rounds:
         self.scouting_s = 0.0
         self.weights: dict[int, F32] = {}  # by view; black views are left out
         self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
-        self._tallies = {c: Tally() for c in candidates}
+        self._tallies = {c: BlockSums() for c in candidates}
         self._shared: dict[int, list[float]] = {}  # by view, of each pair
 
     # ------------------------------------------------------------------------------------------------------ rendering
 
     def scout(self) -> None:
-        """Compile, and render what the images of each view will be weighted with."""
+        """Compile, and render the images that give each view's weights."""
         turns = -(-SCOUTS // len(self._candidates))
         for view, render in enumerate(self._views):
             every = list(self._candidates) * turns
@@ -70,7 +70,7 @@ class Rounds:
         self.scouting_s = self.spent_s()
 
     def round(self, candidates: Sequence[Candidate], pairs: int) -> None:
-        """Render images, the candidates in turn: what slows the machine down slows down all of them."""
+        """Render images, the candidates in turn, so that a slower machine slows all of them down."""
         for view in self.weights:
             for _ in range(pairs):
                 seeds = next(self._seeds[view]), next(self._seeds[view])
@@ -96,7 +96,7 @@ class Rounds:
         return image
 
     def affordable(self, candidates: Sequence[Candidate], pairs: int, seconds: float) -> int:
-        """How many pairs per view, of those wanted, the time that is left allows."""
+        """The number of pairs per view, at most `pairs`, that the remaining time allows."""
         left = seconds - self.spent_s()
         per_pair = 2 * len(self.weights) * sum(self._time(c) for c in candidates)
         room = MOST_PAIRS - max(self.images(c) for c in candidates) // (2 * len(self.weights))
@@ -105,7 +105,7 @@ class Rounds:
     # ------------------------------------------------------------------------------------------------------- figures
 
     def images(self, candidate: Candidate) -> int:
-        """Images rendered of a candidate that count."""
+        """The number of images rendered of a candidate that count."""
         return sum(len(record.times_s) for record in self._records[candidate].values())
 
     def spent_s(self) -> float:
@@ -122,18 +122,18 @@ class Rounds:
         return missed(self._tallies[candidate], [tally for c, tally in self._tallies.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
-        """relMSE that counts, by pairs and views, (pairs, views)."""
+        """The relMSE that counts, by pairs and views, (pairs, views)."""
         columns = []
         for view, record in self._records[candidate].items():
             columns.append(np.array(record.errors) - not_counted(self._shared[view])[: len(record.errors)])
         return np.stack(columns, axis=1)
 
     def shared(self) -> float:
-        """relMSE of an image that all candidates share in rare bright samples, and that does not count."""
+        """The uncounted relMSE of rare bright samples that all candidates share in an image."""
         return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
 
     def is_suspect(self, candidate: Candidate) -> bool:
-        """Whether it seems to miss light that others find; how much of it grows with the images it is judged by."""
+        """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
         inferred = self._missed(candidate)
         return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
 
@@ -141,14 +141,14 @@ class Rounds:
         """Error × time of a candidate: less is better."""
         return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
 
-    def measured(self, candidate: Candidate) -> Measured:
-        """Error × time against plain path tracing, over the images that both rendered with equal seeds."""
+    def measured(self, candidate: Candidate) -> MeasuredCandidate:
+        """The error × time against plain path tracing, over the images that both rendered with equal seeds."""
         seen, inferred = self._seen(candidate), self._missed(candidate)
         plain = self._seen(PLAIN)[: len(seen)] + self._missed(PLAIN)
-        errors = Errors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
+        errors = RelativeErrors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
         cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
         relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
-        return Measured(
+        return MeasuredCandidate(
             candidate=candidate,
             errors=errors,
             missed=inferred,
@@ -159,5 +159,5 @@ class Rounds:
 
 
 def _by_views(errors: NDArray[np.float64]) -> tuple[float, ...]:
-    """Means over pairs, (pairs, views); of a single view its pairs."""
+    """The means over pairs, given (pairs, views); for a single view the pairs themselves."""
     return tuple((errors.mean(axis=0) if errors.shape[1] > 1 else errors[:, 0]).tolist())

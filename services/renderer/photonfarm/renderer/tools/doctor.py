@@ -1,4 +1,4 @@
-"""What works on this machine, and what to do about what does not; each check is a real use, not a look at versions."""
+"""What works on this machine, and remedies for what does not; each check is a real use, not a look at versions."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class MachineCheck:
     """The result of one check."""
 
     name: str
     works: bool
     detail: str
-    exit_code: int = 0  # of the command, if this does not work and is needed
+    exit_code: int = 0  # of the command, if this check fails and is required
 
 
-def examine(store: str | Path, redis_url: str) -> Iterator[Finding]:
+def examine(store: str | Path, redis_url: str) -> Iterator[MachineCheck]:
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
     yield _tried("renderer", _renders)
@@ -40,20 +40,20 @@ def examine(store: str | Path, redis_url: str) -> Iterator[Finding]:
     yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
 
 
-def _packages() -> Finding:
+def _packages() -> MachineCheck:
     names = ("photonfarm-shared", "mitsuba", "drjit", "zarr", "rq", "redis")
-    return Finding("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
+    return MachineCheck("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
 
 
-def _tried(name: str, check: Callable[[], str]) -> Finding:
+def _tried(name: str, check: Callable[[], str]) -> MachineCheck:
     try:
-        return Finding(name, True, check())
+        return MachineCheck(name, True, check())
     except PhotonfarmError as error:
-        return Finding(name, False, str(error), error.exit_code)
+        return MachineCheck(name, False, str(error), error.exit_code)
 
 
-def _optional(finding: Finding, note: str) -> Finding:
-    return finding if finding.works else Finding(finding.name, False, f"{finding.detail} ({note})")
+def _optional(finding: MachineCheck, note: str) -> MachineCheck:
+    return finding if finding.works else MachineCheck(finding.name, False, f"{finding.detail} ({note})")
 
 
 def _renders() -> str:
@@ -114,10 +114,10 @@ def _reaches(url: str) -> str:
         raise QueueError(str(error)) from error
 
 
-def _scenes() -> Finding:
+def _scenes() -> MachineCheck:
     from photonfarm.shared.scene.spec import SCENES_VARIABLE
 
     folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
     found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
     detail = ", ".join(found) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
-    return Finding("scenes", bool(found), detail)
+    return MachineCheck("scenes", bool(found), detail)

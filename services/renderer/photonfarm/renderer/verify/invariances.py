@@ -1,7 +1,8 @@
-"""What must not change an image: technique counts, how lights are grouped, units, how a scene came to be as it is.
+"""Changes that must not change an image: technique counts, the grouping of lights, units, the history of a scene.
 
-And what one seed promises. `checks` yields all of them by name, quick or long; each runs by itself, says what it found,
-and can be repeated with `command`. Equal seeds give equal bytes with one thread only (`backend.load(threads=1)`).
+Also the promises about equal seeds. `checks` yields all of them by name, quick or long; each runs by itself, reports
+its figures, and can be repeated with `command`. Equal seeds give equal bytes with one thread only
+(`backend.load(threads=1)`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, Effort, Images, Scene, Settings
+from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, Scene
 from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
 from photonfarm.renderer.verify.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
@@ -28,19 +29,19 @@ from photonfarm.shared.core.statistics import BlockTest, block_z_test
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
 LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=512, resolution=0.005)
 DEPTH = 5
-COUNTS = tuple(Settings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
+COUNTS = tuple(BdptSettings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0, 4.0)) if r or not c)
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
-"""Scenes with rare bright samples, of which a few renders say too little; they have rows of their own."""
+"""The scenes with rare bright samples, for which a few renders prove too little; they have rows of their own."""
 _MORE_COUNTS = tuple(name for name in hard_scenes.HARD_SCENES if name not in _SKEWED)
 _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """What a check found."""
+class InvarianceResult:
+    """The result of a check."""
 
-    faults: tuple[str, ...]  # why it failed; none: it passed
+    faults: tuple[str, ...]  # why it failed; empty: it passed
     figures: str  # what was measured, in words
     cpu_s: float
 
@@ -51,60 +52,60 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
-    """Something that must hold."""
+class Invariance:
+    """A property that must hold."""
 
     name: str
-    said: str  # what must hold
+    claim: str  # what must hold
     find: Callable[[], tuple[list[str], str]]  # (faults, figures)
     long: bool
 
     @property
     def command(self) -> str:
-        """Runs it again."""
-        return f"python bench/stability.py --invariances {self.name}" + " --quick" * (not self.long)
+        """The command that runs it again."""
+        return f"python -m bench.renderer.stability --invariances {self.name}" + " --quick" * (not self.long)
 
-    def run(self) -> Finding:
-        """Render what it takes, and judge."""
+    def run(self) -> InvarianceResult:
+        """Render what the check needs, and judge it."""
         start = time.process_time()
         faults, figures = self.find()
-        return Finding(tuple(faults), figures, time.process_time() - start)
+        return InvarianceResult(tuple(faults), figures, time.process_time() - start)
 
 
-def checks(*, long: bool) -> Iterator[Check]:
-    """All invariances; the long version looks at more scenes, more sharply."""
+def checks(*, long: bool) -> Iterator[Invariance]:
+    """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
     for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
-        yield Check(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
+        yield Invariance(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
                     partial(equal_means, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("hundred_lights",)).items():
-        yield Check(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
+        yield Invariance(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
                     partial(additive, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("plastics", "rotated_envmap", "mirror_room")).items():
-        yield Check(f"linear-{name}", "radiances times a factor give the image times it",
+        yield Invariance(f"linear-{name}", "radiances times a factor give the image times it",
                     partial(linear, build, effort), long)  # fmt: skip
     for factor in _NEAR_SCALED:
-        yield Check(
+        yield Invariance(
             f"scale-{factor:g}", "lengths times a factor give the same image", partial(scale, factor, effort), long
         )
     for name, build in _scenes(long, ("many_lights",), ("cove",)).items():
-        yield Check(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
+        yield Invariance(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
                     partial(update_equals_reload, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "plastics", "glass_caustic", "cove")).items():
-        yield Check(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
+        yield Invariance(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
                     partial(reproducible, build, effort), long)  # fmt: skip
     for name, build in _scenes(long, ("many_lights",), ("cornell", "glass_caustic", "cove")).items():
-        yield Check(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
+        yield Invariance(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
                     partial(recorded, build, effort), long)  # fmt: skip
     for name, build in (weight_check.LONG_SCENES if long else weight_check.SCENES).items():
-        yield Check(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
+        yield Invariance(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
                     partial(oracles_weights, build, _LANES[long]), long)  # fmt: skip
 
 
-def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
-    """The checks of these names, or whose names begin like them; all for an empty choice.
+def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
+    """The checks of these names, or whose names begin with them; all for an empty choice.
 
-    Raises ValueError for a name that stands for none.
+    Raises ValueError for a name that matches none.
     """
     everything = list(checks(long=long))
     for name in names:
@@ -114,9 +115,9 @@ def chosen(names: Sequence[str], *, long: bool) -> list[Check]:
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
 
 
-def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
-    """A table of checks and what they found, and the commands that repeat those that failed."""
-    lines = [f"| {check.name} | {check.said} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
+def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
+    """A table of checks and their results, and the commands that repeat the failed ones."""
+    lines = [f"| {check.name} | {check.claim} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
     failures = [
         f"- {check.name}: {'; '.join(finding.faults)}. Again: `{check.command}`"
         for check, finding in found
@@ -129,7 +130,7 @@ def markdown(found: Sequence[tuple[Check, Finding]]) -> str:
 
 
 def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], Scene]]:
-    """Scenes by name: the quick ones, and for the long version ``more`` of them."""
+    """Scenes by name: the quick ones, and for the long version also those in ``more``."""
     names = (*quick, *more) if long else quick
     return {name.replace("_", "-"): hard_scenes.HARD_SCENES[name] for name in names}
 
@@ -138,20 +139,20 @@ def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> d
 
 
 def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Every pair of counts against the usual one with more samples. The path tracer (0, 0) may be noisy."""
+    """Compare every pair of counts with the usual one at more samples. The path tracer (0, 0) may be noisy."""
     scene = load(build(effort.size))
     truth = _images(scene, ALL[0], effort, TRUTH_SEEDS, effort.truth_spp)
     faults, ratios = [], []
     for settings in COUNTS:
         wanted = effort if settings.light_ratio else replace(effort, resolution=np.inf)
-        test, said = _compare(_images(scene, settings, effort, 0), truth, wanted)
-        faults += [f"{settings}: {fault}" for fault in said]
+        test, found = _compare(_images(scene, settings, effort, 0), truth, wanted)
+        faults += [f"{settings}: {fault}" for fault in found]
         ratios.append(f"{settings}: {plus_minus(test.mean_ratio, test.mean_ratio_standard_error)}")
     return faults, "; ".join(ratios)
 
 
 def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """All lights against the even ones plus the odd ones, each switched off in place."""
+    """Compare all lights with the even ones plus the odd ones, each switched off in place."""
     scene = load(build(effort.size))
     parameters = mi.traverse(scene)
     keys = _brightness_keys(parameters)
@@ -170,44 +171,44 @@ def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Times 8 with the same seed, where nothing but the exponent changes; times 3 with others."""
+    """Compare radiances times 8 with the same seed, where only the exponent changes; and times 3 with other seeds."""
     scene = load(build(effort.size))
     before = _images(scene, ALL[0], effort, 0)
     _brighten(scene, 8)
     off = _largest_difference(_images(scene, ALL[0], effort, 0), before * 8)
     faults = [f"times 8: a pixel is off by {off:.2g}, allowed is {_SUMS:g}"] if not off <= _SUMS else []
     _brighten(scene, 3 / 8)
-    test, said = _compare(_images(scene, ALL[0], effort, TRUTH_SEEDS), before * 3, effort)
-    return faults + said, f"times 8: largest difference {off:.2g}; times 3: {_ratio(test)}"
+    test, found = _compare(_images(scene, ALL[0], effort, TRUTH_SEEDS), before * 3, effort)
+    return faults + found, f"times 8: largest difference {off:.2g}; times 3: {_ratio(test)}"
 
 
 _SUMS = 1e-5
-"""Largest difference of a pixel, relative to itself and the mean, that is rounding of float32 sums alone."""
+"""The largest difference of a pixel, relative to itself and the mean, that float32 sums alone can cause."""
 _NEAR, _SHARE = 1e-3, 0.9
-"""Share of the pixels that must be this near with one seed; in the others a path has met or missed an edge."""
+"""The limit of a near pixel, and the share of near pixels with one seed; in others a path met or missed an edge."""
 _NEAR_SCALED = {1e3: _NEAR, 1e-3: 2e-2}
-"""The same by factor of scale: below one unit, ray offsets do not become smaller with the scene."""
+"""The limit by factor of scale: below one unit, ray offsets do not become smaller with the scene."""
 
 
 def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
-    """The cove, all lengths times a factor, against itself: with the same seeds, and with others."""
+    """Compare the cove with itself at all lengths times a factor: with the same seeds, and with others."""
     images = _images(load(scaled(factor)(effort.size)), ALL[0], effort, 0)
     same = _images(load(scaled(1.0)(effort.size)), ALL[0], effort, 0)
     near = float(np.mean(_differences(images, same) < _NEAR_SCALED[factor]))
     faults = [f"with one seed {near:.1%} of the pixels are near, wanted are {_SHARE:.0%}"] if near < _SHARE else []
     others = _images(load(scaled(1.0)(effort.size)), ALL[0], effort, TRUTH_SEEDS)
-    test, said = _compare(images, others, effort)
+    test, found = _compare(images, others, effort)
     return (
-        faults + said,
+        faults + found,
         f"with one seed {near:.1%} of the pixels are within {_NEAR_SCALED[factor]:.1%}; with others {_ratio(test)}",
     )
 
 
 def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """The light dimmed, then a box and the camera moved, in place and in the description.
+    """Dim the light, then move a box and the camera, in place and in the description, and compare.
 
-    The light bit by bit. Embree keeps moved meshes otherwise than new ones, and Mitsuba inverts a camera's transform in
-    other precision when it loads it, so that there the last bits differ.
+    The light must match bit by bit. Embree stores moved meshes otherwise than new ones, and Mitsuba inverts a camera's
+    transform at another precision when it loads it, so that there the last bits differ.
     """
     step, new = [0.2, -0.1, 0.15], [0.2, -3.0, 1.1]
     at = mi.ScalarTransform4f().translate([-0.3, 0.2, 0.3]) @ mi.ScalarTransform4f().scale(0.2)
@@ -215,7 +216,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     box = {"type": "cube", "to_world": at, "bsdf": hard_scenes.grey(0.5)}
     start = {**build(effort.size), "box": box}
     scene = load(start)
-    _images(scene, ALL[0], effort, 5)  # so that there is something to be left over
+    _images(scene, ALL[0], effort, 5)  # so that a stale state could show
     parameters = mi.traverse(scene)
     parameters["light.emitter.radiance.value"] = mi.Color3f(1.5, 2.0, 2.5)
     parameters.update()
@@ -234,12 +235,12 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     test, faults = _compare(moved, _images(scene, ALL[0], effort, TRUTH_SEEDS), effort)
     faults += [f"with one seed {unequal:.2%} of the values are unequal"] if unequal else []
     faults += [f"with one seed {near:.2%} of the pixels are near, wanted are {_SHARE:.0%}"] if near < _SHARE else []
-    said = f"unequal values with a dimmed light {unequal:.1%}; near pixels with box and camera moved {near:.1%}"
-    return faults, f"with one seed: {said}; with others {_ratio(test)}"
+    figures = f"unequal values with a dimmed light {unequal:.1%}; near pixels with box and camera moved {near:.1%}"
+    return faults, f"with one seed: {figures}; with others {_ratio(test)}"
 
 
 def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """A seed twice, another between; and several at once. Bit by bit, for each of the usual counts."""
+    """Render a seed twice, another between, and several at once: bit by bit equal, for each of the usual counts."""
     scene = load(build(effort.size))
     faults = []
     for settings in ALL:
@@ -258,7 +259,7 @@ def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[st
 
 
 def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Bit by bit: other seeds, several of them, other numbers of samples, a dimmed or dead light, a moved camera."""
+    """Compare recorded launches bit by bit: other seeds, other numbers of samples, dimmed lights, a moved camera."""
     scene = load(build(effort.size))
     parameters, sensor = mi.traverse(scene), scene.sensors()[0]
     key = _brightness_keys(parameters)[0]
@@ -286,7 +287,7 @@ def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str], str]:
-    """Weights of real paths; see `weight_check`."""
+    """Compare the weights of real paths; see `weight_check`."""
     faults, figures = [], []
     for settings in ALL:
         found = weight_check.compare_weights(build, settings, lanes=lanes)
@@ -299,17 +300,17 @@ def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str
 # ------------------------------------------------ Their parts ------------------------------------------------
 
 
-def _integrator(settings: Settings) -> dict[str, Any]:
+def _integrator(settings: BdptSettings) -> dict[str, Any]:
     counts = {"connections": settings.connections, "light_ratio": settings.light_ratio}
     return {"type": "bdpt", "max_depth": DEPTH, **counts}
 
 
-def _images(scene: Any, settings: Settings, effort: Effort, seed: int, spp: int | None = None) -> Images:
+def _images(scene: Any, settings: BdptSettings, effort: Effort, seed: int, spp: int | None = None) -> Images:
     return render(scene, _integrator(settings), spp or effort.spp, range(seed, seed + effort.seeds))
 
 
 def _compare(a: Images, b: Images, effort: Effort) -> tuple[BlockTest, list[str]]:
-    """The block z-test, and what is wrong by it."""
+    """The block z-test, and its faults."""
     tests = [block_z_test(a, b, blocks, SIGNIFICANCE, ROUNDING) for blocks in (effort.blocks, 1)]
     faults = [f"|z| is {test.z_max:.2f}, the limit {test.z_limit:.2f}" for test in tests if not test.passed]
     if not tests[0].mean_ratio_standard_error <= effort.resolution:
@@ -323,7 +324,7 @@ def _ratio(test: BlockTest) -> str:
 
 
 def _differences(a: Images, b: Images) -> Images:
-    """[K, H, W, 3] relative to the pixel or, where that is dark, to the mean."""
+    """The differences, [K, H, W, 3], relative to the pixel or, if that is dark, to the mean."""
     return np.asarray(np.abs(a - b) / np.maximum(np.abs(b), np.mean(b)))
 
 

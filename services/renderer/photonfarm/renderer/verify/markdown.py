@@ -1,4 +1,4 @@
-"""The stability report as Markdown: verdict, table, pictures, what is hard and what is refused."""
+"""The stability report as Markdown: verdict, table, pictures, hard cases and refusals."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from photonfarm.renderer.verify.pictures import FULL_Z
 from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Result, plus_minus
+from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
 from photonfarm.shared.core.statistics import two_sided_limit
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.verify.report import Report
+    from photonfarm.renderer.verify.report import StabilityReport
 
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "
@@ -31,9 +31,9 @@ _COLUMNS = ("row", "scene", "truth", "settings", "z max (limit)", "mean ratio (b
 _HEAD = f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 
-def markdown(report: Report, command: str) -> str:
+def markdown(report: StabilityReport, command: str) -> str:
     """The report as Markdown."""
-    scenes: dict[str, list[Result]] = {}
+    scenes: dict[str, list[SceneResult]] = {}
     for result in report.results:
         scenes.setdefault(result.label, []).append(result)
     parts = [
@@ -78,8 +78,8 @@ _PICTURES = (
 )
 
 
-def _verdict(report: Report) -> str:
-    """How many rows and scenes pass; refusals that have no row are counted by themselves."""
+def _verdict(report: StabilityReport) -> str:
+    """The numbers of rows and scenes that pass; refusals without a row are counted separately."""
     rows, scenes = report.rows(), report.scenes()
     others = [not result.faults for result in report.results if result.row is None]
     parts = [f"**{sum(rows.values())} of {len(rows)} rows pass**, {sum(scenes.values())} of {len(scenes)} scenes"]
@@ -88,11 +88,11 @@ def _verdict(report: Report) -> str:
     return f"{' '.join(parts)}.{tried}"
 
 
-def _line(results: list[Result]) -> str:
+def _line(results: list[SceneResult]) -> str:
     first = results[0]
     if first.z_limit is None:
-        said = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
-        return f"{said} | – | – | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
+        head = f"| {first.row} | {first.name} | {first.truth} | {first.settings}"
+        return f"{head} | – | – | – | – | – | – | {first.cpu_s:.1f} | {first.verdict} |"
     z = max((r.z_max or 0.0) for r in results)
     brightest = max((r.max_over_mean or 0.0) for r in results)
     verdict = "FAIL" if any(r.faults for r in results) else "pass"
@@ -107,20 +107,20 @@ def _line(results: list[Result]) -> str:
 
 
 def _seen(biases: Sequence[float | None]) -> str:
-    """The worst of some biases that would be seen."""
+    """The worst of the smallest biases that would fail."""
     if None in biases:
         return "unknown"
     worst = 100 * max(bias for bias in biases if bias is not None)
     return f"{worst:.2g} %" if worst < 100 else f"{worst:.0f} %"
 
 
-def _deviation(result: Result) -> float:
+def _deviation(result: SceneResult) -> float:
     if result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return float("inf")
     return abs(result.mean_ratio - 1) / max(result.mean_ratio_standard_error, ROUNDING)
 
 
-def _ratio(results: Sequence[Result]) -> str:
+def _ratio(results: Sequence[SceneResult]) -> str:
     result = max(results, key=_deviation)
     if result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return "unknown"
@@ -128,22 +128,22 @@ def _ratio(results: Sequence[Result]) -> str:
     return f"{plus_minus(result.mean_ratio, result.mean_ratio_standard_error)}{rounding} (≤ {result.resolution:g})"
 
 
-def _path_ratio(result: Result) -> str:
+def _path_ratio(result: SceneResult) -> str:
     if result.path_ratio is None or result.path_ratio_standard_error is None:
         return "–"
     return plus_minus(result.path_ratio, result.path_ratio_standard_error)
 
 
-def _is_rounding(result: Result) -> bool:
-    """Whether it passes only because differences of rounding are let pass: above the noise, and no trifle."""
+def _is_rounding(result: SceneResult) -> bool:
+    """Whether it passes only because of the tolerance for rounding: above the noise, and not negligible."""
     if result.faults or result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return False
     off = abs(result.mean_ratio - 1)
     return off > ROUNDING and off > two_sided_limit(SIGNIFICANCE) * result.mean_ratio_standard_error
 
 
-def _rounded(scenes: Sequence[Sequence[Result]]) -> str:
-    """What is ° in the table, and can be of one colour all over in the picture, beside what `path` has there."""
+def _rounded(scenes: Sequence[Sequence[SceneResult]]) -> str:
+    """The entries marked ° in the table, which may colour a whole picture, beside the same ratio of `path`."""
     if not scenes:
         return ""
     worst = [max(results, key=_deviation) for results in scenes]
@@ -159,7 +159,7 @@ def _per_cent(ratio: float | None) -> str:
     return "unknown" if ratio is None else f"{100 * (ratio - 1):+.3f} %"
 
 
-def _hard(results: Sequence[Result]) -> str:
+def _hard(results: Sequence[SceneResult]) -> str:
     """What is hard, one line for each row; scenes that share a sentence share it."""
     rows: dict[int, dict[str, list[str]]] = {}
     for result in results:
@@ -168,17 +168,17 @@ def _hard(results: Sequence[Result]) -> str:
             names += [result.name] if result.name not in names else []
     lines = []
     for row, sentences in rows.items():
-        said = [f"*{', '.join(names)}*: {hard}" if len(sentences) > 1 else hard for hard, names in sentences.items()]
-        lines.append(f"- {row}: {'; '.join(said)}")
+        found = [f"*{', '.join(names)}*: {hard}" if len(sentences) > 1 else hard for hard, names in sentences.items()]
+        lines.append(f"- {row}: {'; '.join(found)}")
     return "## What is hard\n\n" + "\n".join(lines) if lines else ""
 
 
-def _failures(results: Sequence[Result]) -> str:
+def _failures(results: Sequence[SceneResult]) -> str:
     lines = [f"- {r.label} ({r.settings}): {'; '.join(r.faults)}. Again: `{r.command}`" for r in results if r.faults]
     return "## Failures\n\n" + "\n".join(lines) if lines else ""
 
 
-def _unsupported(refusals: Sequence[Result]) -> str:
-    said = [f"- {r.label}: “{r.hard}” ({r.verdict})" for r in refusals]
-    refused = "## Refused\n\n" + "\n".join([*said, f"- {REFUSED_ON_IMPORT}"])
+def _unsupported(refusals: Sequence[SceneResult]) -> str:
+    lines = [f"- {r.label}: “{r.hard}” ({r.verdict})" for r in refusals]
+    refused = "## Refused\n\n" + "\n".join([*lines, f"- {REFUSED_ON_IMPORT}"])
     return refused + "\n\n## Done from the eye alone\n\n" + "\n".join(f"- {sentence}" for sentence in EYE_ALONE)

@@ -1,4 +1,4 @@
-"""Pictures of outcomes, to look at: bdpt, truth and where they differ.
+"""Pictures of outcomes: bdpt, the truth and their difference.
 
 Shape letters: K renders, H W image, B blocks.
 """
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.runner import Outcome, Renders
+from photonfarm.renderer.verify.runner import Renders, SceneOutcome
 from photonfarm.shared.core.pictures import Picture, display
 
 SIDE = 96
-"""Pixels of one picture's side on the sheet."""
+"""The pixels of one picture's side on the sheet."""
 FULL_Z = 5.0
 """The |z| that is shown in full colour; the limits lie a little above."""
 _LABEL, _GAP, _COLUMNS = 14, 8, 3
@@ -34,7 +34,7 @@ def triple(renders: Renders) -> Picture:
 
 
 def of_z(z: npt.NDArray[np.float64]) -> Picture:
-    """(…, 3) of z (…): white where it is 0, full red at `FULL_Z`, full blue at −`FULL_Z`, black where it is NaN."""
+    """Colours (…, 3) of z (…): white at 0, full red at `FULL_Z`, full blue at −`FULL_Z`, black for NaN."""
     strength = np.clip(np.nan_to_num(z) / FULL_Z, -1, 1)
     red, blue = np.maximum(strength, 0), np.maximum(-strength, 0)
     colours = np.round(255 * np.stack([1 - blue, 1 - red - blue, 1 - red], axis=-1)).astype(np.uint8)
@@ -58,7 +58,7 @@ def sheet(outcomes: Sequence[tuple[str, Picture]]) -> Any:
 
 
 def _draw_legend(whole: Any) -> None:
-    """What the three parts of a triple are, and the colours of z from −`FULL_Z` to `FULL_Z`."""
+    """Draw the legend: the three parts of a triple, and the colours of z from −`FULL_Z` to `FULL_Z`."""
     from PIL import Image, ImageDraw, ImageFont
 
     draw, font = ImageDraw.Draw(whole), ImageFont.load_default(size=15)
@@ -73,7 +73,7 @@ def _draw_legend(whole: Any) -> None:
     draw.text((x + bar.shape[1] + _GAP, 27), brighter, "black", font)
 
 
-def keep(outcome: Outcome, folder: Path) -> Path:
+def keep(outcome: SceneOutcome, folder: Path) -> Path:
     """Write the renders [K, H, W, 3] as .npy and the triple as .png into a folder of this outcome; returns it."""
     from PIL import Image
 

@@ -12,22 +12,22 @@ from typing import TypeVar
 from photonfarm.renderer.verify.markdown import markdown as markdown
 from photonfarm.renderer.verify.pictures import keep, sheet, triple
 from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, Outcome, Result, run
-from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
+from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
+from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
 from photonfarm.shared.core.pictures import Picture
 
 FAILURES = Path(".stability")
-"""Where the renders of failures are kept."""
+"""The folder for the renders of failures."""
 
 
 Key = TypeVar("Key", int, str)
 
 
 @dataclass(slots=True)
-class Report:
-    """What a run found."""
+class StabilityReport:
+    """The results of a run."""
 
-    results: list[Result] = field(default_factory=list)
+    results: list[SceneResult] = field(default_factory=list)
     pictures: list[tuple[str, Picture]] = field(default_factory=list)  # label, triple of the first settings
 
     @property
@@ -36,15 +36,15 @@ class Report:
         return not any(result.faults for result in self.results)
 
     def rows(self) -> dict[int, bool]:
-        """Number → whether all of the row's scenes that were rendered passed, with all settings."""
+        """Whether each row passed, by number: all of its scenes that were rendered, with all settings."""
         return _all_passed((result.row, result) for result in self.results if result.row is not None)
 
     def scenes(self) -> dict[str, bool]:
-        """Label → whether the scene passed with all settings; one for each line of the table."""
+        """Whether each scene passed with all settings, by label; one for each line of the table."""
         return _all_passed((result.label, result) for result in self.results if result.row is not None)
 
 
-def _all_passed(results: Iterable[tuple[Key, Result]]) -> dict[Key, bool]:
+def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
     verdicts: dict[Key, bool] = {}
     for key, result in results:
         verdicts[key] = verdicts.get(key, True) and not result.faults
@@ -52,31 +52,31 @@ def _all_passed(results: Iterable[tuple[Key, Result]]) -> dict[Key, bool]:
 
 
 def examine(
-    items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[Settings] = (),
-    failures: Path = FAILURES, tell: Callable[[str], None] = lambda _: None,
-) -> Report:  # fmt: skip
-    """Run the scenes (see `rows.chosen`), keep the renders of failures, tell of each as it is done."""
-    report = Report()
+    items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = (),
+    failures: Path = FAILURES, log: Callable[[str], None] = lambda _: None,
+) -> StabilityReport:  # fmt: skip
+    """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""
+    report = StabilityReport()
     for item in items:
         for outcome in run(item, quick=quick, seed=seed, settings=settings):
-            _add(report, outcome, failures, tell)
-        gc.collect()  # the next scene's kernels are found in the cache only once this scene is gone
+            _add(report, outcome, failures, log)
+        gc.collect()  # Dr.Jit finds the next scene's kernels in its cache only once this scene is gone
     return report
 
 
-def _add(report: Report, outcome: Outcome, failures: Path, tell: Callable[[str], None]) -> None:
+def _add(report: StabilityReport, outcome: SceneOutcome, failures: Path, log: Callable[[str], None]) -> None:
     result = outcome.result
     if outcome.renders is not None and result.label not in dict(report.pictures):
         report.pictures.append((result.label, triple(outcome.renders)))
     report.results.append(result)
-    tell(f"{result.label} ({result.settings}): {result.verdict}")
+    log(f"{result.label} ({result.settings}): {result.verdict}")
     if result.faults:
         folder = keep(outcome, failures)
-        tell(f"  {'; '.join(result.faults)}\n  again: {result.command}\n  renders: {folder}")
+        log(f"  {'; '.join(result.faults)}\n  again: {result.command}\n  renders: {folder}")
 
 
-def write(report: Report, out: Path, command: str) -> None:
-    """Write stability.md, stability.json and stability.png into a folder; `command` is what made them."""
+def write(report: StabilityReport, out: Path, command: str) -> None:
+    """Write stability.md, stability.json and stability.png into a folder; `command` is the command that made them."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "stability.md").write_text(markdown(report, command), encoding="utf-8")
     (out / "stability.json").write_text(as_json(report, command), encoding="utf-8")
@@ -84,7 +84,7 @@ def write(report: Report, out: Path, command: str) -> None:
         sheet(report.pictures).save(out / "stability.png")
 
 
-def as_json(report: Report, command: str) -> str:
+def as_json(report: StabilityReport, command: str) -> str:
     """All results, one object for each scene and settings."""
     results = [asdict(result) | {"label": result.label, "verdict": result.verdict} for result in report.results]
     rows, scenes = report.rows(), report.scenes()

@@ -6,25 +6,25 @@ import difflib
 from collections.abc import Sequence
 
 from photonfarm.renderer.verify.scenes import cameras, closed_form, lights, surfaces
-from photonfarm.renderer.verify.scenes.case import HardScene, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
 
 SCENES: tuple[HardScene, ...] = tuple(
     sorted((*closed_form.SCENES, *lights.SCENES, *surfaces.SCENES, *cameras.SCENES), key=lambda scene: scene.row)
 )
-"""Every hard scene; a row has one or a few."""
+"""All hard scenes; a row has one or a few."""
 REFUSALS: tuple[Refusal, ...] = cameras.REFUSALS
-"""What is refused: row 30, and what has no row."""
+"""The refusals: row 30, and others without a row."""
 ROWS = 36
-"""How many rows there are."""
+"""The number of rows."""
 
 
 def chosen(
-    only: Sequence[str] = (), *, quick: bool = False, settings: Sequence[Settings] = ()
+    only: Sequence[str] = (), *, quick: bool = False, settings: Sequence[BdptSettings] = ()
 ) -> list[HardScene | Refusal]:
     """Scenes and refusals by row number, name or label, in order; all of them for an empty choice.
 
-    Left out are scenes without a quick version, and those that are not tried with any of the settings. Raises
-    ValueError for a name that stands for no scene at all, or for none that is left.
+    Scenes without a quick version, or not tried with any of the settings, are left out. Raises ValueError for a name
+    that matches no scene, or if none is left.
     """
     everything: list[HardScene | Refusal] = sorted([*SCENES, *REFUSALS], key=lambda item: item.row or ROWS + 1)
     left = [item for item in everything if _is_tried(item, quick, settings)]
@@ -42,7 +42,7 @@ def chosen(
 
 
 def _unknown(wanted: str, everything: Sequence[HardScene | Refusal]) -> str:
-    """One sentence; a name that is almost right is answered with the right one."""
+    """The message about an unknown name, in one sentence; it suggests a similar name."""
     if wanted.lstrip("-").isdigit():
         return f"there is no row {wanted}; allowed are 1 to {ROWS}"
     known = [name for item in everything for name in (item.label, item.name)]
@@ -55,7 +55,7 @@ def _is_called(item: HardScene | Refusal, wanted: str) -> bool:
     return wanted in (item.label, item.name) or (wanted.isdigit() and item.row == int(wanted))
 
 
-def _is_tried(item: HardScene | Refusal, quick: bool, settings: Sequence[Settings]) -> bool:
+def _is_tried(item: HardScene | Refusal, quick: bool, settings: Sequence[BdptSettings]) -> bool:
     if isinstance(item, Refusal):
         return True
     return not (quick and item.quick is None) and (not settings or any(s in item.settings for s in settings))

@@ -16,22 +16,22 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Refusal, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
 from photonfarm.renderer.verify.scenes.truths import PATH, load, render
 from photonfarm.shared.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
 
 SIGNIFICANCE = 4e-6
-"""Probability that one right scene fails with one pair of settings: 0.1 % for 250 of them, more than there are."""
+"""The probability that a right scene fails with one pair of settings: 0.1 % for 250 pairs, more than there are."""
 ROUNDING = 1e-4
-"""Standard errors below this part of the mean count as this: ray offsets and float32 sums are not held to more.
+"""The least standard error, as a part of the mean: ray offsets and float32 sums are not more exact.
 
 In the shining sphere `path` itself is 0.04 % too bright at depth 2, 0.07 % at depth 3 (row 1), 0.09 % at 24 (row 36).
 """
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
-    """A line of the table."""
+class SceneResult:
+    """A scene's result with one pair of settings: a line of the table."""
 
     row: int | None
     name: str
@@ -41,22 +41,22 @@ class Result:
     size: int
     seeds: int
     spp: int
-    truth_spp: int | None  # None where the truth is known exactly
+    truth_spp: int | None  # None for a truth that is known exactly
     z_max: float | None  # largest block |z|, and that of the whole image
     z_limit: float | None
     mean_ratio: float | None  # bdpt over truth, whole images
     mean_ratio_standard_error: float | None
     resolution: float | None  # the largest standard error allowed
-    seen_bias: float | None  # part of the mean by which the image must be off to fail, if the noise does not help it
-    seen_block_bias: float | None  # the same of its worst block, as part of the block's mean
+    seen_bias: float | None  # the part of the mean by which the image must be off to fail, if the noise does not help
+    seen_block_bias: float | None  # likewise for its worst block, as part of the block's mean
     max_over_mean: float | None  # brightest pixel of any render over the mean
     truth_max_over_mean: float | None
     nan: int
     inf: int
     cpu_s: float
-    faults: tuple[str, ...]  # why it failed; none: it passed
-    command: str  # renders it again
-    path_ratio: float | None = None  # `path` over a truth that is known exactly: what rounding alone does in Mitsuba
+    faults: tuple[str, ...]  # why it failed; empty: it passed
+    command: str  # the command that renders it again
+    path_ratio: float | None = None  # `path` over a truth that is known exactly: the effect of rounding alone
     path_ratio_standard_error: float | None = None
 
     @property
@@ -72,7 +72,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Renders:
-    """What a result was judged by."""
+    """The renders from which a result was judged."""
 
     bdpt: Images
     truth: Images
@@ -80,19 +80,19 @@ class Renders:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SceneOutcome:
     """A result and its renders; a refusal has none."""
 
-    result: Result
+    result: SceneResult
     renders: Renders | None = None
 
 
 def run(
-    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[Settings] = ()
-) -> Iterator[Outcome]:
-    """One outcome for each settings: those given among the scene's, else the quick ones if quick, else all.
+    item: HardScene | Refusal, *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = ()
+) -> Iterator[SceneOutcome]:
+    """One outcome for each pair of settings: those given among the scene's, else the quick ones if quick, else all.
 
-    Nothing for a scene that has no quick version, or is not tried with any of these settings.
+    Yields nothing for a scene without a quick version, or that is not tried with any of these settings.
     """
     if isinstance(item, Refusal):
         yield _refused(item, quick)
@@ -114,14 +114,14 @@ def run(
         integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
         integrator |= {"connections": counts.connections, "light_ratio": counts.light_ratio}
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
-        command = f"python bench/stability.py --only {item.label} --settings {counts} --seed {seed}"
+        command = f"python -m bench.renderer.stability --only {item.label} --settings {counts} --seed {seed}"
         outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
         yield replace(outcome, result=replace(outcome.result, path_ratio=path[0], path_ratio_standard_error=path[1]))
         start = time.process_time()
 
 
 def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tuple[float | None, float | None]:
-    """Mean ratio of `path` to the truth, and its standard error; None where the truth is a render."""
+    """The mean ratio of `path` to the truth, and its standard error; None if the truth is a render."""
     if len(truth) > 1:
         return None, None
     found = compare(PATH.images(item, effort, seed), truth, 1)
@@ -129,21 +129,21 @@ def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tu
 
 
 def _judged(
-    item: HardScene, effort: Effort, settings: Settings, bdpt: Images, truth: Images, start: float, command: str
-) -> Outcome:
+    item: HardScene, effort: Effort, settings: BdptSettings, bdpt: Images, truth: Images, start: float, command: str
+) -> SceneOutcome:
     with np.errstate(all="ignore"):  # values that are not finite, and black images, are judged below
         blocks, whole = compare(bdpt, truth, effort.blocks), compare(bdpt, truth, 1)
         brightest, truth_brightest = _max_over_mean(bdpt), _max_over_mean(truth)
     z_max = float(np.fmax(blocks.z_max, whole.z_max))
     faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
-    result = Result(
-        item.row, item.name, item.hard, item.truth.said, str(settings), effort.size, effort.seeds, effort.spp,
+    result = SceneResult(
+        item.row, item.name, item.hard, item.truth.name, str(settings), effort.size, effort.seeds, effort.spp,
         effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
         _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
         _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
         int(np.isnan(bdpt).sum()), int(np.isinf(bdpt).sum()), time.process_time() - start, faults, command,
     )  # fmt: skip
-    return Outcome(result, Renders(bdpt, truth, blocks.z))
+    return SceneOutcome(result, Renders(bdpt, truth, blocks.z))
 
 
 def _faults(
@@ -181,7 +181,7 @@ def compare(images: Images, truth: Images, blocks: int) -> BlockTest:
 
 
 def seen_bias(images: Images, truth: Images, blocks: int) -> float:
-    """The bias that just fails, as part of a block's mean and of the block where it is largest; black ones apart."""
+    """The smallest bias that fails, as part of a block's mean: that of the worst block, without black ones."""
     with np.errstate(all="ignore"):
         means, expected = block_means(images, blocks), block_means(truth, blocks)
         variance = means.var(axis=0, ddof=1) / len(means)
@@ -213,11 +213,11 @@ def _finite(value: float) -> float | None:
 
 
 def message_of(refusal: Refusal, size: int = 8) -> str:
-    """What `bdpt` says to the scene; empty if it renders it."""
+    """The message with which `bdpt` refuses the scene; empty if it renders it."""
     return _refusal(load(refusal.build(size)), refusal.settings)
 
 
-def _refusal(scene: object, settings: Settings) -> str:
+def _refusal(scene: object, settings: BdptSettings) -> str:
     integrator = {"type": "bdpt", "connections": settings.connections, "light_ratio": settings.light_ratio}
     try:
         mi.load_dict(integrator).render(scene, seed=0, spp=1)
@@ -226,15 +226,15 @@ def _refusal(scene: object, settings: Settings) -> str:
     return ""
 
 
-def _refused(refusal: Refusal, quick: bool) -> Outcome:
+def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     start = time.process_time()
-    said = message_of(refusal)
-    faults = [] if refusal.sentence in said else [f"not refused with {refusal.sentence!r}, but with {said!r}"]
+    text = message_of(refusal)
+    faults = [] if refusal.sentence in text else [f"not refused with {refusal.sentence!r}, but with {text!r}"]
     if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
-    result = Result(
-        refusal.row, refusal.name, said, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
+    result = SceneResult(
+        refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
-        f"python bench/stability.py --only {refusal.label}" + " --quick" * quick,
+        f"python -m bench.renderer.stability --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
-    return Outcome(result)
+    return SceneOutcome(result)

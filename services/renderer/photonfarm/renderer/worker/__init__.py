@@ -1,1 +1,1 @@
-"""The render worker: a supervisor, and the child that it starts and that renders."""
+"""The render worker: a supervisor, and the child process that renders."""

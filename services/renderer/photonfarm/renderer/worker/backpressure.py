@@ -1,6 +1,6 @@
-"""When a worker should take no job: the disk is nearly full, or the trainer is far behind.
+"""Reasons for a worker to take no job: the disk is nearly full, or the trainer is far behind.
 
-Neither fails a job, and both pass by themselves. They hold back what has not begun; the job in hand is finished.
+Neither fails a job, and both end by themselves. They hold back jobs that have not begun; the job in hand is finished.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from photonfarm.shared.store.io.local import LocalStorage
 from photonfarm.shared.store.write.scene_store import Progress
 
 AHEAD_MINIMUM = 256
-"""Samples that may be committed before any has been used: a trainer waits for its first few, also held-out ones."""
+"""The samples that may be committed before any is used: a trainer waits for its first few, also held-out ones."""
 
 AHEAD_LOOK_S = 5.0
-"""Between counts of what is committed, which lists every marker."""
+"""The seconds between counts of committed samples, each of which lists every marker."""
 
 FULL_S = 30.0
-"""How long a disk that refused a commit is left alone, where the reserve does not tell when there is space again."""
+"""How long jobs stop after a disk refused a commit, if the reserve does not tell when there is space again."""
 
 
 class DiskReserve:
-    """Keeps some of a store's disk free; a store that is not on a disk of ours has no end."""
+    """Keeps some of a store's disk free; a store that is not on a local disk has no limit."""
 
     def __init__(self, store: Store, reserve_bytes: int, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Take a store and how much of its disk is to stay free."""
+        """Take a store and the number of bytes of its disk that must stay free."""
         self._root = store.storage.root if isinstance(store.storage, LocalStorage) else None
         self._reserve_bytes = reserve_bytes
         self._clock = clock
         self._refused_until = 0.0
 
     def refused(self) -> None:
-        """The disk has just refused a write, whatever it says of its space: quotas are not seen there."""
+        """Report that the disk has just refused a write, whatever free space it states: quotas do not show there."""
         self._refused_until = self._clock() + FULL_S
 
     def reason(self) -> str | None:
-        """Why no job should be taken now; None if there is none. Raises StoreError if the store's folder is gone."""
+        """Why no job should be taken now, or None. Raises StoreError if the store's folder is gone."""
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
         with store_errors("ask how much of the disk is free", str(self._root)):
@@ -70,8 +70,8 @@ def is_full(error: BaseException) -> bool:
 class TrainerPace:
     """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
 
-    Each scene by itself: a trainer uses the samples of one. Samples that lack guides do not count in a scene that is to
-    have them: a trainer that needs these cannot use them yet, and would wait for workers that wait for it.
+    Each scene is treated by itself, as a trainer uses the samples of one. In a scene with guides, samples that lack
+    them do not count: a trainer that needs guides cannot use these yet, and would wait for workers that wait for it.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class TrainerPace:
         scene_id: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take where both numbers are found; a ratio below 1 would stop for good, as no more is used than committed."""
+        """Take the sources of both numbers; a ratio below 1 would stop for good, as no more is used than committed."""
         self._store = store
         self._connection = connection
         self._ratio = ratio
@@ -100,7 +100,7 @@ class TrainerPace:
         return self._ahead
 
     def _progress(self) -> dict[str, Progress]:
-        """By scene id; a scene that cannot be read holds nobody back."""
+        """The progress of each scene, by its id; a scene that cannot be read holds back no jobs."""
         if self._scene_id is None:
             return self._store.each(SceneStore.progress)[0]
         return {self._scene_id: self._store.scene(self._scene_id).progress()}

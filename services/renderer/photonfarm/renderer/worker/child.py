@@ -1,7 +1,7 @@
-"""The worker's child: an RQ worker that keeps its scenes warm, for our jobs alone.
+"""The worker's child: an RQ worker that keeps its scenes loaded, and runs our jobs alone.
 
-What RQ leaves out is here: a deadline that also ends native code, recycling, and filling the queue when idle. What it
-has too much of is left out: commands over pub/sub, scheduled jobs, maintenance that loads strangers' jobs.
+It adds what RQ lacks: a deadline that also ends native code, recycling, and filling the queue when idle. It leaves out
+what RQ has too much of: commands over pub/sub, scheduled jobs, maintenance that loads strangers' jobs.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
-from photonfarm.renderer.worker.heartbeat import Heart
-from photonfarm.renderer.worker.log import Talk, Tally
+from photonfarm.renderer.worker.heartbeat import HeartbeatThread
+from photonfarm.renderer.worker.log import JobCounts, WorkerLog
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import (
@@ -41,43 +41,43 @@ from photonfarm.shared.queue import RenderArguments, RenderJob
 from photonfarm.shared.store import SceneStore, Store
 
 STARTS_ALLOWED = 5
-"""Starts of one job without an end, after which it counts as failed: it kills its workers."""
+"""The starts of one job without an end after which it counts as failed: it kills its workers."""
 
 RQ_WORKER_TTL_S = 120
-"""After this, and a minute, RQ forgets a worker that was killed while idle; our own heartbeat is what counts."""
+"""The seconds, and one minute more, after which RQ forgets a worker killed while idle; our own heartbeat decides."""
 
 POLL_S = 0.2
-"""Between looks at an empty queue."""
+"""The seconds between looks at an empty queue."""
 
 NOT_HERE_S = 300.0
-"""For so long a scene is left to others whose files are not here; then they are looked for again."""
+"""How long a scene whose files are missing here is left to other workers before its files are looked for again."""
 
 log = logging.getLogger(__name__)
 
 
 def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     """The child's main function: settings from stdin, work, and the exit code; its last words go to stdout."""
-    words = os.dup(1)
-    os.dup2(2, 1)  # whatever else is printed, by Mitsuba say, is talk
+    pipe = os.dup(1)
+    os.dup2(2, 1)  # all other output, by Mitsuba say, goes to stderr
     settings = WorkerSettings.model_validate_json(sys.stdin.buffer.readline())
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
     threading.Thread(target=_end_with_supervisor, daemon=True).start()
     try:
         store = Store(settings.store)
         jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
-        return RenderWorker(settings, store, queue.connect(settings.redis_url), words).run()
+        return RenderWorker(settings, store, queue.connect(settings.redis_url), pipe).run()
     except PhotonfarmError as error:
-        _leave_word(words, str(error))
+        _send_line(pipe, str(error))
         return error.exit_code
     except redis.RedisError as error:
-        _leave_word(words, f"lost Redis: {error}")
+        _send_line(pipe, f"lost Redis: {error}")
         return QueueError.exit_code
 
 
-def _leave_word(words: int, message: str) -> None:
-    """Tell the supervisor, if it is still there."""
+def _send_line(pipe: int, message: str) -> None:
+    """Send a line to the supervisor, if it is still there."""
     with contextlib.suppress(BrokenPipeError):
-        os.write(words, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
+        os.write(pipe, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
 
 
 def _end_with_supervisor() -> None:
@@ -92,8 +92,8 @@ def _end_with_supervisor() -> None:
 class RenderWorker(SimpleWorker):
     """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
 
-    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, words: int | None = None) -> None:
-        """Register nothing yet; `words` is a file descriptor that the supervisor reads, if there is one."""
+    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, pipe: int | None = None) -> None:
+        """Prepare without registering; `pipe` is a file descriptor that the supervisor reads, if there is one."""
         self._queue = queue.open_queue(connection)
         super().__init__(
             [self._queue],
@@ -107,23 +107,23 @@ class RenderWorker(SimpleWorker):
         self._settings = settings
         self._store = store
         self._fatal: PhotonfarmError | None = None
-        self._tainted = False  # something unforeseen happened, perhaps in the middle of an edit
+        self._tainted = False  # an unexpected error happened, perhaps in the middle of an edit
         self._failed = False  # the job in hand
-        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, what this machine leaves to others…
+        self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
-        self._heart = Heart(settings, store, words)
+        self._heart = HeartbeatThread(settings, store, pipe)
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None
             if settings.ahead is None
             else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
         )
-        self._talk = Talk(settings)
-        self._words = words
-        self._tally = Tally()
+        self._talk = WorkerLog(settings)
+        self._pipe = pipe
+        self._counts = JobCounts()
 
     def run(self) -> int:
-        """Work until stopped, complete or due for a successor; the exit code, 0 only if all is complete."""
+        """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
         self._heart.start()
         self.bootstrap(logging_level="WARNING")
         self._install_signal_handlers()
@@ -149,13 +149,13 @@ class RenderWorker(SimpleWorker):
             with contextlib.suppress(redis.RedisError):
                 self._heart.end()
                 self.teardown()
-        return RECYCLED  # for a supervisor that has not been told to stop itself
+        return RECYCLED  # for a supervisor that is not to stop itself
 
     def subscribe(self) -> None:
-        """Nothing: whoever may write to Redis could stop workers and jobs by RQ's commands, and nobody needs them."""
+        """Do nothing: by RQ's commands any client of Redis could stop workers and jobs, and nothing needs them."""
 
     def run_maintenance_tasks(self) -> None:
-        """Nothing: `reconcile` does what is needed, without loading strangers' jobs."""
+        """Do nothing: `reconcile` does the maintenance, without loading strangers' jobs."""
 
     def get_heartbeat_ttl(self, job: RenderJob) -> int:  # noqa: ARG002
         """How long RQ's own records of a running job last, in seconds."""
@@ -164,7 +164,7 @@ class RenderWorker(SimpleWorker):
     # ---------------------------------------------------------------------------------------------------- taking a job
 
     def _take(self) -> RenderJob | None:
-        """The next job; None if for a while there was none, or none should be taken."""
+        """Take the next job; None if there was none for a while, or none should be taken."""
         queue.serve(self.connection, self._store)
         held_back = self._disk.reason()
         self._talk.pausing(held_back)
@@ -177,13 +177,13 @@ class RenderWorker(SimpleWorker):
                 log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
             if job is not None or time.monotonic() >= until:
                 return job
-            time.sleep(self._settings.idle_s if self._heart.left else POLL_S)  # Redis looks at each job that is left
+            time.sleep(self._settings.idle_s if self._heart.left else POLL_S)  # Redis checks each job that is skipped
 
     def _next(self) -> tuple[RenderJob | None, int]:
         return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._heart.left)
 
     def _left(self) -> dict[str, str]:
-        """Why this worker takes no jobs of some scenes now, by their ids."""
+        """Why this worker now takes no jobs of some scenes, by their ids."""
         ahead = self._pace.ahead() if self._pace else {}
         self._talk.waiting(ahead)
         for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
@@ -191,9 +191,9 @@ class RenderWorker(SimpleWorker):
         return {**ahead, **{scene_id: str(error) for scene_id, error in self._not_here.items()}}
 
     def _fill_or_finish(self) -> bool:
-        """Look at the store, as there is no coordinator; True if there is nothing left to wait for.
+        """Fill the queue from the store, as there is no coordinator; True if there is nothing left to wait for.
 
-        Raises StoreError if the store is gone: an empty folder in its place has nothing missing.
+        Raises StoreError if the store is gone: an empty folder in its place would seem to miss nothing.
         """
         self._store.check()
         if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
@@ -206,7 +206,7 @@ class RenderWorker(SimpleWorker):
         not_failed = missing.keys() - failed.keys()
         if not_failed and all(missing[name] in self._not_here for name in not_failed):
             raise self._not_here[missing[min(not_failed)]]
-        if unreadable and not not_failed:  # and nothing else is left: the others were gone on with
+        if unreadable and not not_failed:  # and nothing else is left: the other scenes' jobs were taken before
             raise unreadable[min(unreadable)]
         if missing and not not_failed:
             first = min(missing)
@@ -217,7 +217,7 @@ class RenderWorker(SimpleWorker):
         return not missing
 
     def _missing(self) -> tuple[dict[str, str], dict[str, StoreError]]:
-        """The scene ids of the missing jobs, by their names; and why nothing is known of some scenes, by their ids."""
+        """The scene ids of the missing jobs, by their names; and why some scenes cannot be read, by their ids."""
         only = self._settings.scene_id
         unreadable: dict[str, StoreError] = {}
         if only is None:
@@ -230,7 +230,7 @@ class RenderWorker(SimpleWorker):
 
     def execute_job(self, job: RenderJob, queue: Any) -> None:
         """Run one job under a heartbeat and a deadline."""
-        self.set_state(WorkerStatus.BUSY)  # told to stop from here on, RQ ends the job first
+        self.set_state(WorkerStatus.BUSY)  # if it is asked to stop from here on, RQ ends the job first
         self._failed = False
         began = time.monotonic()
         with self._heart.working(job.id), self._talk.timing(job.id):
@@ -240,21 +240,21 @@ class RenderWorker(SimpleWorker):
         self._count(job.id, time.monotonic() - began)
 
     def _count(self, name: str, seconds: float) -> None:
-        """Have the supervisor know what became of the jobs so far: it outlives us, whatever ends us."""
+        """Report the jobs so far to the supervisor, which outlives this process, however it ends."""
         done = not self._failed
-        self._tally += Tally(done, not done, self._samples(name) if done else 0, seconds)
-        if self._words is not None:
-            _leave_word(self._words, self._tally.line)
+        self._counts += JobCounts(done, not done, self._samples(name) if done else 0, seconds)
+        if self._pipe is not None:
+            _send_line(self._pipe, self._counts.line)
 
     def _samples(self, name: str) -> int:
-        """How many samples a job has; 0 where its scene cannot be read any more."""
+        """The number of samples of a job; 0 if its scene cannot be read any more."""
         with contextlib.suppress(PhotonfarmError, IndexError):
             arguments = RenderArguments.of(name)
             return len(self._store.scene(arguments.scene_id).job_rows(arguments.job).samples)
         return 0
 
     def _count_start(self, job: RenderJob) -> None:
-        """Count a start, and have a job refused that has been started too often."""
+        """Count a start, and refuse a job that has been started too often."""
         starts = queue.count_start(self.connection, job.id)
         if starts > STARTS_ALLOWED:
             job.refuse(self._given_up(job.id, starts - 1))
@@ -269,14 +269,14 @@ class RenderWorker(SimpleWorker):
         return f"{died}, or {late} ({overdue} times)" if overdue else died
 
     def _settle(self, name: str) -> None:
-        """Count nothing against a job that has ended, but its failures."""
+        """Reset the counts of a job's starts, which has ended; its failures stay."""
         if self._failed:
             queue.forget_starts_of(self.connection, name)
         else:
             queue.forget_failures_of(self.connection, name)
 
     def handle_exception(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> None:  # noqa: ARG002
-        """Decide what a failed job means: for the job, for this worker, or nothing."""
+        """Decide the consequences of a failed job: for the job, for this worker, or none."""
         if self._is_committed(job.id):
             log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", job.id, error)
             return
@@ -301,7 +301,7 @@ class RenderWorker(SimpleWorker):
                 self._record(job.id, f"{type(error).__name__}: {error}")
 
     def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
-        """What the next job would fail of as well; in a store that is gone, whatever the job has failed of."""
+        """The error that the next job would meet as well; if the store is gone, whatever error the job had."""
         if isinstance(error, redis.RedisError):
             return None
         try:
@@ -329,7 +329,7 @@ class RenderWorker(SimpleWorker):
 
 
 def _resident_bytes() -> int:
-    """Memory of this process now; its peak where the system does not tell."""
+    """The memory of this process now; its peak if the system does not state it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:

@@ -1,4 +1,4 @@
-"""A worker's heartbeat and a job's deadline, both kept by threads that no rendering holds up."""
+"""A worker's heartbeat and a job's deadline, both kept by threads that rendering does not block."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from photonfarm.shared.store import Store
 STDERR = 2
 
 
-class Heart:
-    """Tells Redis that the worker and its job are alive, and what holds it up, from a thread with its own connection.
+class HeartbeatThread:
+    """Writes the heartbeat of the worker and its job, and why it is idle, from a thread with its own connection.
 
-    `paused` says why it takes no jobs, and `left` by scene id why it leaves scenes alone for now.
+    `paused` is the reason why it takes no jobs, and `left` by scene id the reason why it skips scenes for now.
     """
 
-    def __init__(self, settings: WorkerSettings, store: Store, words: int | None) -> None:
-        """Connect; `words` is a file descriptor for the supervisor. Raises QueueError if there is no Redis."""
+    def __init__(self, settings: WorkerSettings, store: Store, pipe: int | None) -> None:
+        """Connect; `pipe` is a file descriptor for the supervisor. Raises QueueError if there is no Redis."""
         self._settings = settings
         self._store = store
-        self._words = words
+        self._pipe = pipe
         self._connection = queue.connect(settings.redis_url)
         self._supervisor = os.getppid()
         self._job: str | None = None
         self._ended = threading.Event()
         self.paused: str | None = None
         self.left: Mapping[str, str] = {}  # replaced, never changed
-        self._left_told: Mapping[str, str] = {}
+        self._left_reported: Mapping[str, str] = {}
 
     def start(self) -> None:
         """Take over from a child that died, and beat for as long as the process lives."""
@@ -45,22 +45,22 @@ class Heart:
         threading.Thread(target=self._keep_beating, daemon=True).start()
 
     def end(self) -> None:
-        """Say that the worker's child is gone; its supervisor keeps the name."""
+        """Remove the heartbeat of the worker's child; its supervisor keeps the name."""
         self._ended.set()
         queue.free_job(self._connection, self._settings.name)
-        queue.forget_held_up(self._connection, self._settings.name, {*self.left, *self._left_told})
+        queue.clear_idle_report(self._connection, self._settings.name, {*self.left, *self._left_reported})
 
     @contextlib.contextmanager
     def working(self, name: str) -> Iterator[None]:
-        """Beat for a job too while the block runs; past the deadline the process ends, and says where it hung."""
+        """Beat for a job too while the block runs; past the deadline the process ends, and prints where it hung."""
         self._job = name
-        if self._words is not None:
+        if self._pipe is not None:
             with contextlib.suppress(BrokenPipeError):
-                os.write(self._words, f"{JOB_IN_HAND}{name}\n".encode())
+                os.write(self._pipe, f"{JOB_IN_HAND}{name}\n".encode())
         self._beat()
-        # its watchdog is a thread without Python's lock, so that native code that never returns is ended as well
+        # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
         faulthandler.dump_traceback_later(
-            self._settings.deadline_s, exit=True, file=STDERR if self._words is None else self._words
+            self._settings.deadline_s, exit=True, file=STDERR if self._pipe is None else self._pipe
         )
         try:
             yield
@@ -79,7 +79,7 @@ class Heart:
     def _beat(self) -> None:
         name, ttl_s = self._settings.name, self._settings.heartbeat_ttl_s
         queue.beat(self._connection, name, process_space(), self._job, ttl_s=ttl_s, process=self._supervisor)
-        left, self._left_told = self._left_told, self.left
-        if no_longer := left.keys() - self._left_told.keys():
-            queue.forget_held_up(self._connection, name, no_longer)
-        queue.tell_held_up(self._connection, name, self.paused, self._left_told, ttl_s=ttl_s)
+        left, self._left_reported = self._left_reported, self.left
+        if no_longer := left.keys() - self._left_reported.keys():
+            queue.clear_idle_report(self._connection, name, no_longer)
+        queue.report_idle(self._connection, name, self.paused, self._left_reported, ttl_s=ttl_s)

@@ -1,4 +1,4 @@
-"""What a worker says while all is well: a line after its first job and then one a minute, and why it pauses."""
+"""The log of a worker in normal operation: a line after its first job and then one a minute, and why it pauses."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from photonfarm.renderer.worker.settings import TALLY, WorkerSettings
+from photonfarm.renderer.worker.settings import JOBS_SO_FAR, WorkerSettings
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
-    """What became of jobs."""
+class JobCounts:
+    """Counts of jobs and samples."""
 
     jobs: int = 0  # done
     failed: int = 0
     samples: int = 0  # of those that are done
     seconds: float = 0.0  # of all
 
-    def __add__(self, other: Tally) -> Tally:
-        """Both together."""
-        return Tally(
+    def __add__(self, other: JobCounts) -> JobCounts:
+        """The sum of both."""
+        return JobCounts(
             self.jobs + other.jobs,
             self.failed + other.failed,
             self.samples + other.samples,
@@ -33,50 +33,50 @@ class Tally:
 
     @property
     def line(self) -> str:
-        """As a child tells it."""
-        return f"{TALLY}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
+        """The counts as a child writes them to its supervisor."""
+        return f"{JOBS_SO_FAR}{self.jobs} {self.failed} {self.samples} {self.seconds:.3f}"
 
     @classmethod
-    def of(cls, line: str) -> Tally:
-        """What a child has told."""
-        jobs, failed, samples, seconds = line.removeprefix(TALLY).split()
+    def of(cls, line: str) -> JobCounts:
+        """The counts in a line of a child."""
+        jobs, failed, samples, seconds = line.removeprefix(JOBS_SO_FAR).split()
         return cls(int(jobs), int(failed), int(samples), float(seconds))
 
     def __str__(self) -> str:
-        """As people are told."""
+        """The counts in words."""
         failed = f", {self.failed} failed" if self.failed else ""
         return f"{counted(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
 
 
 def counted(jobs: int) -> str:
-    """So many jobs, in words."""
+    """A number of jobs, in words."""
     return f"{jobs} job{'s' * (jobs != 1)}"
 
 
-class Talk:
-    """Counts jobs, and says how it goes; nothing if the settings say quiet, but for what holds the worker up."""
+class WorkerLog:
+    """Counts jobs, and logs progress; with `quiet` only what holds the worker up."""
 
     def __init__(self, settings: WorkerSettings) -> None:
-        """Count from now on."""
+        """Start counting."""
         log.setLevel(logging.WARNING if settings.quiet else logging.INFO)
         self._name = settings.name
         self._every_s = settings.report_s
         self._jobs = 0
         self._seconds = 0.0
-        self._said = -settings.report_s
+        self._logged_s = -settings.report_s
         self._pausing = False
         self._waiting: set[str] = set()
 
     @contextlib.contextmanager
     def timing(self, name: str) -> Iterator[None]:
-        """A job, as long as the block runs."""
+        """Time a job while the block runs."""
         began = time.monotonic()
         yield
         now = time.monotonic()
         self._jobs += 1
         self._seconds += now - began
-        if now - self._said >= self._every_s:
-            self._said = now
+        if now - self._logged_s >= self._every_s:
+            self._logged_s = now
             log.info(
                 "worker %s: %s in %.0f s, %.2f s each; the last was %s",
                 self._name,
@@ -87,7 +87,7 @@ class Talk:
             )
 
     def pausing(self, reason: str | None) -> None:
-        """Say once that no jobs are taken, and once that they are again."""
+        """Log once that no jobs are taken, and once that they are taken again."""
         if reason and not self._pausing:
             log.warning("worker %s: takes no jobs: %s", self._name, reason)
         elif self._pausing and not reason:
@@ -95,7 +95,7 @@ class Talk:
         self._pausing = bool(reason)
 
     def waiting(self, ahead: Mapping[str, str]) -> None:
-        """Say once of each scene that its jobs are left for a reason, and once that they are taken again."""
+        """Log once for each scene why its jobs are skipped, and once that they are taken again."""
         for scene_id in ahead.keys() - self._waiting:
             log.warning("worker %s: takes no jobs of scene %s: %s", self._name, scene_id, ahead[scene_id])
         for scene_id in self._waiting - ahead.keys():

@@ -1,4 +1,4 @@
-"""What a worker is told, by the command line to its supervisor and by that to its child."""
+"""The settings of a worker, which the command line passes to its supervisor, and that to its child."""
 
 from __future__ import annotations
 
@@ -9,27 +9,30 @@ from pydantic import ConfigDict, Field
 from photonfarm.shared.scene.spec import Frozen
 
 GRACE_S = 5.0
-"""What a job in hand gets to end in once its worker is to stop: one that is nearly done is kept, and the worker is gone
-within the 10 s that Docker gives. A longer job is killed, and as it has no marker it is rendered again."""
+"""The seconds for a job in hand to end once its worker is to stop.
+
+A job that is nearly done is kept, and the worker is gone within the 10 s that Docker gives. A longer job is killed, and
+as it has no marker it is rendered again.
+"""
 
 RECYCLED = 75
-"""Exit code of a child that wants a successor."""
+"""The exit code of a child that is due for a successor."""
 
 JOB_IN_HAND = "job in hand: "
-"""What a child writes to its supervisor, before a job's name, when it begins the job."""
+"""The line's beginning by which a child reports the job that it begins, before the job's name."""
 
-TALLY = "so far: "
-"""What a child writes to its supervisor, before the numbers of a `Tally`, when a job has ended."""
+JOBS_SO_FAR = "so far: "
+"""The line's beginning by which a child reports its jobs so far, before the numbers of `JobCounts`."""
 
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
-"""Of what a supervisor and its child say."""
+"""The format of log lines of a supervisor and its child."""
 
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 
 
 class WorkerSettings(Frozen):
-    """What a worker is told; each default with its reason."""
+    """The settings of a worker; each default with its reason."""
 
     model_config = ConfigDict(hide_input_in_errors=True)  # the URL may hold a password
 
@@ -37,14 +40,14 @@ class WorkerSettings(Frozen):
     redis_url: Annotated[str, Field(repr=False)]
     name: Annotated[str, Field(min_length=1, max_length=128)]
     until_complete: bool = False
-    scene_id: str | None = None  # fill the queue with, and wait for, this scene alone; None: all of the store
-    quiet: bool = False  # say only what is wrong
+    scene_id: str | None = None  # fill the queue with, and wait for, this scene alone; None: the whole store
+    quiet: bool = False  # log only problems
     max_jobs: Count = 500  # then a fresh child: bounds what leaks, at < 1 % of the time
     max_rss_bytes: Count = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more
     deadline_s: Positive = 1800.0  # jobs are meant to take 5 to 30 s; a hundred times that is a hang
     heartbeat_ttl_s: Positive = 90.0  # longer than native code holds Python's lock
-    steady_s: Positive = 30.0  # a child that lived this long was well: its successor starts at once
+    steady_s: Positive = 30.0  # a child that lived this long was healthy: its successor starts at once
     idle_s: Count = 2  # between looks at the store, while the queue is empty
-    report_s: Positive = 60.0  # between lines that say how it goes
+    report_s: Positive = 60.0  # between lines about the progress
     reserve_bytes: Annotated[int, Field(ge=0)] = 10**9  # a few jobs, and room for whatever else needs the disk
     ahead: Annotated[float, Field(ge=1)] | None = None  # a scene's samples committed for each that its trainer has used

@@ -15,8 +15,8 @@ from types import FrameType
 
 import redis
 
-from photonfarm.renderer.worker.log import Tally
-from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, RECYCLED, TALLY, WorkerSettings
+from photonfarm.renderer.worker.log import JobCounts
+from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, JOBS_SO_FAR, RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.core.processes import Stop, process_space
@@ -27,53 +27,53 @@ from photonfarm.shared.store.read.find import scene_named
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 
 POLL_S = 1.0
-"""Between looks for a store that is not there yet, and for signals that came while the child was being listened to."""
+"""The seconds between looks for a missing store, and for signals that came while reading from the child."""
 
 HUNG_LINES = 8
-"""Of the stack of a job that the deadline has ended: the innermost calls, which tell where it was."""
+"""The lines of the stack of a job that the deadline ended: its innermost calls, where it hung."""
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
-    """What a child has told."""
+class ChildOutput:
+    """The output of a child."""
 
-    last: str  # why it ended, if it said so
-    job: str | None  # the one that it began last
-    hung: str  # where the deadline has ended that; "" if it has not
-    tally: Tally  # of the jobs that ended
+    last: str  # why it ended, if it stated that
+    job: str | None  # the job that it began last
+    hung: str  # the stack where the deadline ended that job; "" if it did not
+    counts: JobCounts  # of the jobs that ended
 
     @classmethod
-    def of(cls, told: str) -> Words:
-        """What was written: jobs that were begun, last words, and faulthandler's dump, the main thread at its end."""
-        said, timeout, dump = told.partition("Timeout (")
-        lines = said.splitlines()
+    def of(cls, text: str) -> ChildOutput:
+        """Parse a child's output: jobs begun, last words, and faulthandler's dump, the main thread at its end."""
+        written, timeout, dump = text.partition("Timeout (")
+        lines = written.splitlines()
         jobs = [line.removeprefix(JOB_IN_HAND) for line in lines if line.startswith(JOB_IN_HAND)]
-        tallies = [line for line in lines if line.startswith(TALLY)]
-        others = [line for line in lines if line.strip() and not line.startswith((JOB_IN_HAND, TALLY))]
+        counted = [line for line in lines if line.startswith(JOBS_SO_FAR)]
+        others = [line for line in lines if line.strip() and not line.startswith((JOB_IN_HAND, JOBS_SO_FAR))]
         stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
-        tally = Tally.of(tallies[-1]) if tallies else Tally()
-        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]), tally)
+        counts = JobCounts.of(counted[-1]) if counted else JobCounts()
+        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]), counts)
 
     @property
     def overdue(self) -> str | None:
-        """The job that the deadline has ended; None if it has ended none."""
+        """The job that the deadline ended; None if it ended none."""
         return self.job if self.hung else None
 
 
 class Supervisor:
     """Starts the child again until it has nothing left to do."""
 
-    def __init__(self, settings: WorkerSettings, command: tuple[str, ...], say: Callable[[str], None]) -> None:
-        """Take what to start, and where to say what happens."""
+    def __init__(self, settings: WorkerSettings, command: tuple[str, ...], report: Callable[[str], None]) -> None:
+        """Take the child's command line, and the function that logs events."""
         self._settings = settings
         self._command = command
-        self._say = say
+        self._report = report
         self._stop = Stop()
         self._child: subprocess.Popen[bytes] | None = None
-        self._tally = Tally()
+        self._counts = JobCounts()
 
     def run(self) -> None:
-        """Supervise; raises what the child cannot go on with."""
+        """Supervise; raises the errors that a new child would meet again."""
         vacant = is_vacant(self._settings.store)
         if vacant and self._settings.until_complete:
             raise StoreError(f"{self._settings.store}: there is no store; `photonfarm submit` makes one")
@@ -88,15 +88,15 @@ class Supervisor:
                         queue.serve(connection, store)
                         self._supervise(store)
             finally:
-                if (self._tally.jobs or self._tally.failed) and not self._settings.quiet:
-                    self._say(f"worker {self._settings.name}: ended: {self._tally}")
+                if (self._counts.jobs or self._counts.failed) and not self._settings.quiet:
+                    self._report(f"worker {self._settings.name}: ended: {self._counts}")
                 with contextlib.suppress(redis.RedisError):
                     if store is not None:
                         queue.release(connection, store)
 
     @contextlib.contextmanager
     def _named(self, connection: redis.Redis) -> Iterator[None]:
-        """Have a name that no other worker alive has, until the block ends; raises QueueError if Redis fails."""
+        """Hold a name that no other live worker has, until the block ends; raises QueueError if Redis fails."""
         wanted = self._settings.name
         try:
             name = queue.take_name(
@@ -105,7 +105,7 @@ class Supervisor:
         except redis.RedisError as error:
             raise QueueError(f"Redis failed while worker {wanted} was announced: {error}") from error
         if name != wanted:
-            self._say(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
+            self._report(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
         self._settings = self._settings.model_copy(update={"name": name})
         try:
             yield
@@ -114,9 +114,9 @@ class Supervisor:
                 queue.bury(connection, name)
 
     def _waited_for(self, connection: redis.Redis) -> Store | None:
-        """The store, once somebody has made it; None if told to stop before. The worker counts as alive meanwhile."""
+        """Wait for the store; None if asked to stop before. The worker counts as alive meanwhile."""
         settings = self._settings
-        self._say(f"worker {settings.name}: waiting for a store at {settings.store}")
+        self._report(f"worker {settings.name}: waiting for a store at {settings.store}")
         while is_vacant(settings.store):
             with contextlib.suppress(redis.RedisError):
                 queue.beat(
@@ -134,39 +134,39 @@ class Supervisor:
         failures = 0
         while not self._stop.is_set():
             started = time.monotonic()
-            code, words = self._run_child()
+            code, output = self._run_child()
             if code < 0 and self._stop.is_set():
                 _free_job(self._settings)
             if code == 0 or self._stop.is_set():
                 return
-            _raise_final(code, words.last)
+            _raise_final(code, output.last)
             if code == RECYCLED:
                 failures = 0
                 continue
             failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
             pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
-            if code > 0 and words.overdue:
-                _count_overdue(self._settings, words.overdue)
-            ending = _ending(code, words, self._settings.deadline_s)
-            self._say(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
+            if code > 0 and output.overdue:
+                _count_overdue(self._settings, output.overdue)
+            ending = _ending(code, output, self._settings.deadline_s)
+            self._report(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
-    def _run_child(self) -> tuple[int, Words]:
-        """Exit code of one child, and what it has told."""
+    def _run_child(self) -> tuple[int, ChildOutput]:
+        """Run one child; returns its exit code and its output."""
         with subprocess.Popen(
             self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
         ) as self._child:
             if self._child.stdin is None or self._child.stdout is None:
                 raise BackendError("the worker's child was started without pipes")
-            if self._stop.is_set():  # asked to while it was being started
+            if self._stop.is_set():  # a stop was requested while it was being started
                 self._child.terminate()
             with contextlib.suppress(BrokenPipeError):
                 self._child.stdin.write(self._settings.model_dump_json().encode() + b"\n")
-                self._child.stdin.flush()  # and left open: its end tells the child that we are gone
-            words = Words.of(_all_told(self._child.stdout.fileno()).decode(errors="replace"))
-            self._tally += words.tally
-            return self._child.wait(), words
+                self._child.stdin.flush()  # it stays open: its end shows the child that the supervisor is gone
+            output = ChildOutput.of(_read_all(self._child.stdout.fileno()).decode(errors="replace"))
+            self._counts += output.counts
+            return self._child.wait(), output
 
     # ---------------------------------------------------------------------------------------------------------- signals
 
@@ -192,8 +192,8 @@ class Supervisor:
             threading.Thread(target=self._see_off, daemon=True).start()
 
     def _see_off(self) -> None:
-        """End the child after the grace: its own handler waits for native code to return, which may take minutes."""
-        self._say(
+        """End the child after the grace period: its own handler waits for native code, which may take minutes."""
+        self._report(
             f"worker {self._settings.name}: stopping; a job in hand that takes longer than {GRACE_S:g} s "
             "will be rendered again"
         )
@@ -202,33 +202,33 @@ class Supervisor:
             self._child.kill()
 
 
-def _all_told(pipe: int) -> bytes:
-    """What a child tells until it ends.
+def _read_all(pipe: int) -> bytes:
+    """Read a child's output until it ends.
 
-    A read that waits for all of it would not see a signal that comes between two parts, for as long as the child says
-    nothing more: Python acts on signals only between its own instructions, or where one interrupts a system call.
+    A read of everything at once would not notice a signal between two parts, until the child writes again: Python
+    handles signals only between its own instructions, or when one interrupts a system call.
     """
-    told = bytearray()
+    content = bytearray()
     while True:
         if select.select([pipe], [], [], POLL_S)[0]:
             part = os.read(pipe, 1 << 16)
             if not part:
-                return bytes(told)
-            told += part
+                return bytes(content)
+            content += part
 
 
-def _ending(code: int, words: Words, deadline_s: float) -> str:
-    """How a child has ended, in words."""
+def _ending(code: int, output: ChildOutput, deadline_s: float) -> str:
+    """How a child ended, in words."""
     if code < 0:
         return f"its child was ended by {signal.Signals(-code).name}"
-    if words.overdue:
+    if output.overdue:
         deadline = f"--deadline {deadline_s:g} s"
-        return f"job {words.overdue} took longer than {deadline} and was ended, while in\n{words.hung}\n"
-    return words.last or f"its child ended with exit code {code}, for the reason above"
+        return f"job {output.overdue} took longer than {deadline} and was ended, while in\n{output.hung}\n"
+    return output.last or f"its child ended with exit code {code}, for the reason above"
 
 
 def _free_job(settings: WorkerSettings) -> None:
-    """Let others have the job that a child was killed with at once, and do not count this start of it."""
+    """Free the job of a killed child at once, and do not count this start of it."""
     with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
         name = queue.free_job(connection, settings.name)
         if name is not None:
@@ -236,13 +236,13 @@ def _free_job(settings: WorkerSettings) -> None:
 
 
 def _count_overdue(settings: WorkerSettings, name: str) -> None:
-    """Have it known what has ended this start of a job; a Redis that is not there need not know."""
+    """Record that the deadline ended this start of a job; a Redis that cannot be reached is ignored."""
     with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
         queue.count_overdue(connection, name)
 
 
 def _raise_final(code: int, message: str) -> None:
-    """Raise what starting again does not help against."""
+    """Raise the errors that a new child would meet again."""
     for kind in (StoreError, BackendError, IncompleteError):
         if code == kind.exit_code:
             raise kind(message)

@@ -1,8 +1,8 @@
 """The worker: a supervisor and the child that it keeps alive.
 
-The child (`worker_child`) is an RQ worker that renders in its own process, so that scenes and kernels stay warm. It is
-always a fresh interpreter, as Dr.Jit's threads do not survive a fork; it gets its settings through stdin, as the Redis
-URL may hold a password, and ends when that pipe does, so that it cannot outlive its supervisor.
+The child (`worker_child`) is an RQ worker that renders in its own process, so that scenes and kernels stay loaded. It
+is always a fresh interpreter, as Dr.Jit's threads do not survive a fork; it gets its settings through stdin, as the
+Redis URL may hold a password, and ends when that pipe does, so that it cannot outlive its supervisor.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ def run_worker(
     *,
     name: str | None = None,
     child: Sequence[str] = CHILD,
-    say: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
     **settings: Any,
 ) -> None:
-    """Render what is queued until told to stop, or with `until_complete` until nothing is missing.
+    """Render queued jobs until asked to stop, or with `until_complete` until nothing is missing.
 
-    A store that does not exist is waited for, but with `until_complete`. Where another worker has its name, this one
-    goes by that with a number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a
-    second one at once. Further `settings` are those of WorkerSettings; `scene_id` may also be how an id begins, or a
-    scene's name. Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves
-    another store, StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    It waits for a missing store, except with `until_complete`. If another worker has its name, this one appends a
+    number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a second one at once.
+    Further `settings` are those of WorkerSettings; `scene_id` may also be the beginning of an id, or a scene's name.
+    Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves another store,
+    StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
     """
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
-    told = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
-    Supervisor(told, tuple(child), say or log.warning).run()
+    worker = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
+    Supervisor(worker, tuple(child), report or log.warning).run()
 
 
 def render_job(
     store: str | Path, scene: str, job: int, *, load: jobs.SceneLoader = jobs.load_scene
 ) -> tuple[bool, float]:
-    """Render and commit one job here and now, without a queue: whether it was not committed before, and the seconds.
+    """Render and commit one job here, without a queue; returns whether it was not committed before, and the seconds.
 
-    `scene` is its id, how that begins, or its name. Whatever goes wrong in it is raised as it is; StoreError if the
+    `scene` is its id, the beginning of its id, or its name. Errors of the job are raised unchanged; StoreError if the
     store has no such job.
     """
     opened = Store(store)

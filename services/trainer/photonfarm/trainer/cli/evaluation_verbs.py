@@ -1,4 +1,4 @@
-"""The verbs that ask what was learned: evaluate, infer, report."""
+"""The verbs for trained networks: evaluate, infer, report."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from photonfarm.trainer.cli.train_verb import run_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
-class Several(click.Option):
-    """An option that may be repeated, of which a configuration file may give one."""
+class RepeatableOption(click.Option):
+    """An option that may be repeated; a configuration file may give a single value."""
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
-        """The values; click takes the letters of a single one apart."""
+        """The values as a tuple; click would split a single text into letters."""
         return super().type_cast_value(ctx, [value] if isinstance(value, str | int) else value)
 
 
@@ -30,19 +30,20 @@ device_option = click.option(
 
 
 runs_option = click.option(
-    "--run", "runs", cls=Several, multiple=True, type=click.Path(path_type=Path, file_okay=False), default=["run"],
-    envvar="PHOTONFARM_RUN", show_default=True, help="Folder of a training run; several give several rows.",
+    "--run", "runs", cls=RepeatableOption, multiple=True, type=click.Path(path_type=Path, file_okay=False),
+    default=["run"], envvar="PHOTONFARM_RUN", show_default=True,
+    help="Folder of a training run; several give several rows.",
 )  # fmt: skip
 references_option = click.option(
     "--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
     help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
 )  # fmt: skip
 denoisers_option = click.option(
-    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=Several, multiple=True,
+    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=RepeatableOption, multiple=True,
     help="Measure one that is not trained too, or several. none: dropped pixels stay black.",
 )  # fmt: skip
 kept_option = click.option(
-    "--kept", type=click.IntRange(1), cls=Several, multiple=True, metavar="K",
+    "--kept", type=click.IntRange(1), cls=RepeatableOption, multiple=True, metavar="K",
     help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
 )  # fmt: skip
 samples_option = click.option(
@@ -56,7 +57,7 @@ inception_option = click.option(
 
 
 def measuring(command: Callable[..., None]) -> Callable[..., None]:
-    """The options that say what is measured, against what and on which device; `_how` takes all but the runs."""
+    """The options for what is measured, against what and on which device; `_how` takes all but the runs."""
     options = (
         store_option, runs_option, references_option, denoisers_option, kept_option, samples_option, inception_option,
         device_option,
@@ -73,7 +74,7 @@ def _how(
     inception: Path | None,
     **others: Any,
 ) -> dict[str, Any]:
-    """What `compare` takes, every denoiser with every share of the pixels; UsageError for options that need others."""
+    """The arguments of `compare`: every denoiser with every share of the pixels. Raises UsageError."""
     if kept and not denoisers:
         raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
     if inception and references is None:
@@ -97,14 +98,14 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     """
     how = _how(**asked)
     from photonfarm.trainer.compare.evaluate import compare, write
-    from photonfarm.trainer.compare.evaluation_table import told
+    from photonfarm.trainer.compare.evaluation_table import evaluation_text
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    with _progress() as tell:
-        found = compare(store, loaded, tell=tell, **how)
+    with _progress() as on_progress:
+        found = compare(store, loaded, on_progress=on_progress, **how)
     pictures = write(found, loaded)
-    click.echo(json.dumps(found.document(), indent=2) if as_json else told(found))
+    click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 
@@ -124,14 +125,14 @@ def report(
     how = _how(**asked)
     from photonfarm.trainer.report import write_report
 
-    with _progress() as tell:
-        figures = write_report(store, list(dict.fromkeys(runs)), out, tell=tell, timed=not untimed, **how)
+    with _progress() as on_progress:
+        figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 
 
 @contextmanager
 def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """What tells how far it has come: a bar for each predictor on a terminal, a line elsewhere; both to stderr."""
+    """A progress callback: a bar for each predictor on a terminal, else a line; both on stderr."""
     from rich import markup
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -144,12 +145,12 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
 
-        def tell(name: str, done: int, total: int) -> None:
+        def show(name: str, done: int, total: int) -> None:
             if name not in tasks:
                 tasks[name] = bars.add_task(markup.escape(name), total=total)
             bars.update(tasks[name], completed=done)
 
-        yield tell
+        yield show
 
 
 def _line(name: str, done: int, total: int) -> None:

@@ -1,4 +1,4 @@
-"""The trainer as a service: it waits for a store and a scene, trains as the samples come, and says that it lives."""
+"""The trainer as a service: it waits for a store and a scene, trains as samples arrive, and shows that it is alive."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
 
 if TYPE_CHECKING:
-    from photonfarm.trainer.runs.distributed import Group
+    from photonfarm.trainer.runs.distributed import TrainingGroup
 
 T = TypeVar("T")
 
 POLL_S = 1.0
 ALIVE_FILE = "alive"
-TELL_S = 5.0  # between figures for the workers
-ALIVE_S = 60.0  # a run whose sign of life is older is taken for dead
+REPORT_S = 5.0  # between reports to the workers
+ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
 
 
 def run(
@@ -43,20 +43,21 @@ def run(
     changes: dict[str, Any],
     redis_url: str | None = None,
 ) -> None:
-    """Train on one scene of a store, until the settings say stop or SIGTERM comes; both leave a checkpoint.
+    """Train on one scene of a store, until the settings' end or SIGTERM; both leave a checkpoint.
 
-    Waiting for a scene, its base and its samples counts as time spent. With a Redis, workers are told what is used.
-    Started by torchrun, rank 0 does all this, and the others train with it until it ends; all need the same folder.
+    The time spent waiting for a scene, its base and its samples counts. With a Redis, the used samples are reported to
+    workers. Under torchrun, rank 0 does all this, and the other ranks train with it until it ends; all need the same
+    folder.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
-    from photonfarm.trainer.runs.distributed import ALONE, leading, ranks
+    from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
     from photonfarm.trainer.training.assist import assist
     from photonfarm.trainer.training.loop import stop_on_signals
 
     settings = settings_of(preset_name, changes)
     with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
-        group = ours or ALONE
+        group = ours or SINGLE_PROCESS
         device = group.device(settings.device)
         if ours is not None and ours.rank:
             assist(partial(StoreSource, store), settings, folder, ours)
@@ -73,12 +74,12 @@ def _lead(
     settings: TrainSettings,
     redis_url: str | None,
     stop: Stop,
-    group: Group,
+    group: TrainingGroup,
 ) -> None:
-    """Train as the only process or as rank 0: it waits for a scene, tells, and leaves event files for TensorBoard."""
+    """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.tensorboard import event_files
-    from photonfarm.trainer.training.loop import train
+    from photonfarm.trainer.training.loop import Hooks, train
 
     begun_on = _begun_on(folder)
     if scene_id and begun_on and scene_id != begun_on:
@@ -99,17 +100,26 @@ def _lead(
             there = scene_id in Store(store).scene_ids()
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
-        with _consumption_told(redis_url, store, scene_id) as count:
-            listen = [_tell, *([board.record] if board else [])]
+        with _reported(redis_url, store, scene_id) as on_draws:
+            logs = [_log_record, *([board.record] if board else [])]
             outcome = train(
-                source, settings, folder, stop=stop, count=count, waited=waited, group=group,
-                listen=lambda record: [hear(record) for hear in listen], show=board.pictures if board else None,
-            )  # fmt: skip
+                source,
+                settings,
+                folder,
+                Hooks(
+                    stop=stop,
+                    on_record=lambda record: [log(record) for log in logs],
+                    on_draws=on_draws,
+                    on_images=board.pictures if board else None,
+                    waited=waited,
+                    group=group,
+                ),
+            )
     click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
 
 
 def check(folder: Path) -> None:
-    """Raise IncompleteError unless a trainer has given a sign of life in this run's folder lately."""
+    """Raise IncompleteError unless a trainer has recently given a sign of life in this run's folder."""
     try:
         age_s = time.time() - (folder / ALIVE_FILE).stat().st_mtime
     except OSError as error:
@@ -145,10 +155,10 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
 
 
 def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, changes: dict[str, Any]) -> str:
-    """The table of a grid search over optimisers, rates and decays on a complete store; goes on where it was stopped.
+    """Run, or resume, a grid search over optimisers, rates and decays on a complete store; returns its table.
 
-    What `changes` set of these is searched no further. Raises SpecError without a spec, unless the store has one scene,
-    for a store without the scene, and in one of several processes.
+    Keys that `changes` sets are not searched. Raises SpecError without a spec, unless the store has one scene, for a
+    store without the scene, and in one of several processes.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.grid import AXES, STEPS, run_grid, table
@@ -163,22 +173,22 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
         wanted = f" {spec}" if spec else ""
         raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):
-        tell = partial(click.echo, err=True)
+        log = partial(click.echo, err=True)
         axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
         if settings.schedule == "cosine":
             axes["decay"] = (settings.decay,)
-            tell("decay is not searched: schedule = 'cosine' has none")
+            log("decay is not searched: schedule = 'cosine' has none")
         elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
             axes["decay"] = (settings.decay,)
-            tell(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
-        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, tell=tell)
+            log(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
+        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, log=log)
         if stop.is_set():
-            tell(f"stopped after {len(cells)} cells; the same command goes on")
+            log(f"stopped after {len(cells)} cells; the same command goes on")
         return table(cells)
 
 
 def _begun_on(folder: Path) -> str | None:
-    """The scene that a run was begun on; None for a run that has not begun."""
+    """The scene that a run was begun on; None for a new run."""
     from photonfarm.trainer.runs import checkpoint
     from photonfarm.trainer.runs.run_folder import INITIAL
 
@@ -201,7 +211,7 @@ def _only_scene(store: str | Path) -> str | None:
 
 
 def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
-    """What `look` finds at last; None once told to stop, or after so many seconds."""
+    """Wait until `look` finds something, and return it; None once asked to stop, or after so many seconds."""
     end = time.monotonic() + seconds
     while (found := look()) is None:
         if stop.wait(min(POLL_S, max(end - time.monotonic(), 0.0))) or time.monotonic() >= end:
@@ -211,7 +221,7 @@ def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
 
 @contextmanager
 def _sign_of_life(folder: Path) -> Iterator[None]:
-    """Touch a file now and then, from a thread of its own, for `check`."""
+    """Touch a file regularly, from a thread of its own, for `check`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ALIVE_FILE).touch()
@@ -231,50 +241,50 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
         ended.set()
         thread.join()
         if folder.is_dir():
-            with suppress(StoreError), held(folder):  # whoever trains there keeps it
+            with suppress(StoreError), held(folder):  # unless a trainer is at work there, which keeps the file
                 (folder / ALIVE_FILE).unlink(missing_ok=True)
 
 
 @contextmanager
-def _consumption_told(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
-    """What takes draws and samples of training; Redis is told now and then, and at the end, how many have been used.
+def _reported(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+    """A callback for draws and samples of training; a thread reports the used ones to Redis regularly, and at the end.
 
-    By a thread. Each sample counts once, and held-out ones as soon as they are seen. A Redis that is not there is none
-    of our trouble, nor a store that is not there yet; that it serves another store is said once.
+    Each sample counts once, and held-out ones as soon as they are visible. A missing Redis or store is ignored; if the
+    Redis serves another store, that is logged once.
     """
-    told = _Told(redis_url, store, scene_id)
+    reporter = _ConsumptionReporter(redis_url, store, scene_id)
     ended = threading.Event()
 
-    def keep_telling() -> None:
-        while not ended.wait(TELL_S):
-            told.tell()
+    def keep_reporting() -> None:
+        while not ended.wait(REPORT_S):
+            reporter.report()
 
-    thread = threading.Thread(target=keep_telling, daemon=True)
+    thread = threading.Thread(target=keep_reporting, daemon=True)
     thread.start()
     try:
-        yield told.take
+        yield reporter.take
     finally:
         ended.set()
         thread.join()
-        told.tell()
+        reporter.report()
 
 
-class _Told:
-    """What Redis is told of a scene's samples."""
+class _ConsumptionReporter:
+    """Reports a scene's used samples to Redis."""
 
     def __init__(self, redis_url: str | None, store: str | Path, scene_id: str) -> None:
         self._url, self._root, self._scene_id = redis_url, store, scene_id
-        self._store: Store | None = None  # opened with the first figures: before training begins there may be none
-        self._used: int | None = None  # a run that continues knows only once it has begun
+        self._store: Store | None = None  # opened with the first numbers: there may be no store before training begins
+        self._used: int | None = None  # a resumed run knows it only once it has begun
         self._connection: Redis | None = None
         self._refused = False
 
     def take(self, draws: int, samples: int) -> None:
-        """Take what there was by now."""
+        """Set the current numbers."""
         self._used = min(draws, samples)
 
-    def tell(self) -> None:
-        """Tell what was taken last, if there is anything and a Redis."""
+    def report(self) -> None:
+        """Report the last numbers, if there are any and a Redis."""
         if self._url is None or self._used is None:
             return
         from photonfarm.shared import queue
@@ -283,7 +293,7 @@ class _Told:
             self._connection = self._connection or queue.connect(self._url)
             self._store = self._store or Store(self._root)
             queue.check_served(self._connection, self._store)
-            queue.tell_consumed(self._connection, self._scene_id, self._used)
+            queue.report_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
                 click.echo(f"no worker is told what is used: {error}", err=True)
@@ -292,7 +302,7 @@ class _Told:
             pass
 
 
-def _tell(record: dict[str, Any]) -> None:
+def _log_record(record: dict[str, Any]) -> None:
     if record["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
         click.echo(f"goes on from step {record['step']} with {changed}", err=True)
@@ -311,7 +321,7 @@ def _tell(record: dict[str, Any]) -> None:
 
 
 def _recovered(record: dict[str, Any]) -> str:
-    """Why a run went back, and to what."""
+    """Why a run went back, and to which step."""
     errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
     if errors is None:
         found = "the loss is not finite"

@@ -27,17 +27,17 @@ class ChoiceOrOwn(click.Choice[str]):
         return value if is_own(value) else super().convert(value, param, ctx)
 
 
-class Pairs(click.Option):
-    """KEY=VALUE, as often as wanted, of which a configuration file makes a table."""
+class KeyValueOption(click.Option):
+    """KEY=VALUE, repeatable; a table in a configuration file."""
 
     def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
-        """The pairs as written; those of a table as they would be."""
+        """The pairs as written; a table's entries in the same form."""
         pairs = [f"{key}={json.dumps(given)}" for key, given in value.items()] if isinstance(value, Mapping) else value
         return super().type_cast_value(ctx, pairs)
 
 
 def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
-    """The values of `Pairs` by their keys, each as in JSON, or text."""
+    """The values of `KeyValueOption` by their keys, each parsed as JSON, or kept as text."""
     found: dict[str, Any] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -99,7 +99,7 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @click.option(
     "--set",
     "pairs",
-    cls=Pairs,
+    cls=KeyValueOption,
     multiple=True,
     metavar="KEY=VALUE",
     help=f"Any setting, also those above, whose own options come first; may be repeated: {', '.join(KEYS)}.",

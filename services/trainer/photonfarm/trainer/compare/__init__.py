@@ -1,1 +1,1 @@
-"""Several predictors on the same held-out samples."""
+"""Comparisons of several predictors on the same held-out samples."""

@@ -25,9 +25,9 @@ GAP = 8  # pixels, between pictures
 
 
 def comparison(evaluation: Evaluation) -> Picture:
-    """A column for what was aimed at and one for each predictor, a row for each of a few held-out samples.
+    """A column for the target and one for each predictor, a row for each of a few held-out samples.
 
-    All as clip(exposure · I, 0, 1)^(1/2.2) with the scene's own exposure. A column's head says what it shows.
+    All are shown as clip(exposure · I, 0, 1)^(1/2.2) with the scene's own exposure; the head of each column names it.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -50,7 +50,7 @@ def comparison(evaluation: Evaluation) -> Picture:
 
 
 def _cells(evaluation: Evaluation) -> list[list[Picture]]:
-    """The pictures of each shown sample; black where a predictor was not measured on it, as it had been taken back."""
+    """The pictures of each shown sample; black where a predictor could not be measured, after a repair."""
     found = []
     for target in evaluation.shown:
         images = [row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows]
@@ -63,7 +63,7 @@ def _names(evaluation: Evaluation) -> list[str]:
 
 
 def _of_targets(shown: tuple[Target, ...]) -> str:
-    """What the first column shows."""
+    """The head of the first column."""
     fewest = min(target.spp for target in shown)
     if all(target.is_reference for target in shown):
         return f"reference, {fewest} samples per pixel or more"

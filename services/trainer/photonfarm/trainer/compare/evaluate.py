@@ -1,7 +1,7 @@
-"""`photonfarm evaluate`: the error of trained networks, and of denoisers that nobody trained, on what is held out.
+"""`photonfarm evaluate`: the error of trained networks, and of denoisers not trained on the scene, on held-out samples.
 
-Two errors, which answer different questions. In linear radiance noisy halves are enough: their noise is taken out
-exactly. The columns of the paper's tables are of what a display shows, and need converged references [supplement 4].
+There are two errors, for different questions. In linear radiance noisy halves are enough: their noise is taken out
+exactly. The columns of the paper's tables concern what a display shows, and need converged references [supplement 4].
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluation_samples import Reference, References, Samples, Target, read_references
-from photonfarm.trainer.data.dataset import Batch, kept_count
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
+from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import (
@@ -39,47 +39,49 @@ from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.evaluation import (
     NONE_COMPLETE,
     DevicePredictor,
-    HeldOut,
+    HeldOutErrors,
     Predictor,
     batches,
     by_turns,
     measure,
 )
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.runs.device import described, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 EVALUATION = "evaluation.json"
 
 Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
-"""Rows to show beside the first ones: of the first predictor's images (H, W, 3), and of the references that some have.
+"""A function that names rows to show beside the first ones.
+
+It gets the first predictor's images (H, W, 3), and the references that some rows have.
 """
 
-Tell = Callable[[str, int, int], object]
-"""Told of a predictor, by its name, on how many samples of how many it has been measured."""
+MeasureProgress = Callable[[str, int, int], object]
+"""A callback with a predictor's name, the number of samples it was measured on so far, and of all samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
-    """One predictor on the held-out samples."""
+class PredictorRow:
+    """One predictor's results on the held-out samples."""
 
     name: str
-    kept: int | None  # it is given one of so many pixels of half A; None: no colour
-    held_out: HeldOut  # linear radiance × exposure, noise removed
+    kept: int | None  # it gets one of so many pixels of half A; None: no colour
+    held_out: HeldOutErrors  # linear radiance × exposure, noise removed
     seconds: Seconds  # of its network alone, for one image
-    metrics: ImageMetrics | None  # of what a display shows; None where no view has a reference
+    metrics: ImageMetrics | None  # in the metric space; None if no view has a reference
     shown: Mapping[int, F32]  # its images, (H, W, 3), of the rows that are shown
 
-    def behind(self, first: Row) -> Estimate | None:
-        """By how much its linear error is above another's, in pairs of configurations; None for other samples."""
+    def behind(self, first: PredictorRow) -> Estimate | None:
+        """The excess of its linear error over another's, in pairs of configurations; None for other samples."""
         if self.held_out.units != first.held_out.units:
             return None
         difference = self.held_out.per_sample - first.held_out.per_sample
         return Estimate.of(group_means(difference, self.held_out.units))
 
-    def document(self, first: Row) -> dict[str, Any]:
-        """What evaluation.json says of it, and of how far it is behind the first row."""
+    def document(self, first: PredictorRow) -> dict[str, Any]:
+        """Its part of evaluation.json, with its excess over the first row."""
         error, behind = self.held_out.error, self.behind(first)
         return {
             "predictor": self.name,
@@ -99,35 +101,35 @@ class Row:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Several predictors on the same samples."""
+    """Several predictors' results on the same samples."""
 
     scene: str
     scene_id: str
-    unit: str  # what is independent: "configuration" or, of a static scene, "view"
-    measured: tuple[int, ...]  # rows of the store, one of each view; those that are complete no longer are left out
+    unit: str  # the independent unit: "configuration" or, in a static scene, "view"
+    measured: tuple[int, ...]  # rows of the store, one of each view; without those that are complete no longer
     device: str  # of the networks
     threads: int  # of torch on the CPU
     references: References | None
-    rows: tuple[Row, ...]
+    rows: tuple[PredictorRow, ...]
     shown: tuple[Target, ...]
 
     @property
     def samples(self) -> int:
-        """How many samples all were measured on, each of a view of its own."""
+        """The number of samples that all were measured on, each of a view of its own."""
         return len(self.measured)
 
     @property
     def noise_floor(self) -> float:
-        """Of the targets: what the linear error against them would show on top."""
+        """The noise of the targets, which would be added to a linear error against them."""
         return self.rows[0].held_out.floor
 
     @property
     def units(self) -> int:
-        """How many configurations the samples are of; of a static scene, how many views."""
+        """The number of configurations (in a static scene, of views) of the samples."""
         return self.rows[0].held_out.error.count
 
     def document(self) -> dict[str, Any]:
-        """What evaluation.json says."""
+        """The content of evaluation.json."""
         return {
             "scene": self.scene,
             "scene_id": self.scene_id,
@@ -153,29 +155,29 @@ def compare(
     without_inception: bool = False,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     choose: Choose | None = None,
 ) -> Evaluation:
-    """The runs, and denoisers of one of so many pixels, on the first `most` views that no run was trained on.
+    """Compare runs, and denoisers given one of so many pixels, on the first `most` views that no run was trained on.
 
     Each view is measured once, by its first sample, however many passes of it there are. References are files
     `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
-    FID, KID and Feature L1 take most of the time; `without_inception` they are left out. Raises SpecError for runs of
+    FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. Raises SpecError for runs of
     different scenes, for references of another size, for a film with too few pixels to keep some, and for a package
     that is missing; IncompleteError if no held-out sample is complete.
     """
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
-    samples = Samples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    samples = HeldOutSamples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
         kept_count(spec, kept)
     found = {} if references is None else read_references(references, samples)
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found and not without_inception else None
-    test = _Test(store, samples, found, shown, network, str(place), tell or (lambda *_: None))
-    untrained = [Untrained(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    test = _Test(store, samples, found, shown, network, str(place), on_progress or (lambda *_: None))
+    untrained = [UntrainedPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     leading, *others = test.timed([*runs, *untrained])
     first_of_all = test.measured(leading)
     if choose:
@@ -205,7 +207,7 @@ def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
 
 
 def write(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
-    """Leave evaluation.json and comparison.png in each run's folder; returns the pictures. Raises StoreError."""
+    """Write evaluation.json and comparison.png into each run's folder; returns the pictures. Raises StoreError."""
     text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
     for run in runs:
         with store_errors("write the evaluation", run.folder):
@@ -223,66 +225,66 @@ class _Watched:
 
     predict: Predictor
     wanted: set[int]
-    tell: Callable[[int], object]  # how many samples there were so far
+    on_progress: Callable[[int], object]  # called with the number of samples so far
     images: dict[int, F32] = field(default_factory=dict)
     units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
     samples: int = 0
 
-    def __call__(self, batch: Batch) -> F32:
+    def __call__(self, batch: TrainingBatch) -> F32:
         images = self.predict(batch)
         for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
             if row in self.wanted:
                 self.images[row], self.units[row] = image.copy(), unit
         self.samples += len(batch.rows)
-        self.tell(self.samples)
+        self.on_progress(self.samples)
         return images
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Timed:
-    """A predictor that is ready, and how long one image takes it."""
+    """A loaded predictor, and the time it takes for one image."""
 
-    predictor: TrainedRun | Untrained
+    predictor: TrainedRun | UntrainedPredictor
     predict: DevicePredictor
     seconds: Seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Measured:
-    """A predictor that was put to the test, with its images of all rows that may be shown."""
+    """A measured predictor, with its images of all rows that may be shown."""
 
     timed: _Timed
-    held_out: HeldOut
+    held_out: HeldOutErrors
     metrics: ImageMetrics | None
     images: dict[int, F32]
 
-    def row(self, shown: Sequence[int]) -> Row:
-        """Its row, with the images of some rows of the store."""
+    def row(self, shown: Sequence[int]) -> PredictorRow:
+        """Its results, with the images of some rows of the store."""
         images = {row: self.images[row] for row in shown if row in self.images}
         predictor, seconds = self.timed.predictor, self.timed.seconds
-        return Row(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
+        return PredictorRow(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Test:
-    """What all predictors are put to."""
+    """The samples, references and metrics that all predictors are measured with."""
 
     store: str | Path
-    samples: Samples
+    samples: HeldOutSamples
     references: Mapping[int, Reference]  # by row
     shown: list[int]  # rows
     inception: Inception | None
     device: str
-    tell: Tell
+    on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def timed(self, predictors: Sequence[TrainedRun | Untrained]) -> list[_Timed]:
-        """All of them, timed by turns on the first sample."""
+    def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:
+        """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
         ready = zip(predictors, calls, by_turns(calls), strict=True)
         return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
 
-    def _call(self, predictor: TrainedRun | Untrained) -> tuple[DevicePredictor, Inputs]:
+    def _call(self, predictor: TrainedRun | UntrainedPredictor) -> tuple[DevicePredictor, Inputs]:
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
             for batch in batches(feed, self.samples.rows, 1):
@@ -290,17 +292,19 @@ class _Test:
         raise IncompleteError(NONE_COMPLETE)
 
     def measured(self, timed: _Timed) -> _Measured:
-        """On all samples."""
+        """Measure a predictor on all samples."""
         predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
         with self._feed(predictor, batch=size) as feed:
             watched = _Watched(
-                timed.predict, {*self.references, *self.shown}, lambda done: self.tell(predictor.name, done, len(rows))
+                timed.predict,
+                {*self.references, *self.shown},
+                lambda done: self.on_progress(predictor.name, done, len(rows)),
             )
             held_out = measure(watched, batches(feed, rows, size))
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
         return _Measured(timed, held_out, metrics, watched.images)
 
-    def _feed(self, predictor: TrainedRun | Untrained, *, batch: int) -> Feed:
+    def _feed(self, predictor: TrainedRun | UntrainedPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
         source = StoreSource(self.store, self.samples.source.spec.scene_id)
         return Feed(source, settings, needs=predictor.needs)
@@ -320,7 +324,7 @@ class _Test:
         )  # fmt: skip
 
     def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
-        """Those of the references of some rows, which are the same for nearly all predictors."""
+        """The features of the references of some rows, which are the same for almost all predictors."""
         if rows not in self.known:
             self.known[rows] = reference_features(references, inception)
         return self.known[rows]

@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.store.read.merge import Merged
+from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.trainer.data.dataset import rows_held_out, units_of
 from photonfarm.trainer.data.store_source import StoreSource
 
@@ -28,21 +28,21 @@ class Reference:
     half_b: F32  # independent of `half_a`
 
     @classmethod
-    def of(cls, merged: Merged, exposure: float) -> Self:
+    def of(cls, merged: MergedView, exposure: float) -> Self:
         """The halves of a merged view, as float32: their noise is far above its steps, and there may be hundreds."""
         a, b = (np.float32(exposure) * half.astype(np.float32) for half in (merged.half_a, merged.half_b))
         return cls(merged.count, a, b)
 
     @property
     def mean(self) -> F32:
-        """Of both halves, (H, W, 3)."""
+        """The mean of both halves, (H, W, 3)."""
         mean: F32 = np.float32(0.5) * (self.half_a + self.half_b)
         return mean
 
 
 @dataclass(frozen=True, slots=True)
 class References:
-    """What the columns of the metric space were measured against."""
+    """The references of the metric space."""
 
     views: int
     spp: int  # of the reference that has the fewest
@@ -50,7 +50,7 @@ class References:
 
     @classmethod
     def of(cls, found: Mapping[int, Reference], half_spp: int) -> Self | None:
-        """Those that were found; None where there are none."""
+        """A summary of the references found; None if there are none."""
         if not found:
             return None
         count = min(reference.count for reference in found.values())
@@ -59,7 +59,7 @@ class References:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """What a shown sample's predictions are looked at beside."""
+    """The picture beside the predictions of a shown sample."""
 
     row: int
     image: F32  # (H, W, 3) linear radiance × exposure
@@ -69,18 +69,18 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
-    """The held-out samples that all predictors are measured on: one of each view, whatever passes of it there are."""
+class HeldOutSamples:
+    """The held-out samples that all predictors are measured on: one of each view, however many passes there are."""
 
     source: StoreSource
     rows: list[int]  # ascending
     view_keys: list[Key]  # of each
 
     @classmethod
-    def of(cls, source: StoreSource, share: float, most: int) -> Samples:
-        """The first of each view, of those held out by the smallest share: shares are nested, so no run has seen them.
+    def of(cls, source: StoreSource, share: float, most: int) -> HeldOutSamples:
+        """The first sample of each view held out by the smallest share: as shares are nested, no run was trained on it.
 
-        Of `most` views at the most; IncompleteError if there is none.
+        At most `most` views; IncompleteError if there is none.
         """
         complete = source.refresh().tolist()
         held_out = [row for row, held in zip(complete, rows_held_out(source, complete, share), strict=True) if held]
@@ -93,13 +93,13 @@ class Samples:
         return cls(source, [row for row, _ in chosen], [key for _, key in chosen])
 
     def to_show(self, references: Mapping[int, Reference]) -> list[int]:
-        """The first sample of each of the first configurations: of those that have a reference, where there are any."""
+        """The first sample of each of the first configurations; only of those with a reference, if there are any."""
         rows = list(references) or self.rows
         first = dict(zip(reversed(units_of(self.source, rows)), reversed(rows), strict=True))
         return sorted(first.values())[:SHOWN]
 
     def target(self, row: int, reference: Reference | None) -> Target:
-        """A sample's reference, or the mean of its halves; StoreError for one that has been taken back."""
+        """A sample's reference, or the mean of its halves; StoreError if a repair has removed the sample."""
         spec = self.source.spec
         half_spp = spec.transport.half_spp
         (sample,) = self.source.read_batch([row])
@@ -109,8 +109,8 @@ class Samples:
         return Target(row, halves.mean(axis=0), 2 * half_spp, is_reference=False, half_a=halves[0])
 
 
-def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
-    """The references there are, by the row that shows their view; raises SpecError where none can be used."""
+def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Reference]:
+    """The references by the row of their view; raises SpecError if none can be used."""
     if not folder.is_dir():
         raise SpecError(f"{folder}: there is no such folder")
     spec = samples.source.spec
@@ -118,7 +118,7 @@ def read_references(folder: Path, samples: Samples) -> dict[int, Reference]:
     found: dict[int, Reference] = {}
     for row, key in zip(samples.rows, samples.view_keys, strict=True):
         if (file := folder / f"{key.hex()}.npz").is_file():
-            found[row] = Reference.of(Merged.read(file), spec.exposure)
+            found[row] = Reference.of(MergedView.read(file), spec.exposure)
             if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:

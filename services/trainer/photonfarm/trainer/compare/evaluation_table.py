@@ -1,9 +1,9 @@
-"""What `photonfarm evaluate` prints: a head, a table, and a foot that says how far its figures can be trusted."""
+"""The output of `photonfarm evaluate`: a head, a table, and notes on how far its figures can be trusted."""
 
 from __future__ import annotations
 
 from photonfarm.shared.core.estimate import Estimate
-from photonfarm.trainer.compare.evaluate import Evaluation, Row
+from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
@@ -11,13 +11,13 @@ from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
 
 CONVERGED_SPP = 4096
-"""Samples per pixel from which a reference counts as converged [method §4, ours]."""
+"""The samples per pixel from which a reference counts as converged [method §4, ours]."""
 
 FEW_UNITS = 6
-"""Configurations or views below which intervals by Student's t say little."""
+"""The number of configurations or views below which intervals by Student's t are of little use."""
 
 
-def told(evaluation: Evaluation) -> str:
+def evaluation_text(evaluation: Evaluation) -> str:
     """The head, the rows as a Markdown table, and the foot."""
     of_time = _of_time(evaluation)
     foot = "\n".join(f"- {sentence}" for sentence in (of_time, *notes(evaluation)))
@@ -25,7 +25,7 @@ def told(evaluation: Evaluation) -> str:
 
 
 def notes(evaluation: Evaluation) -> list[str]:
-    """What is to be known of the errors, a sentence each."""
+    """Notes on the errors, a sentence each."""
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
         f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
@@ -42,7 +42,7 @@ def _of_few(units: int) -> str:
 
 
 def place_of_networks(evaluation: Evaluation) -> str:
-    """Where the networks ran, in words: a device, and on a CPU how many threads."""
+    """The device of the networks in words, on a CPU with the number of threads."""
     return (
         f"{evaluation.device}, {counted(evaluation.threads, 'thread')}"
         if evaluation.device == "cpu"
@@ -101,9 +101,9 @@ def _head(evaluation: Evaluation) -> str:
 
 
 def _table(evaluation: Evaluation) -> str:
-    """The linear error, how far it is behind the first row's, then the paper's columns.
+    """The linear error, its excess over the first row's, then the paper's columns.
 
-    Both have their 95 % intervals. The second is narrower: of one configuration, all predictors share what is hard.
+    Both have their 95 % intervals. The second is narrower: all predictors share the difficulty of a configuration.
     """
     first = evaluation.rows[0]
     columns = next((list(row.metrics.columns()) for row in evaluation.rows if row.metrics is not None), [])
@@ -111,7 +111,7 @@ def _table(evaluation: Evaluation) -> str:
     return markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
 
 
-def _cells(row: Row, first: Row, columns: list[str]) -> list[str]:
+def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[str]:
     behind = None if row is first else row.behind(first)
     metrics = {} if row.metrics is None else row.metrics.columns()
     return [
@@ -130,11 +130,11 @@ def _interval(estimate: Estimate) -> str:
 
 
 def views_of(evaluation: Evaluation, noun: str = "view") -> str:
-    """What was measured: so many views of so many configurations, or of a static scene views alone."""
+    """The numbers of measured views and configurations; in a static scene, of views alone."""
     views = counted(evaluation.samples, noun)
     return views if evaluation.unit == "view" else f"{views} of {counted(evaluation.units, evaluation.unit)}"
 
 
 def counted(number: int, noun: str) -> str:
-    """A number of things, in words."""
+    """A number with its noun."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

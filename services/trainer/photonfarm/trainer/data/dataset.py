@@ -1,4 +1,4 @@
-"""What the trainer reads: samples from a store that grows, split by configuration, as arrays ready for a batch.
+"""The trainer's samples: read from a store that grows, split by configuration, as arrays ready for a batch.
 
 Shape letters: B batch, P points, H W image.
 """
@@ -45,8 +45,8 @@ from photonfarm.trainer.networks.inputs import (
 )
 
 
-class Sample(Protocol):
-    """One sample as it is read: its images in whatever type they are stored in."""
+class SourceSample(Protocol):
+    """One sample as it is read; its images have their stored types."""
 
     @property
     def modification(self) -> Modification:
@@ -62,7 +62,7 @@ class Sample(Protocol):
 
     @property
     def scale(self) -> float:
-        """What makes linear radiance of what is stored, a power of two."""
+        """The factor from stored values to linear radiance, a power of two."""
 
     @property
     def buffers(self) -> ViewBuffers:
@@ -70,7 +70,7 @@ class Sample(Protocol):
 
     @property
     def visibility(self) -> Visibility:
-        """Which points and photons are seen."""
+        """Which points and photons the view sees."""
 
     @property
     def pass_(self) -> int:
@@ -78,7 +78,7 @@ class Sample(Protocol):
 
     @property
     def guides(self) -> Guides | None:
-        """What is known of the view beside its buffers; None unless guides are followed."""
+        """The guides of the view; None unless they are followed."""
 
 
 class SampleSource(Protocol):
@@ -88,7 +88,7 @@ class SampleSource(Protocol):
         """Whether spec and base are there; they come with the scene's first job."""
 
     def follow_guides(self) -> None:
-        """Have guides read too, and samples be complete only with them; SpecError if the scene has none."""
+        """Read guides too, so that samples are complete only with them; SpecError if the scene has none."""
 
     @property
     def spec(self) -> SceneSpec:
@@ -98,13 +98,13 @@ class SampleSource(Protocol):
         """The geometry and the base cloud."""
 
     def refresh(self) -> NDArray[np.int64]:
-        """The rows that became complete since the last call."""
+        """Look for new samples; returns the rows that became complete since the last call."""
 
     def taken_back(self) -> NDArray[np.int64]:
-        """The rows that were complete before the last `refresh` and not after it; they become complete once more."""
+        """The rows that were complete before the last `refresh` and not after it; workers render them again."""
 
-    def read_batch(self, rows: Sequence[int]) -> Sequence[Sample]:
-        """Complete rows' samples, valid until the next call; raises StoreError if one is not, or cannot be read."""
+    def read_batch(self, rows: Sequence[int]) -> Sequence[SourceSample]:
+        """The samples of complete rows, valid until the next call; StoreError if one is incomplete or unreadable."""
 
     def read_photons(self, row: int) -> Photons:
         """The photons of a complete row's configuration; raises StoreError if the scene has none."""
@@ -119,11 +119,11 @@ class SampleSource(Protocol):
         """The number of samples in all plans so far, complete or not."""
 
     def plan_requests(self) -> list[dict[str, Any]]:
-        """What was asked for with each plan so far, in order, as JSON has it: all that the rows follow from."""
+        """The requests of all plans so far, in order, as JSON documents: all rows follow from them."""
 
 
 def rows_held_out(source: SampleSource, rows: Sequence[int], share: float) -> list[bool]:
-    """Whether each row is kept from training, not by when it arrived but by what it is.
+    """Whether each row is held out of training, by its content and not by its time of arrival.
 
     All views and passes of a configuration are on one side. A static scene has one configuration; there the view
     decides, and all passes of a view are on one side.
@@ -132,49 +132,49 @@ def rows_held_out(source: SampleSource, rows: Sequence[int], share: float) -> li
 
 
 def units_of(source: SampleSource, rows: Sequence[int]) -> list[Key]:
-    """What each row is held out by: the key of its configuration or, of a static scene, of its view."""
+    """The unit by which each row is held out: the key of its configuration or, in a static scene, of its view."""
     return source.modification_keys(rows) if source.spec.groups else source.view_keys(rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Batch:
-    """Samples as tensors; valid until the next one is taken. Those that were not complete are left out, maybe all."""
+class TrainingBatch:
+    """Samples as tensors; valid until the next batch is taken. Incomplete samples are left out, possibly all."""
 
     rows: tuple[int, ...]
-    units: tuple[Key, ...]  # what each is held out by: equal for samples that are not independent
+    units: tuple[Key, ...]  # by which each is held out: equal for samples that are not independent
     inputs: Inputs
     target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, linear radiance × exposure
 
     @classmethod
     def empty(
         cls, size: int, points: int, spec: SceneSpec, needs: Needs = POINTS_ONLY, *, pinned: bool = False
-    ) -> Batch:
-        """Memory for what is needed of `size` samples, to be filled again and again."""
+    ) -> TrainingBatch:
+        """Memory for the needed parts of `size` samples, which is reused for every batch."""
 
         def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             try:
                 return torch.empty(size, *shape, dtype=dtype, pin_memory=pinned)
-            except RuntimeError as error:  # torch's way to say that there is no memory
+            except RuntimeError as error:  # torch's error for want of memory
                 raise SpecError(f"batch = {size}: no memory for so many samples") from error
 
         target = memory(2, spec.film.height, spec.film.width, 3)
         return cls((), (), Inputs.empty(memory, points, spec, needs), target)
 
-    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> Batch:
-        """The first samples of this memory, named by their rows and what they are held out by."""
+    def filled(self, rows: tuple[int, ...], units: tuple[Key, ...]) -> TrainingBatch:
+        """The first samples of this memory, with their rows and the units by which they are held out."""
         n = len(rows)
-        return Batch(rows, units, map_tensors(lambda tensor: tensor[:n], self.inputs), self.target[:n])
+        return TrainingBatch(rows, units, map_tensors(lambda tensor: tensor[:n], self.inputs), self.target[:n])
 
-    def to(self, device: torch.device) -> Batch:
+    def to(self, device: torch.device) -> TrainingBatch:
         """The same batch on a device; itself on the CPU."""
         inputs = map_tensors(lambda tensor: tensor.to(device), self.inputs)
-        return Batch(self.rows, self.units, inputs, self.target.to(device))
+        return TrainingBatch(self.rows, self.units, inputs, self.target.to(device))
 
-    def for_training(self) -> Batch:
-        """The batch whose targets nothing in its inputs has seen: itself, if these hold no noisy colour.
+    def for_training(self) -> TrainingBatch:
+        """The batch with targets that no input depends on: itself, unless its inputs hold noisy colour.
 
         Otherwise it is twice as long: the samples with A in the inputs and B as the target, (B, 1, H, W, 3), then the
-        same samples the other way round (Lehtinen et al., Noise2Noise, 2018). The same pixels are kept of both.
+        same samples with both exchanged (Lehtinen et al., Noise2Noise, 2018). The same pixels are kept of both.
         """
         noisy = self.inputs.noisy
         if noisy is None:
@@ -182,11 +182,11 @@ class Batch:
         half_b = NoisyColour(self.target[:, 1] * noisy.kept[..., None], noisy.kept)
         inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=half_b))
         target = torch.cat([self.target[:, 1:], self.target[:, :1]])
-        return Batch(2 * self.rows, 2 * self.units, inputs, target)
+        return TrainingBatch(2 * self.rows, 2 * self.units, inputs, target)
 
 
 def kept_count(spec: SceneSpec, of: int) -> int:
-    """How many pixels of the film one of `of` is; SpecError where the film has fewer than `of`."""
+    """The number of pixels that one of `of` makes; SpecError if the film has fewer than `of` pixels."""
     pixels = spec.film.height * spec.film.width
     if of > pixels:
         raise SpecError(
@@ -196,11 +196,11 @@ def kept_count(spec: SceneSpec, of: int) -> int:
     return pixels // of
 
 
-def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
-    """One of `of` pixels, (H, W), H·W / `of` in all: a random choice that follows from the sample's content key.
+def kept_pixels(sample: SourceSample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+    """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from the sample's content key.
 
-    So each pass of a view keeps pixels of its own, and a run that continues sees what it saw. Of more pixels, those of
-    fewer are a part. Raises SpecError as `kept_count` does.
+    So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
+    pixels is a subset of a larger one. Raises SpecError as `kept_count` does.
     """
     film = spec.film.height, spec.film.width
     key = sample_key(spec.scene_id, sample.modification, sample.view.vector, sample.pass_)
@@ -210,8 +210,10 @@ def kept_pixels(sample: Sample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     return kept
 
 
-def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: Needs, cloud: BasePointCloud) -> Batch:
-    """Complete rows of a source, read into the first places of a batch's memory; StoreError if one cannot be read."""
+def read_into(
+    memory: TrainingBatch, source: SampleSource, rows: Sequence[int], needs: Needs, cloud: BasePointCloud
+) -> TrainingBatch:
+    """Read complete rows of a source into the first places of a batch's memory; StoreError if one cannot be read."""
     spec = source.spec
     units = []
     for place, (row, sample) in enumerate(zip(rows, source.read_batch(rows), strict=True)):
@@ -224,11 +226,11 @@ def read_into(memory: Batch, source: SampleSource, rows: Sequence[int], needs: N
     return memory.filled(tuple(rows), tuple(units))
 
 
-def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BasePointCloud) -> None:
-    """Write one sample into a batch's memory, but for its photons and its noisy colour.
+def fill(batch: TrainingBatch, place: int, sample: SourceSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
+    """Write one sample into a batch's memory, except its photons and its noisy colour.
 
-    That is its camera, its buffers, its exposed targets; where they are needed, its points; and which points and
-    photons are seen. What it is stored in becomes float32 on the way, in one pass over the images.
+    That is its camera, its buffers, its exposed targets; if needed, its points; and which points and photons the view
+    sees. Stored types become float32 on the way, in one pass over the images.
     """
     i, b = batch.inputs, sample.buffers
     i.world_to_camera[place] = torch.from_numpy(Camera.of(sample.view, spec).world_to_camera)
@@ -245,7 +247,7 @@ def fill(batch: Batch, place: int, sample: Sample, spec: SceneSpec, cloud: BaseP
 
 
 OF_LIGHT = ("emission", "direct", "gloss", "point_light")
-"""The guides that are in units of radiance, or of irradiance, and so exposed."""
+"""The guides in units of radiance, or of irradiance, which are therefore exposed."""
 
 
 def _fill_guides(memory: GuideInputs, place: int, guides: Guides | None, exposure: float) -> None:
@@ -257,7 +259,7 @@ def _fill_guides(memory: GuideInputs, place: int, guides: Guides | None, exposur
 
 
 def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
-    """Write a configuration's photons into a batch's memory, but for which of them a view sees."""
+    """Write a configuration's photons into a batch's memory, except which of them a view sees."""
     for name, array in arrays_of(photons).items():
         getattr(memory, name)[place] = torch.from_numpy(array)
     memory.present[place] = memory.bounce[place] >= 0
@@ -272,7 +274,7 @@ def _fill_points(
     memory.seen[place] = torch.from_numpy(seen[:points])
 
 
-def _fill_noisy(batch: Batch, place: int, kept: NDArray[np.bool_]) -> None:
+def _fill_noisy(batch: TrainingBatch, place: int, kept: NDArray[np.bool_]) -> None:
     noisy = given(batch.inputs.noisy)
     noisy.kept[place] = torch.from_numpy(kept)
     torch.mul(batch.target[place, 0], noisy.kept[place, ..., None], out=noisy.colour[place])

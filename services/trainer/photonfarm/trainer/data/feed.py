@@ -1,4 +1,4 @@
-"""A thread that follows the store and reads batches ahead, into memory that is used again and again."""
+"""A thread that follows the store and reads batches ahead, into memory that is reused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.trainer.data.dataset import Batch, SampleSource, read_into, rows_held_out
+from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into, rows_held_out
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
@@ -19,12 +19,12 @@ from photonfarm.trainer.runs.settings import TrainSettings
 
 
 class Feed:
-    """Batches in the order they were asked for, and the rows as they arrive; a context manager.
+    """Batches in the order of their requests, and rows as they arrive; a context manager.
 
-    Rows that are not complete when they are read, as a repair of the store may have taken them back, are left out of
-    their batch, until they have become complete again. Only its thread touches the source. Samples are not kept
-    beside the batches: reading one from the system's cache, checked, is less than half of what it takes to make a place
-    of a batch of it (docs/results/train_step.md), so that a cache of our own would hardly pay for its memory.
+    Rows that are incomplete when they are read, for instance after a repair of the store, are left out of their batch,
+    until they are complete again. Only the feed's thread uses the source. There is no cache of samples besides the
+    batches: to read a sample from the system's cache, checked, takes less than half of the time to write it into a
+    batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Feed:
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
     ) -> None:
-        """Feed what the settings' network needs, or what other predictors do."""
+        """Feed a batch with the inputs that the settings' network needs, or those in `needs`."""
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
@@ -48,16 +48,16 @@ class Feed:
         self._complete = False
         self._plans: list[dict[str, Any]] = []
         self._here: set[int] = set()  # rows that are complete
-        self._known: set[int] = set()  # rows that are, or were
+        self._known: set[int] = set()  # rows that are or were complete
         self._error: BaseException | None = None
         points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
         pinned = usable_device(settings.device).type == "cuda"
         self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
-        self._ready: queue.SimpleQueue[tuple[Batch, Batch] | None] = queue.SimpleQueue()
-        self._free: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[TrainingBatch, TrainingBatch] | None] = queue.SimpleQueue()
+        self._free: queue.SimpleQueue[TrainingBatch | None] = queue.SimpleQueue()
         for _ in range(settings.prefetch + 1):
-            self._free.put(Batch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
-        self._lent: Batch | None = None
+            self._free.put(TrainingBatch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
+        self._lent: TrainingBatch | None = None
         self._polled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
@@ -74,11 +74,11 @@ class Feed:
         self._thread.join()
 
     def ask(self, rows: Sequence[int]) -> None:
-        """Have a batch of these rows read; at most `batch` of them."""
+        """Request a batch of these rows, at most `batch` of them."""
         self._asked.put(tuple(rows))
 
-    def take(self) -> Batch:
-        """The next batch asked for, read. The one taken before is no longer valid. Raises what the reading raised."""
+    def take(self) -> TrainingBatch:
+        """The next requested batch. The one taken before is then no longer valid. Raises the errors of reading."""
         if self._lent is not None:
             self._free.put(self._lent)
         got = self._ready.get()
@@ -91,8 +91,8 @@ class Feed:
     def arrivals(self) -> tuple[list[tuple[int, bool]], bool]:
         """The rows that became complete since the last call, each with whether it is held out; and whether all have.
 
-        The second is True once everything that is planned has been complete. A row that was taken back is told again
-        when it has become complete again. Raises what the reading raised.
+        The second is True once everything planned has been complete. A row that a repair removed is reported again when
+        it is complete again. Raises the errors of reading.
         """
         self._raise()
         with self._lock:
@@ -100,7 +100,7 @@ class Feed:
             return rows, self._complete
 
     def plan_requests(self) -> list[dict[str, Any]]:
-        """What was asked for with each plan, by the last look at the store."""
+        """The requests of all plans, as of the last look at the store."""
         with self._lock:
             return self._plans
 
@@ -111,7 +111,7 @@ class Feed:
     def _run(self) -> None:
         try:
             self._serve()
-        except BaseException as error:  # handed to the thread that takes
+        except BaseException as error:  # passed on to the thread that takes
             self._error = error
         finally:
             self._polled.set()
@@ -145,16 +145,16 @@ class Feed:
             self._complete = 0 < self._source.planned() <= len(self._known)
         self._polled.set()
 
-    def _read(self, rows: Sequence[int], memory: Batch) -> Batch:
-        """Those of the rows that are complete."""
+    def _read(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
+        """Read those of the rows that are complete."""
         if not self._known.issuperset(rows):
-            self._poll()  # somebody else has seen them arrive
+            self._poll()  # another reader has seen them arrive
         try:
             return self._read_complete(rows, memory)
         except StoreError:
-            self._poll()  # a repair may have set some aside since the last time, and a worker have rendered them again
+            self._poll()  # since then a repair may have set some aside, and a worker may have rendered them again
             return self._read_complete(rows, memory)
 
-    def _read_complete(self, rows: Sequence[int], memory: Batch) -> Batch:
+    def _read_complete(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
         there = [row for row in rows if row in self._here]
         return read_into(memory, self._source, there, self._needs, self.cloud)

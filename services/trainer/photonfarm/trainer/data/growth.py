@@ -1,4 +1,4 @@
-"""The stream of training batches from a store that grows, at a pace that its growth allows."""
+"""The stream of training batches from a growing store, at a pace limited by its growth."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any, Self
 
 import torch
 
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """What arrived and when: with the seed, all that the order of training depends on.
+    """The rows that arrived, and when: with the seed, this determines the order of training.
 
-    A run's checkpoint has it whole, as `following.arrived` and `following.growth`. To look at there is metrics.jsonl,
-    each record of which tells how many draws there were and how many samples had arrived.
+    A run's checkpoint has it whole, as `following.arrived` and `following.growth`. A readable summary is metrics.jsonl,
+    of which each record has the number of draws and of arrived samples.
     """
 
     rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
@@ -29,21 +29,23 @@ class Growth:
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Self:
-        """That of a run, by the `following` of its checkpoint."""
+        """The growth of a run, from the `following` of its checkpoint."""
         return cls(state["arrived"].tolist(), [(drawn, arrived) for drawn, arrived in state["growth"].tolist()])
 
     def visible(self, drawn: int) -> int | None:
-        """How many rows had arrived when batch `drawn` was drawn; None past the log's end."""
+        """The number of rows that had arrived when batch `drawn` was drawn; None past the log's end."""
         if not self.log or drawn > self.log[-1][0]:
             return None
         place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
         return self.log[place - 1][1] if place else 0
 
 
-class Following:
-    """Draws batches ahead of training; they are read meanwhile. A `script` repeats the growth of an earlier run."""
+class BatchStream:
+    """Draws batches ahead of training, while they are being read. A `script` repeats the growth of an earlier run."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: Group = ALONE) -> None:
+    def __init__(
+        self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = SINGLE_PROCESS
+    ) -> None:
         """Draw for all processes of a group, and read this one's part."""
         self._feed, self._settings, self._group = feed, settings, group
         self._script = script or Growth()
@@ -63,11 +65,11 @@ class Following:
 
     @property
     def complete(self) -> bool:
-        """True once everything that is planned has arrived and is visible."""
+        """Whether everything planned has arrived and is visible."""
         return self._complete
 
     def look(self) -> None:
-        """Make visible what has arrived, or of it what the script says."""
+        """Make arrived rows visible; with a script, only those that it lists."""
         rows, complete = self._feed.arrivals()
         self._waiting.update((row, held) for row, held in rows if row not in self._known)
         scripted = self._script.visible(self.drawn)
@@ -89,9 +91,9 @@ class Following:
         self._sampler.add([row for row in rows if not held[row]])
 
     def may_draw(self) -> bool:
-        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and enough to begin with.
+        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and enough samples to begin with.
 
-        Neither holds back once everything planned has arrived. A script is followed as it is.
+        Neither limit applies once everything planned has arrived. A script is followed exactly.
         """
         scripted = self._script.visible(self.drawn)
         if scripted is not None:
@@ -103,7 +105,7 @@ class Following:
         return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
 
     def draw_ahead(self, until: int) -> bool:
-        """Draw and ask for batches, up to `prefetch` ahead and batch number `until`; False if there is none to take."""
+        """Draw and request batches, up to `prefetch` ahead and batch number `until`; False if there is none to take."""
         while len(self._asked) < self._settings.prefetch and self.drawn < until:
             self.look()
             if not self.may_draw():
@@ -114,16 +116,16 @@ class Following:
 
     def _ask(self, rows: tuple[int, ...]) -> None:
         self._asked.append(rows)
-        self._group.tell("rows", rows)
+        self._group.send("rows", rows)
         self._feed.ask(self._group.part(rows))
 
-    def take(self) -> Batch | None:
-        """The next batch drawn, this process' part of it read; draws of rows that are not complete now do not count.
+    def take(self) -> TrainingBatch | None:
+        """The next drawn batch, this process' part of it read; draws of rows that are incomplete now do not count.
 
-        None if there is no row left in it: another one is drawn in its place, as the last one.
+        None if no row is left in it: another batch is drawn instead, at the end.
         """
         batch = self._feed.take()
-        self._group.tell("take")  # only now, so that the others wait for no rank that has failed to read
+        self._group.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
         rows, there = self._asked.popleft(), self._group.joined(batch.rows)
         self._sampler.put_back((Counter(rows) - Counter(there)).elements())
         if there:
@@ -132,17 +134,17 @@ class Following:
         return None
 
     def drop(self) -> None:
-        """Let go of the batches that were read ahead, so that something else can be read; other ranks keep theirs."""
+        """Drop the batches that were read ahead, so that other rows can be read; the other ranks keep theirs."""
         for _ in self._asked:
             self._feed.take()
 
     def ask_again(self) -> None:
-        """Have the batches that were let go read again."""
+        """Request the dropped batches again."""
         for rows in self._asked:
             self._feed.ask(self._group.part(rows))
 
     def state(self) -> dict[str, Any]:
-        """What is to be restored for the same batches to follow; int64 tensors where there is a number for each row."""
+        """The state from which the same batches follow; int64 tensors for values of each row."""
         return {
             "sampler": self._sampler.state(),
             "asked": [list(rows) for rows in self._asked],

@@ -1,4 +1,4 @@
-"""Which samples to draw next from a set that grows: in rounds, those drawn least more often."""
+"""The choice of the next samples from a growing set: in rounds, with the least drawn ones more often."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from photonfarm.shared.core.keys import Stream, make_key
 
 
 class RoundSampler:
-    """Every round draws each row once, in random order, and a row that is behind up to `catch_up` times more.
+    """Every round draws each row once, in random order, and a row that lags behind up to `catch_up` times more.
 
     Once no rows arrive, all are drawn equally often to within one. Uniform draws from a growing set would favour the
-    early rows by r ln(n_end/n_then). Strictly the fewest-drawn first, shard by shard as they arrive, would train on
-    nothing but the new shard's rows until they had caught up, which is where a network forgets the others; so here new
-    rows come more often and never alone, and a `catch_up` larger than any row has been drawn is that strict order.
-    Deterministic in the seed, the order of arrival, and how many had arrived at each draw.
+    early rows by r ln(n_end/n_then). Strictly the fewest-drawn first, shard by shard as they arrive, would train on the
+    new shard's rows alone until they had caught up, and a network would forget the others; so here new rows come more
+    often and never alone. A `catch_up` larger than the draws of any row gives that strict order. Deterministic in the
+    seed, the order of arrival, and the number of rows that had arrived at each draw.
     """
 
     def __init__(self, seed: int, catch_up: int) -> None:
         self._seed, self._catch_up = seed, catch_up
         self.rows: list[int] = []
         self._visits = np.zeros(0, np.int64)
-        self._joined = 0  # rows that are in the rounds; the others join at the next draw
+        self._joined = 0  # rows in the rounds; the others join at the next draw
         self._deck: deque[int] = deque()  # places in `rows`
         self._shuffles = 0
 
     @property
     def visits(self) -> dict[int, int]:
-        """How often each row has been drawn."""
+        """The number of draws of each row."""
         return dict(zip(self.rows, self._visits.tolist(), strict=True))
 
     def add(self, rows: Iterable[int]) -> None:
-        """Rows that have arrived; they join the round that is under way, at the next draw."""
+        """Add rows that have arrived; they join the current round at the next draw."""
         self.rows.extend(rows)
         self._visits = np.pad(self._visits, (0, len(self.rows) - len(self._visits)))
 
     def draw(self, count: int) -> tuple[int, ...]:
-        """The next `count` rows; all different where there are as many."""
+        """Draw the next `count` rows; all are different if there are enough."""
         if not self.rows:
             raise ValueError("no row has arrived; nothing can be drawn")
         if self._joined < len(self.rows):
@@ -63,12 +63,12 @@ class RoundSampler:
         return tuple(self.rows[place] for place in chosen)
 
     def put_back(self, rows: Iterable[int]) -> None:
-        """Draws that came to nothing: these rows are behind by as much."""
+        """Undo draws of rows that could not be used: they lag behind by as many."""
         for row in rows:
             self._visits[self.rows.index(row)] -= 1
 
     def state(self) -> dict[str, Any]:
-        """All that draws depend on besides the seed; int64 tensors where there is a number for each row."""
+        """All that draws depend on besides the seed; int64 tensors for values of each row."""
         return {
             "rows": torch.tensor(self.rows, dtype=torch.int64),
             "visits": torch.from_numpy(self._visits.copy()),
@@ -86,7 +86,7 @@ class RoundSampler:
         self._shuffles = state["shuffles"]
 
     def _round(self, first: int) -> NDArray[np.int64]:
-        """A round of the places from `first` on: once each, and those behind up to `catch_up` times more."""
+        """A round of the places from `first` on: once each, and those that lag behind up to `catch_up` times more."""
         behind = self._visits.max(initial=0) - self._visits[first:]
         copies = 1 + np.minimum(behind, self._catch_up)
         return np.repeat(np.arange(first, len(self.rows)), copies)

@@ -20,8 +20,8 @@ from photonfarm.shared.store.read.reader import SceneReader
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredSample:
-    """One sample in the types that it is stored in; its images lie in memory that the next batch is read into."""
+class RawSample:
+    """One sample in its stored types; its images are in memory that the next batch reuses."""
 
     modification: Modification
     view: View
@@ -30,7 +30,7 @@ class StoredSample:
     buffers: ViewBuffers
     visibility: Visibility
     pass_: int
-    guides: Guides | None = None  # where they are followed
+    guides: Guides | None = None  # if guides are followed
 
 
 class StoreSource:
@@ -46,7 +46,7 @@ class StoreSource:
         return self._reader.is_begun
 
     def follow_guides(self) -> None:
-        """Read guides too; samples are complete only with them. Raises SpecError for a scene that has none."""
+        """Read guides too; samples are complete only with them. Raises SpecError for a scene without guides."""
         self._reader.follow_guides()
         self._memory, self._has_guides = None, True
 
@@ -60,21 +60,21 @@ class StoreSource:
         return self._reader.base()
 
     def refresh(self) -> NDArray[np.int64]:
-        """The rows that became complete since the last call."""
+        """Look for new samples; returns the rows that became complete since the last call."""
         return self._reader.refresh()
 
     def taken_back(self) -> NDArray[np.int64]:
         """The rows that were complete before the last `refresh` and not after it: a repair has set their jobs aside."""
         return self._reader.taken_back
 
-    def read_batch(self, rows: Sequence[int]) -> list[StoredSample]:
-        """Complete rows' samples, valid until the next call; CorruptError if their bytes are not what was committed."""
+    def read_batch(self, rows: Sequence[int]) -> list[RawSample]:
+        """The samples of complete rows, valid until the next call; CorruptError if bytes are not what was committed."""
         if self._memory is None or len(rows) > len(self._memory):
             self._memory = Batch.empty(self.spec, len(rows), guides=self._has_guides)
         read = self._reader.read_batch(rows, self._memory)
         return [self._sample(read, place, row) for place, row in enumerate(rows)]
 
-    def _sample(self, read: Batch, place: int, row: int) -> StoredSample:
+    def _sample(self, read: Batch, place: int, row: int) -> RawSample:
         modification, view, pass_ = self._reader.inputs(row)
         radiance, scale = read.radiance[place], 2.0**-read.radiance_exponent
         if place in read.wide:
@@ -82,10 +82,10 @@ class StoreSource:
         buffers = ViewBuffers(**{name: values[place] for name, values in read.buffers.items()})
         known = {name: values[place] for name, values in read.guides.items()}
         guides = Guides(**known) if known else None
-        return StoredSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_, guides)
+        return RawSample(modification, view, radiance, scale, buffers, read.visibility(place), pass_, guides)
 
     def read_photons(self, row: int) -> Photons:
-        """The photons of a complete row's configuration; raises StoreError for a scene that has none."""
+        """The photons of a complete row's configuration; raises StoreError for a scene without photons."""
         return self._reader.read_photons(row)
 
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
@@ -101,5 +101,5 @@ class StoreSource:
         return self._reader.planned
 
     def plan_requests(self) -> list[dict[str, Any]]:
-        """What was asked for with each plan, in order, as JSON has it: all that the rows follow from."""
+        """The requests of all plans, in order, as JSON documents: all rows follow from them."""
         return list(self._reader.plan_requests)

@@ -1,4 +1,4 @@
-"""How good images are: the columns of the paper's tables, and what we put beside them [supplement 4]."""
+"""The quality of images: the columns of the paper's tables, and further ones of ours [supplement 4]."""
 
 from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
 from photonfarm.trainer.metrics.fid import Fid, fid, kid

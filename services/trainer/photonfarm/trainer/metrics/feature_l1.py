@@ -1,4 +1,4 @@
-"""Feature L1: how far apart two images are in what an Inception block sees on average [supplement 4, Fig. 5].
+"""Feature L1: the distance of two images in the averaged features of an Inception block [supplement 4, Fig. 5].
 
 Shape letters: N images, C features.
 """

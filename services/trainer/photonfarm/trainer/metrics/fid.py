@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.estimate import Estimate
 
 FULL_RANK = 2048
-"""Images that FID needs at the least to be compared with published figures [method §4]."""
+"""The least number of images with which FID can be compared with published figures [method §4]."""
 FEWEST = 3
-"""Images below which a U-statistic of pairs has no jackknife."""
+"""The least number of images for which a U-statistic of pairs has a jackknife."""
 ROWS = 1024  # of the kernel matrix at a time
 
 _F64 = NDArray[np.float64]
@@ -23,12 +23,12 @@ _F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Fid:
-    """A Fréchet Inception distance, and of how many images: the fewer, the larger it comes out, whatever they show."""
+    """A Fréchet Inception distance, and the numbers of images: the fewer, the larger it is, whatever they show."""
 
     value: float
     predictions: int
     references: int
-    warning: str | None  # where the count is too low to compare with published figures
+    warning: str | None  # if the count is too low to compare with published figures
 
 
 def fid(predictions: NDArray[np.floating], references: NDArray[np.floating]) -> Fid:
@@ -73,7 +73,7 @@ def kid(predictions: NDArray[np.floating], references: NDArray[np.floating]) -> 
 
     The mean over i ≠ j of k(xᵢ, xⱼ) + k(yᵢ, yⱼ) − k(xᵢ, yⱼ) − k(xⱼ, yᵢ) [Gretton et al., 2012, eq. 4]: over all
     images rather than subsets of them. Image i of both sets shows the same view, so k(xᵢ, yᵢ) is left out: it would
-    bias the value down. Without a bias it may be negative. The standard error is the jackknife's, over views.
+    bias the value down. As it is unbiased, it may be negative. The standard error is the jackknife's, over views.
     Raises ValueError for sets of different sizes, or below three images.
     """
     count = len(predictions)
@@ -89,7 +89,7 @@ def kid(predictions: NDArray[np.floating], references: NDArray[np.floating]) -> 
 
 
 def _pair_sums(x: _F64, y: _F64, start: int) -> _F64:
-    """Of each image i from `start` on: the sum over j ≠ i of the U-statistic's kernel, (≤ ROWS,)."""
+    """The sum over j ≠ i of the U-statistic's kernel for each image i from `start` on, (≤ ROWS,)."""
     row = slice(start, start + ROWS)
     pairs = _kernel(x[row], x) + _kernel(y[row], y) - _kernel(x[row], y) - _kernel(y[row], x)
     itself = pairs[np.arange(len(pairs)), start + np.arange(len(pairs))]

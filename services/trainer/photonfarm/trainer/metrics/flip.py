@@ -15,7 +15,7 @@ from photonfarm.trainer.metrics.metric_space import check_pairs
 def flip(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
     """Mean FLIP (low dynamic range) of each pair of display images, 2 × (N, H, W, 3) → (N,); 0 is equality, 1 the most.
 
-    By the authors' package, for the viewer it assumes: 67 pixels per degree. It takes display values for sRGB.
+    The authors' package computes it for its default viewer: 67 pixels per degree. It takes display values as sRGB.
     """
     from flip_evaluator import evaluate  # type: ignore[import-untyped]
 

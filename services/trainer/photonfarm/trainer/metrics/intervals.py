@@ -1,4 +1,4 @@
-"""One number per image, with what may be concluded from it: mean and 95 % confidence interval."""
+"""Metrics of single images and their means, with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ NORMAL_975 = 1.959963984540054
 
 @dataclass(frozen=True, slots=True)
 class PerImage:
-    """A metric that each image has."""
+    """A metric of each image."""
 
-    estimate: Estimate  # over groups: of one group the images share what is hard
-    interval: tuple[float, float] | None  # 95 %, by Student's t; unknown of one group
-    values: tuple[float, ...]  # of each image, in their order
+    estimate: Estimate  # over groups: the images of one group are not independent
+    interval: tuple[float, float] | None  # 95 %, by Student's t; None for a single group
+    values: tuple[float, ...]  # one for each image, in their order
 
     @classmethod
     def of(cls, values: NDArray[np.float64], groups: Sequence[Hashable] | None = None) -> PerImage:
-        """Mean and interval of one value per image (N,); `groups` names what is independent, else each image is."""
+        """The mean and interval of one value per image (N,); `groups` are independent, by default single images."""
         estimate = Estimate.of(values if groups is None else group_means(values, groups))
         return cls(estimate, confidence_interval(estimate), tuple(values.tolist()))
 
 
 def confidence_interval(estimate: Estimate) -> tuple[float, float] | None:
-    """The two-sided 95 % interval of an estimate's mean; None where the standard error is unknown."""
+    """The two-sided 95 % interval of an estimate's mean; None if the standard error is unknown."""
     if estimate.standard_error is None:
         return None
     reach = t_975(estimate.count - 1) * estimate.standard_error

@@ -1,6 +1,6 @@
-"""The metric space: what a display would show, in which images are compared [method §4, ours].
+"""The metric space, in which images are compared: the values that a display would show [method §4, ours].
 
-Shape letters: N images, H W image. Images come as exposed linear radiance: radiance × the scene's fixed exposure.
+Shape letters: N images, H W image. Images are given as exposed linear radiance: radiance × the scene's fixed exposure.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from photonfarm.shared.core.records import F32
 def metric_space(exposed: F32 | Tensor) -> Tensor:
     """clip(I, 0, 1)^(1/2.2) of exposed linear radiance, (N, H, W, 3) → float32 of the same shape in [0, 1].
 
-    The exposure is fixed per scene: one taken from an image would hide errors of brightness. What is infinite shows
+    The exposure is fixed per scene: one derived from an image would hide errors of brightness. Infinite values become
     white. Raises ValueError for another shape, SpecError for values that are not numbers.
     """
     if isinstance(exposed, Tensor):
@@ -34,7 +34,7 @@ def metric_space(exposed: F32 | Tensor) -> Tensor:
 
 
 def check_pairs(predictions: Tensor, references: Tensor) -> None:
-    """ValueError unless both are as many images of the same size, one reference per prediction."""
+    """Raise ValueError unless both are as many images of the same size, one reference per prediction."""
     if predictions.shape != references.shape:
         raise ValueError(
             f"predictions have the shape {tuple(predictions.shape)} and references {tuple(references.shape)}; "

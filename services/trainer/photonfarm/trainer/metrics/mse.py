@@ -1,4 +1,4 @@
-"""Mean squared errors of what a display shows.
+"""Mean squared errors of display values.
 
 Shape letters: N images, H W image.
 """
@@ -17,10 +17,10 @@ def mse(
 ) -> NDArray[np.float64]:
     """Mean squared difference of each pair of display images, 2 × (N, H, W, 3) → (N,) [supplement 4].
 
-    With references in two independent halves it is mean (f − A)(f − B), whose noise averages to nothing; what stays is
-    the shift that the display's curve makes of their noise, of second order. It may be negative below the noise. Of
-    predictions that were made from a part of A it is mean f² − 2fB + AB, as in `clean_error_having_seen_a`. Raises
-    ValueError for shapes that do not fit.
+    With references in two independent halves it is mean (f − A)(f − B), whose noise averages to nothing; the remaining
+    bias is the shift of their noise by the display's curve, of second order. It may be negative below the noise. For
+    predictions that depend on a part of A it is mean f² − 2fB + AB, as in `clean_error_having_seen_a`. Raises
+    ValueError for shapes that do not match.
     """
     halves = references, references if other_halves is None else other_halves
     for half in halves:

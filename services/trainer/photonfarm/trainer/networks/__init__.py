@@ -1,4 +1,4 @@
-"""The networks by name, each with what it needs to see; those of a user's own are named `MODULE:NAME`."""
+"""The networks by name, each with its needs; a user's own are named `MODULE:NAME`."""
 
 from __future__ import annotations
 
@@ -24,49 +24,51 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """An architecture: what makes its network, and what that reads."""
+class NetworkKind:
+    """An architecture: the constructor of its network, and the inputs it reads."""
 
     make: Callable[[NetworkSettings, SceneFrame], Any]
     needs: Needs
 
 
-ARCHITECTURES: dict[str, Kind] = {
-    "cnn": Kind(Cnn, Needs(points=False)),
-    "feature_projection": Kind(FeatureProjection, Needs()),
-    "light_transport": Kind(LightTransport, Needs()),
-    "light_transport_photons": Kind(LightTransportPhotons, Needs(photons=True)),
-    "guided": Kind(Guided, Needs(points=False, guides=True)),
-    "guided_transport": Kind(partial(Guided, transport=True), Needs(guides=True)),
-    "guided_photons": Kind(partial(Guided, photons=True), Needs(points=False, photons=True, guides=True)),
-    "guided_transport_photons": Kind(partial(Guided, transport=True, photons=True), Needs(photons=True, guides=True)),
-    "denoise_1": Kind(Denoiser, Needs(points=False, kept=1)),
-    "denoise_4": Kind(Denoiser, Needs(points=False, kept=4)),
-    "denoise_16": Kind(Denoiser, Needs(points=False, kept=16)),
-    "denoise_32": Kind(Denoiser, Needs(points=False, kept=32)),
-    "denoise_64": Kind(Denoiser, Needs(points=False, kept=64)),
+ARCHITECTURES: dict[str, NetworkKind] = {
+    "cnn": NetworkKind(Cnn, Needs(points=False)),
+    "feature_projection": NetworkKind(FeatureProjection, Needs()),
+    "light_transport": NetworkKind(LightTransport, Needs()),
+    "light_transport_photons": NetworkKind(LightTransportPhotons, Needs(photons=True)),
+    "guided": NetworkKind(Guided, Needs(points=False, guides=True)),
+    "guided_transport": NetworkKind(partial(Guided, transport=True), Needs(guides=True)),
+    "guided_photons": NetworkKind(partial(Guided, photons=True), Needs(points=False, photons=True, guides=True)),
+    "guided_transport_photons": NetworkKind(
+        partial(Guided, transport=True, photons=True), Needs(photons=True, guides=True)
+    ),
+    "denoise_1": NetworkKind(Denoiser, Needs(points=False, kept=1)),
+    "denoise_4": NetworkKind(Denoiser, Needs(points=False, kept=4)),
+    "denoise_16": NetworkKind(Denoiser, Needs(points=False, kept=16)),
+    "denoise_32": NetworkKind(Denoiser, Needs(points=False, kept=32)),
+    "denoise_64": NetworkKind(Denoiser, Needs(points=False, kept=64)),
 }
 
 
-def kind_of(architecture: str) -> Kind:
-    """The architecture of a name. Raises SpecError for one of a user's own that cannot be had.
+def kind_of(architecture: str) -> NetworkKind:
+    """The architecture of a name. Raises SpecError for a user's own that cannot be loaded.
 
-    That is a subclass of `torch.nn.Module` which is made from `NetworkSettings` and `SceneFrame`, and whose `forward`
-    takes `Inputs` and returns the image (B, H, W, 3), linear radiance × exposure. What it reads beside camera and
-    buffers its attribute `needs` says, a `Needs`; without one it reads no more.
+    Such a network is a subclass of `torch.nn.Module` with the arguments `NetworkSettings` and `SceneFrame`, whose
+    `forward` takes `Inputs` and returns the image (B, H, W, 3), linear radiance × exposure. Its attribute `needs`, a
+    `Needs`, states the inputs it reads beside camera and buffers; without it there are none.
     """
     if architecture in ARCHITECTURES:
         return ARCHITECTURES[architecture]
     make = own.load("architecture", architecture)
     if not (isinstance(make, type) and issubclass(make, nn.Module)):
         raise SpecError(f"architecture = {architecture!r}: is {make!r}; a subclass of torch.nn.Module is required")
-    return Kind(make, getattr(make, "needs", Needs(points=False)))
+    return NetworkKind(make, getattr(make, "needs", Needs(points=False)))
 
 
 def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     """A freshly initialised network; the same weights for the same seed on one version of torch.
 
-    Raises SpecError where the scene lacks what the architecture needs, and as `kind_of` does.
+    Raises SpecError if the scene lacks what the architecture needs, and as `kind_of` does.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,4 +1,4 @@
-"""The baseline that sees nothing but the image-space buffers."""
+"""The baseline with no inputs but the image-space buffers."""
 
 from __future__ import annotations
 

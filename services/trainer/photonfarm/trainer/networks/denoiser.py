@@ -1,4 +1,4 @@
-"""The baseline that is given part of a rendered image: `denoise(1/k)` [supplement 4].
+"""The baseline whose inputs include part of a rendered image: `denoise(1/k)` [supplement 4].
 
 Shape letters: H W image.
 """
@@ -13,21 +13,23 @@ from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 SHARE = 2
-"""A light U-Net is half as wide, so about a quarter of the work. Published times fit 1.50 s / k + 0.005 s, where the
-full one takes 0.019 s [method 2, 4]."""
+"""The divisor of a light U-Net's width: half as wide, it has about a quarter of the work.
+
+Published times fit 1.50 s / k + 0.005 s, where the full U-Net takes 0.019 s [method 2, 4].
+"""
 
 
 class Denoiser(Network):
-    """A light U-Net over sparse noisy colour, the mask of what was kept, and the image-space channels.
+    """A light U-Net over sparse noisy colour, the mask of the kept pixels, and the image-space channels.
 
-    It is trained on pairs of independent noisy halves (Lehtinen et al., Noise2Noise, 2018): what it sees is never in
-    its target. The colour is linear; how much of it is seen does not show in the network, only in its weights.
+    It is trained on pairs of independent noisy halves (Lehtinen et al., Noise2Noise, 2018): its input is never in its
+    target. The colour is linear; the share of kept pixels affects only its weights, not its structure.
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
         super().__init__(settings, frame, further=3 + 1, share=SHARE)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """Noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""
+        """The noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""
         noisy = given(inputs.noisy)
         return [noisy.colour, noisy.kept[..., None].to(noisy.colour)]

@@ -1,4 +1,4 @@
-"""The baseline that knows its scene's points, but not what light does between them.
+"""The baseline with its scene's points, but without light transport between them.
 
 Shape letters: B batch, P points, H W image.
 """
@@ -14,7 +14,7 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 
 
 class FeatureProjection(Network):
-    """Each point's learnable descriptor, projected as it is [supplement Table 1, "Feature projection"].
+    """Each point's learnable descriptor, projected unchanged [supplement Table 1, "Feature projection"].
 
     A descriptor moves with its point, and is the same in every configuration.
     """

@@ -18,32 +18,32 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFrame:
-    """The constants of a scene by which inputs are brought near 1; all ours, as the supplement is silent.
+    """The constants of a scene by which inputs are normalised to values near 1; all ours, as the supplement gives none.
 
     Positions are taken about the centre of the geometry's bounding box and, like depths, divided by half its diagonal.
     Emission is divided by its root mean square over the cloud: lamps, few points among many, stand out so far that
-    maxima over the points tell of where they are before any step. Normals, rays and albedo are near 1 as they are.
+    maxima over the points encode their places before any step. Normals, rays and albedo are near 1 anyway.
     """
 
     optics: Optics
     centre: F32  # (3,)
     scale: float  # half the diagonal, scene units
     base: F32  # (P, 3) where each point is in the base configuration, world, scene units
-    appearance: F32  # (P, 9) what never changes of each point: normal, albedo, emission
+    appearance: F32  # (P, 9) the constants of each point: normal, albedo, emission
     photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
-    photon_depth: int  # hits stored of each at most
+    photon_depth: int  # most hits stored of each
     exposure: float  # the spec's factor on radiance
     max_depth: int  # edges of a path of the images; −1: no limit
     area: float  # of all surfaces, scene units²
-    photon_scale: float  # what makes of a photon's power over the number emitted a feature near 1
+    photon_scale: float  # factor from a photon's power, over the number emitted, to a feature near 1
 
     @classmethod
     def of(cls, spec: SceneSpec, geometry: Geometry, cloud: BasePointCloud, settings: NetworkSettings) -> SceneFrame:
         """The frame of a scene, for the first `settings.points` points of its cloud (uniform draws, as all are).
 
         A photon's power is stored over the number emitted, so that more photons are weaker ones. Times that number it
-        is the flux a photon would stand for alone, whatever their number; spread over a disc of the scene's radius, and
-        exposed, it is of the order of what the light makes the scene look like.
+        is the flux that a single photon would carry, whatever their number; spread over a disc of the scene's radius,
+        and exposed, it is of the order of the scene's brightness under that light.
         """
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)

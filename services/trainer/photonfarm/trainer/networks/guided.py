@@ -1,10 +1,10 @@
-"""Networks that are told what is known of a view: the image is that, and what is learned is the rest. All ours.
+"""Networks with guides: the image is what the guides give, and the rest is learned. All ours.
 
-    image = emission + known light + reflectance × U-Net
+image = emission + known light + reflectance × U-Net
 
-Emission and direct light are rendered [renderer.guides], lit points and photons bring light that was reflected before;
-what the U-Net adds is divided by how much a surface reflects, so that it has neither textures nor the colours of metals
-to learn. Nothing here has seen the noise of the half-estimates that it is compared with.
+Emission and direct light are rendered [renderer.guides]; lit points and photons add light that was reflected before.
+The output of the U-Net is divided by the reflectance of a surface, so that it need learn neither textures nor the
+colours of metals. No input depends on the noise of the half-estimates that are its targets.
 
 Shape letters: B batch, H W image, C channels.
 """
@@ -23,15 +23,18 @@ from photonfarm.trainer.networks.photon_map import WINDOWS
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 GUIDE_CHANNELS = 27
-"""Beside view ray 3, depth 1, albedo 3 and normal 3: emission, direct light, gloss, specular, mean normal, throughput,
-and albedo and normal beyond, 3 each; roughness, mean depth and depth beyond, 1 each."""
+"""The channels beside view ray 3, depth 1, albedo 3 and normal 3.
+
+They are emission, direct light, gloss, specular, mean normal, throughput, and albedo and normal beyond, 3 each;
+roughness, mean depth and depth beyond, 1 each.
+"""
 
 REFLECTANCE_FLOOR = 0.2
-"""Least factor of what the U-Net says: what is known of a surface may be wrong, and blends and edges reflect more."""
+"""The least factor of the U-Net's output: guides may be wrong, and blends and edges reflect more."""
 
 
 def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
-    """How much of the light a pixel shows, (B, H, W, 3): of the surface, or of the one that mirrors and glass show."""
+    """The reflectance of a pixel, (B, H, W, 3): of its surface, or of the one seen in mirrors and through glass."""
     own = albedo + (guides.specular - guides.throughput).clamp(min=0)
     return own + guides.throughput * guides.beyond_albedo
 
@@ -39,9 +42,9 @@ def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
-    With `transport` it sees what lit points send on to each pixel, by diffuse reflection and by other lobes, and the
-    diffuse part is added to the image. With `photons` it sees what photons that were reflected before bring to diffuse
-    surfaces, which is added where lit points add nothing.
+    With `transport` its inputs include the light that lit points send on to each pixel, by diffuse reflection and by
+    other lobes, and the diffuse part is added to the image. With `photons` they include the light that photons,
+    reflected before, bring to diffuse surfaces, which is added if lit points are not.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class Guided(Network):
         return self.known(inputs, further) + scale * self.synthesise(channels)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """log(1 + light), (B, H, W, 3) each: of lit points, then of photons by each window."""
+        """log(1 + light), (B, H, W, 3) each: of lit points, then of photons in each window."""
         found = [] if self.lit_points is None else self.lit_points(inputs)
         gathered = [] if self.photon_light is None else self.photon_light(inputs)
         return [torch.log1p(light) for light in (*found, *gathered)]
@@ -70,7 +73,7 @@ class Guided(Network):
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
         """Emission, reflected direct light, and albedo times further diffuse light, (B, H, W, 3).
 
-        That is what all lit points bring, or else what the widest window of photons has.
+        The further light is that of all lit points, or else that of photons in the widest window.
         """
         guides = given(inputs.guides)
         light = guides.emission + guides.direct + guides.gloss
@@ -79,7 +82,7 @@ class Guided(Network):
         return light + inputs.albedo * torch.expm1(further[-1] if self.lit_points is None else further[DIFFUSE])
 
     def guide_channels(self, guides: GuideInputs, scale: Tensor) -> list[Tensor]:
-        """The guides near 1, each (B, H, W, C): light as log(1 + it), direct light over what reflects it."""
+        """The guides as values near 1, each (B, H, W, C): light as log(1 + light), direct light over reflectance."""
         return [
             torch.log1p(guides.emission),
             torch.log1p(guides.direct / scale),

@@ -32,9 +32,9 @@ class ConvBlock(nn.Module):
 class ImageSynthesisLayer(nn.Module):
     """Three halvings by max-pooling at widths d, 2d, 4d, 8d; bilinear up, joined with the encoder's block outputs.
 
-    Ours where the figure is silent: 3×3 convolutions between the widths, no normalisation, no activation at the end.
-    With `precision` "bfloat16" it computes in that type but for the last convolution, so that the image and what the
-    loss makes of it are float32, as are all weights.
+    Ours where the figure gives no details: 3×3 convolutions between the widths, no normalisation, no activation at the
+    end. With `precision` "bfloat16" it computes in that type except for the last convolution, so that the image and the
+    loss are float32, as are all weights.
     """
 
     def __init__(self, channels_in: int, width: int, precision: Precision = "float32") -> None:

@@ -1,4 +1,4 @@
-"""What a predictor sees of a batch of samples: camera and buffers always, all else only if it needs it.
+"""The inputs of a predictor for a batch of samples: camera and buffers always, others only if it needs them.
 
 Shape letters: B batch, P points, L of them that are lit, K photon slots, H W image.
 """
@@ -22,17 +22,17 @@ M = TypeVar("M")
 T = TypeVar("T", bound="DataclassInstance")
 
 Memory = Callable[..., Tensor]
-"""An empty tensor of this shape behind the batch's axis; `dtype=` where it is not float32."""
+"""A function that makes an empty tensor of a shape, after the batch's axis; `dtype=` unless it is float32."""
 
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What a predictor reads beside camera and buffers, be it trained or not."""
+    """The inputs that a predictor, trained or not, reads beside camera and buffers."""
 
     points: bool = True
     photons: bool = False
     guides: bool = False
-    kept: int | None = None  # one of so many pixels is seen in the noisy colour of half A; None: no colour is seen
+    kept: int | None = None  # one of so many pixels of half A is an input, in noisy colour; None: no colour
 
 
 POINTS_ONLY = Needs()
@@ -62,7 +62,7 @@ class PhotonInputs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoisyColour:
-    """The pixels of one half-estimate that were kept."""
+    """The kept pixels of one half-estimate."""
 
     colour: Tensor  # (B, H, W, 3) linear radiance × exposure, zero where not kept
     kept: Tensor  # (B, H, W) bool
@@ -70,7 +70,7 @@ class NoisyColour:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GuideInputs:
-    """What is known of each view before anything is learned, as `records.Guides`; radiance × exposure."""
+    """The guides of each view, as in `records.Guides`; radiance × exposure."""
 
     emission: Tensor  # (B, H, W, 3)
     direct: Tensor  # (B, H, W, 3)
@@ -87,14 +87,14 @@ class GuideInputs:
 
     @classmethod
     def empty(cls, memory: Memory, spec: SceneSpec) -> GuideInputs:
-        """Guides that are still to be filled."""
+        """Unfilled guides."""
         shapes = {name: array.shape for name, array in guide_arrays(spec).items()}
         return cls(**{f.name: memory(*shapes[f.name]) for f in fields(cls)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """What a predictor sees of a batch of samples; what it does not need is None."""
+    """The inputs of a predictor for a batch of samples; those it does not need are None."""
 
     world_to_camera: Tensor  # (B, 3, 4)
     depth: Tensor  # (B, H, W) along the forward axis, 0: nothing hit
@@ -107,7 +107,7 @@ class Inputs:
 
     @classmethod
     def empty(cls, memory: Memory, points: int, spec: SceneSpec, needs: Needs) -> Inputs:
-        """Inputs that are still to be filled, of `points` points where points are needed."""
+        """Unfilled inputs, with `points` points if points are needed."""
         film, slots = (spec.film.height, spec.film.width), spec.photons.slots
 
         def flags(*shape: int) -> Tensor:
@@ -127,14 +127,14 @@ class Inputs:
 
 
 def given(member: M | None) -> M:
-    """A member of the inputs that is needed; raises ValueError where it was not filled."""
+    """A member of the inputs that is needed; raises ValueError if it was not filled."""
     if member is None:
         raise ValueError("inputs: lack what the network needs; make them with the `Needs` of its architecture")
     return member
 
 
 def map_tensors(change: Callable[..., Tensor], record: T, *others: T) -> T:
-    """The record with `change` of each tensor and its like in others of its kind; what is None stays so."""
+    """The record with `change` applied to each tensor, and to the matching ones of other records; None stays None."""
 
     def changed(values: list[Any]) -> Any:
         if isinstance(values[0], Tensor):

@@ -17,7 +17,7 @@ from photonfarm.trainer.networks.point_layers import WIDTH, LightTransportLayer
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 PHOTON_NUMBERS = 10
-"""Of each photon, beside its coordinates: direction 3, normal 3, power 3, bounce 1."""
+"""The features of each photon beside its coordinates: direction 3, normal 3, power 3, bounce 1."""
 
 
 class LightTransport(Network):
@@ -48,12 +48,12 @@ class LightTransport(Network):
 
 
 class LightTransportPhotons(LightTransport):
-    """The same, with photons of the current configuration: "Ours (w/ photons)", whose design is ours.
+    """The supplement's network with photons of the current configuration, "Ours (w/ photons)"; the design is ours.
 
-    With `photons = gathered` it sees what is gathered from them in windows of the image; and what the widest window
-    gathers, times albedo, is the image that its output is added to. With `transport` a second PointNet of the same kind
-    over the photons is projected and averaged like the points. Nothing that it sees depends on how many photons there
-    are, but for its noise: not their power, which is normalised, nor a maximum or mean over them.
+    With `photons = gathered` its inputs include the light gathered from them in windows of the image; and that of the
+    widest window, times albedo, is the image that its output is added to. With `transport` a second PointNet of the
+    same kind over the photons is projected and averaged like the points. No input depends on the number of photons
+    except by its noise: not their power, which is normalised, nor a maximum or mean over them.
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
@@ -66,7 +66,7 @@ class LightTransportPhotons(LightTransport):
         self.photon_transport = layer
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """Those of the points, and log(1 + what is gathered), (B, H, W, 3) each, or those of the photons, 64 wide."""
+        """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
         found, photons = super().further(inputs), given(inputs.photons)
         if self.photon_transport is None:
             return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
@@ -74,15 +74,15 @@ class LightTransportPhotons(LightTransport):
         return [*found, self.project(self.photon_features(photons), *where, inputs)]
 
     def gathered(self, inputs: Inputs) -> list[Tensor]:
-        """What `PhotonLight` tells of all photons, (B, H, W, 3) for each window."""
+        """The light of all photons by `PhotonLight`, (B, H, W, 3) for each window."""
         return self.photon_light(inputs)
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:
-        """Albedo times what the widest window has gathered: the photon map's image of diffuse surfaces."""
+        """Albedo times the light of the widest window: the photon map's image of diffuse surfaces."""
         return inputs.albedo * torch.expm1(further[-1]) if self.photon_transport is None else 0.0
 
     def photon_features(self, photons: PhotonInputs) -> Tensor:
-        """Features of photons by their own layer, (B, K, 64), of empty slots too; ValueError without that layer."""
+        """The features of photons by their own layer, (B, K, 64), also of empty slots; ValueError without it."""
         if self.photon_transport is None:
             raise ValueError("photons = 'gathered': there is no layer for photons")
         position, power = self.coordinates(photons.position), photons.power * self.photon_scale

@@ -1,15 +1,16 @@
 """Light that lit points send on: instant radiosity from the scene's point cloud [Keller 1997], with learned visibility.
 
-Each of the first points of the cloud stands for its share A of the scene's surface. Direct light reaches it, rendered
-with its shadows. What it reflects goes to every other point, and from all of these to every pixel, by the form factor
-F = cos θ cos θ′ A / (π r²):
+Each of the first points of the cloud stands for its share A of the scene's surface. It receives direct light, rendered
+with its shadows. Its reflected light goes to every other point, and from all of these to every pixel, by the form
+factor F = cos θ cos θ′ A / (π r²):
 
-    B₁ = ρ (F ∘ V) E / π        B₀ = ρ E / π        light of a pixel = (F ∘ V) (B₀ + B₁)
+B₁ = ρ (F ∘ V) E / π        B₀ = ρ E / π        light of a pixel = (F ∘ V) (B₀ + B₁)
 
-This is attention over points. Its kernel is the form factor, so that what a pixel receives depends on where it lies, as
-a maximum over points cannot. What is learned is the visibility V between two surfaces, of their places and normals:
+This is attention over points. Its kernel is the form factor, so that the light of a pixel depends on its position,
+which a maximum over points cannot express. The visibility V between two surfaces is learned, as a function of their
+places and normals:
 
-    V = sigmoid(r(receiver) · s(sender) + b)
+V = sigmoid(r(receiver) · s(sender) + b)
 
 Metals sum B₀ over the directions that their lobe mirrors; there nothing is learned.
 
@@ -29,39 +30,41 @@ from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.network import with_octaves
 
 COARSE = 4
-"""Diffuse light is summed for squares of so many by so many pixels: from one to the next it changes little."""
+"""The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
 
 GLOSSY = 0.2
-"""Directional albedo of lobes other than diffuse and followed ones, from which a pixel sums over one: that of metals.
-The coats of plastics and varnish took a third of a step and brought nothing."""
+"""The directional albedo of lobes neither diffuse nor followed from which a pixel sums over one: that of metals.
+
+The coats of plastics and varnish took a third of a step and gained nothing.
+"""
 
 SHARPEST = 0.15
-"""Least roughness of such a lobe: a narrower one would fall between points."""
+"""The least roughness of such a lobe: a narrower one would fall between points."""
 
 LEAST_LOGARITHM = -60.0
-"""Of a lobe's values: smaller ones are denormal numbers, which processors multiply some four times slower."""
+"""The least logarithm of a lobe's values: denormal numbers take processors some four times longer to multiply."""
 
 CHANNELS = 9
 
 DIFFUSE = 1
-"""Which of what `LitPoints` gives is all diffuse light."""
+"""The index of all diffuse light among the results of `LitPoints`."""
 
 OCTAVES = 3
 HIDDEN = 64
 FACTORS = 8
-"""Numbers of each surface whose products say what it sees."""
+"""The numbers of each surface whose products give its visibility."""
 
 OPEN = 2.0
-"""b at first: before anything is learned most surfaces see each other."""
+"""The initial b: before anything is learned most surfaces see each other."""
 
 
-class Visibility(nn.Module):
-    """How much of one surface another sees, learned: in (0, 1)."""
+class LearnedVisibility(nn.Module):
+    """The learned visibility between two surfaces, in (0, 1)."""
 
     centre: Tensor
 
     def __init__(self, frame: SceneFrame) -> None:
-        """Take the scene's place and size from a frame."""
+        """Take the scene's centre and size from a frame."""
         super().__init__()
         self._scale = frame.scale
         self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
@@ -69,7 +72,7 @@ class Visibility(nn.Module):
         self.open = nn.Parameter(torch.tensor(OPEN))
 
     def surfaces(self, position: Tensor, normal: Tensor) -> Tensor:
-        """What is asked of a surface: its place, in sines and cosines, and its normal, (N, C)."""
+        """The features of a surface: its place, in sines and cosines, and its normal, (N, C)."""
         return torch.cat([with_octaves((position - self.centre) / self._scale, OCTAVES), normal], dim=-1)
 
     def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
@@ -78,7 +81,7 @@ class Visibility(nn.Module):
 
 
 def _factors(std: float | None = None) -> nn.Sequential:
-    """What makes factors of a surface's numbers; with `std` they are that small at first."""
+    """A network from a surface's numbers to its factors; `std`: the initial deviation of its last weights."""
     last = nn.Linear(HIDDEN, FACTORS)
     if std is not None:
         nn.init.normal_(last.weight, std=std)
@@ -87,23 +90,23 @@ def _factors(std: float | None = None) -> nn.Sequential:
 
 
 class LitPoints(nn.Module):
-    """The radiance of white diffuse surfaces, and of lobes over their albedo, by what lit points send on."""
+    """The radiance of white diffuse surfaces, and of lobes over their albedo, by the light of lit points."""
 
     albedo: Tensor
     normal: Tensor
 
     def __init__(self, frame: SceneFrame, count: int) -> None:
-        """Take the first `count` points of a frame's cloud, or as many as are lit."""
+        """Take the first `count` points of a frame's cloud, or all that are lit if these are fewer."""
         super().__init__()
         self._optics = frame.optics
         self._count = min(count, len(frame.appearance))
         self._area = frame.area / self._count
-        self.visibility = Visibility(frame)
+        self.visibility = LearnedVisibility(frame)
         self.register_buffer("normal", torch.from_numpy(frame.appearance[: self._count, 0:3].copy()), persistent=False)
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 
     def forward(self, inputs: Inputs) -> list[Tensor]:
-        """Diffuse light B₀ as if nothing hid it, all diffuse light, and light by other lobes, (B, H, W, 3) each.
+        """Diffuse light B₀ without occlusion, all diffuse light, and light by other lobes, (B, H, W, 3) each.
 
         The last is 0 where other lobes reflect less than `GLOSSY`.
         """
@@ -125,7 +128,7 @@ class LitPoints(nn.Module):
         return unhidden, light, gloss
 
     def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray, position and normal of what each pixel sees, (H, W, 3) each."""
+        """The ray, position and normal of each pixel's surface, (H, W, 3) each."""
         guides, to_camera = given(inputs.guides), inputs.world_to_camera[place]
         rays = self._optics.rays(to_camera[None])[0]
         eye = -to_camera[:, :3].T @ to_camera[:, 3]
@@ -135,7 +138,7 @@ class LitPoints(nn.Module):
     def _diffuse(
         self, surface: Tensor, normal: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What points send straight on as if nothing hid it, and what they send with what they pass on, (H, W, 3)."""
+        """The points' B₀ without occlusion, and their B₀ + B₁ with occlusion, (H, W, 3) each."""
         at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
         facing = functional.normalize(facing, dim=-1)
         factors = self._form_factors(at, facing, source)
@@ -149,7 +152,7 @@ class LitPoints(nn.Module):
         return fine[..., :3], fine[..., 3:]
 
     def _form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
-        """cos θ cos θ′ A / (π r²) of surfaces (N, 3) that face (N, 3) and each point, (N, L)."""
+        """cos θ cos θ′ A / (π r²) between surfaces (N, 3) with normals `facing` (N, 3) and each point, (N, L)."""
         leaves, squared = self._between(at, source)
         cosines = (facing @ source.T - (facing * at).sum(-1, keepdim=True)).clamp(min=0) * leaves
         return cosines / (squared * squared) * (self._area / math.pi)
@@ -157,9 +160,9 @@ class LitPoints(nn.Module):
     def _lobes(
         self, at: Tensor, normal: Tensor, rays: Tensor, roughness: Tensor, source: Tensor, sent: Tensor
     ) -> Tensor:
-        """The mean of what points send over a lobe about the mirrored ray, (N, 3).
+        """The mean of the points' light over a lobe about the mirrored ray, (N, 3).
 
-        By a von Mises–Fisher lobe of κ = 2 / α², over the solid angle that each point stands for.
+        The lobe is a von Mises–Fisher distribution of κ = 2 / α²; each point has the weight of its solid angle.
         """
         mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
         leaves, squared = self._between(at, source)
@@ -172,7 +175,7 @@ class LitPoints(nn.Module):
     def _between(self, at: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         """Distance × cosine at each point's front, at least 0, and the squared distance, (N, L) each.
 
-        The square is not below a point's area over π, so that no near point outweighs all others.
+        The square is at least a point's area over π, so that no near point outweighs all others.
         """
         leaves = (at @ self.normal.T - (source * self.normal).sum(-1)).clamp(min=0)
         squared = (at * at).sum(-1, keepdim=True) + (source * source).sum(-1) - 2 * at @ source.T

@@ -1,4 +1,4 @@
-"""What all networks have in common: features of each pixel, then image synthesis [supplement 1.3].
+"""The base of all networks: features of each pixel, then image synthesis [supplement 1.3].
 
 Shape letters: B batch, P points, H W image, C channels.
 """
@@ -17,35 +17,38 @@ from photonfarm.trainer.networks.projection import footprint, project_mean
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 IMAGE_CHANNELS = 10
-"""View ray 3, depth 1, albedo 3, normal 3 [supplement 1.3]."""
+"""The image-space channels: view ray 3, depth 1, albedo 3, normal 3 [supplement 1.3]."""
 
 
 DESCRIPTOR_SIZE = 0.1
-"""Standard deviation of descriptors at first. At 1 they would drown position and emission in the maximum over the
-points, and it would take far longer to learn where lights are."""
+"""The initial standard deviation of descriptors.
+
+At 1 they would hide position and emission in the maximum over the points, and the network would take far longer to
+learn where lights are.
+"""
 
 
 def descriptors(points: int, settings: NetworkSettings) -> nn.Parameter:
-    """The learnable numbers of each point, (P, descriptor), before any step."""
+    """The learnable numbers of each point, (P, descriptor), initialised."""
     return nn.Parameter(DESCRIPTOR_SIZE * torch.randn(points, settings.descriptor))
 
 
 def with_octaves(x: Tensor, octaves: int) -> Tensor:
     """Coordinates near 1, (…, 3), with sin and cos of π/2 · 2ᵏ times each, k = 0 … octaves − 1: (…, 3 + 6 · octaves).
 
-    From these, functions of the position are learnt in far fewer steps (Tancik et al., Fourier Features, 2020).
+    From these, functions of the position are learned in far fewer steps (Tancik et al., Fourier Features, 2020).
     """
     angles = [x * (0.5 * math.pi * 2**octave) for octave in range(octaves)]
     return torch.cat([x, *(wave(angle) for angle in angles for wave in (torch.sin, torch.cos))], dim=-1)
 
 
 class Network(nn.Module):
-    """Image synthesis from the image-space channels, and from whatever further ones a kind of network puts before."""
+    """Image synthesis from the image-space channels, and from the further channels of a kind of network before them."""
 
     centre: Tensor
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, share: int = 1) -> None:
-        """`further` channels beside the image-space ones; a U-Net of one `share`-th of the width that is set."""
+        """Take `further` channels beside the image-space ones; the U-Net has the `share`-th part of the set width."""
         super().__init__()
         self.optics = frame.optics
         self.scale = frame.scale
@@ -59,9 +62,9 @@ class Network(nn.Module):
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure.
 
-        With demodulation, which is ours, the output × (albedo + ε): the network predicts what falls on a surface. ε
-        lets lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets stay as they are:
-        dividing them by albedo would weight their noise by a factor per pixel.
+        With demodulation, which is ours, it is the output × (albedo + ε): the network predicts the incident light.
+        Because of ε, lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets are not divided
+        by albedo, which would weight their noise by a factor per pixel.
         """
         further = self.further(inputs)
         output = self.synthesise(torch.cat([*further, self.image_space(inputs)], dim=-1))
@@ -69,11 +72,11 @@ class Network(nn.Module):
         return made + self.known(inputs, further)
 
     def further(self, inputs: Inputs) -> list[Tensor]:  # noqa: ARG002 - what the kinds see
-        """What this kind of network puts before the image-space channels, each (B, H, W, C)."""
+        """The channels that this kind of network adds before the image-space channels, each (B, H, W, C)."""
         return []
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:  # noqa: ARG002 - what the kinds see
-        """What the image is without anything learned, (B, H, W, 3), to which the output is added."""
+        """The known part of the image, (B, H, W, 3), to which the learned output is added."""
         return 0.0
 
     def image_space(self, inputs: Inputs) -> Tensor:
@@ -82,7 +85,7 @@ class Network(nn.Module):
         return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
 
     def synthesise(self, channels: Tensor) -> Tensor:
-        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, which is what convolutions on CPUs like."""
+        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, which makes convolutions faster on CPUs."""
         return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
     def coordinates(self, position: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What the photons of a configuration bring to the surfaces that a view shows.
+"""The light that the photons of a configuration bring to the surfaces of a view.
 
 Shape letters: B batch, H W image.
 """
@@ -19,19 +19,19 @@ from photonfarm.trainer.networks.projection import footprint
 class PhotonLight:
     """The exposed radiance of white diffuse surfaces by the photons in windows of the image.
 
-    Of photons whose path to the eye is no longer than the paths of the images, and whose light has been reflected
-    `bounces` times before at least.
+    It takes the photons whose path to the eye is no longer than the paths of the images, and whose light has been
+    reflected at least `bounces` times.
     """
 
     def __init__(self, frame: SceneFrame, architecture: str, *, bounces: int = 0) -> None:
-        """Take the scene of a frame; raises SpecError where it has no photons."""
+        """Take the scene's constants from a frame; raises SpecError for a scene without photons."""
         if not frame.photon_paths:
             raise SpecError(
                 f"network.architecture = {architecture!r}: the scene has photons.paths = 0, and none are stored; set "
                 "photons.paths in its spec and render it anew, or train an architecture without photons"
             )
         self._optics, self._exposure, self._first = frame.optics, frame.exposure, bounces
-        self._last = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # after it the eye, an edge more
+        self._last = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # then one edge to the eye
 
     def __call__(self, inputs: Inputs) -> list[Tensor]:
         """(B, H, W, 3) for each of `photon_map.WINDOWS`."""

@@ -1,9 +1,8 @@
-"""The photon map, gathered in the image: what falls on the surfaces that each pixel sees, estimated from the photons.
+"""The photon map in image space: the irradiance of each pixel's surface, estimated from the photons.
 
 The irradiance of a surface is the flux of the photons that land near over the area on which they do [Jensen, Global
-Illumination using Photon Maps, 1996]; near are here those that land near in the image. Noise falls with the number of
-photons and of pixels, and what differs between these is blurred.
-
+Illumination using Photon Maps, 1996]; near means here near in the image. Noise falls with the number of photons and of
+pixels, while differences between the pixels are blurred.
 Shape letters: B batch, K photon slots, H W image.
 """
 
@@ -18,15 +17,18 @@ from torch.nn import functional
 from photonfarm.trainer.networks.projection import Footprint, Optics
 
 WINDOWS = (0.07, 0.17)
-"""Sides of the squares over which photons and area are summed, of the image's width, three times in a row, as a sum
-over one square has an edge. The wider has less noise, the narrower more detail."""
+"""The sides of the squares over which photons and area are summed, as shares of the image's width.
+
+They are summed three times in a row, as a sum over one square has an edge. The wider window has less noise, the
+narrower one more detail.
+"""
 
 GRAZING = 0.05
-"""Cosine between ray and normal below which a pixel is left out: the area of a surface seen edge-on has no bound."""
+"""The cosine between ray and normal below which a pixel is left out: the area of surfaces seen edge-on is unbounded."""
 
 
 def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
-    """Area of the surface that each pixel sees, (B, H, W) in scene units², 0 where nothing is seen, or all but edge-on.
+    """The area of each pixel's surface, (B, H, W) in scene units²; 0 if there is none, or it is seen almost edge-on.
 
     z² / (f² |n · d|) for depth z, focal length f in pixels, unit shading normal n, and d the ray that crosses depth 1.
     """
@@ -37,16 +39,16 @@ def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Te
 
 
 def arrives_on_seen_side(position: Tensor, direction: Tensor, normal: Tensor, world_to_camera: Tensor) -> Tensor:
-    """Whether photons (B, K, 3) come from the side of their surface that the eye is on, (B, K)."""
+    """Whether photons (B, K, 3) arrive on the side of their surface that faces the eye, (B, K)."""
     eye = -(world_to_camera[:, :, :3].mT @ world_to_camera[:, :, 3:]).mT
     return (direction * normal).sum(dim=-1) * ((position - eye) * normal).sum(dim=-1) > 0
 
 
 def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
-    """Irradiance / π by each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
+    """Irradiance / π in each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
 
     power (B, K, 3) is flux over the number of paths emitted, area (B, H, W), and pixels where that is 0 are left out.
-    Zero where no surface is seen near.
+    The result is zero if there is no surface nearby.
     """
     B, H, W = area.shape
     landed = power.flatten(0, 1).index_select(0, kept.point)

@@ -13,17 +13,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 WIDTH = 64
-"""Width of the layer's output and of each block's input [supplement Fig. 1]."""
+"""The width of the layer's output and of each block's input [supplement Fig. 1]."""
 
 LOCAL = WIDTH // 2
-"""Width of the per-point half of a block's output; the other half is the maximum over points."""
+"""The width of the per-point half of a block's output; the other half is the maximum over points."""
 
 
 class ResidualBlock(nn.Module):
     """A fully connected residual block 64 → 32, activations before each layer [supplement Fig. 1].
 
-    Ours where the figure is silent: the last layer starts at zero and the shortcut has no bias, so that a block starts
-    as a linear map.
+    Ours where the figure gives no details: the last layer starts at zero and the shortcut has no bias, so that a block
+    starts as a linear map.
     """
 
     def __init__(self) -> None:
@@ -43,22 +43,22 @@ class ResidualBlock(nn.Module):
 
 
 def _linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
-    """`layer` on each point's [local, shared], without building it."""
+    """Apply `layer` to each point's [local, shared], without building it."""
     own, common = torch.split(layer.weight, [local.shape[-1], shared.shape[-1]], dim=1)
     return functional.linear(local, own) + functional.linear(shared, common, layer.bias)[:, None]
 
 
 def masked_max(x: Tensor, visible: Tensor) -> Tensor:
-    """The maximum over visible points, (B, P, F) and (B, P) → (B, F); zero where no point is visible."""
+    """The maximum over visible points, (B, P, F) and (B, P) → (B, F); zero if no point is visible."""
     maximum = x.masked_fill(~visible[..., None], -torch.inf).amax(dim=1)
     return torch.where(visible.any(dim=1, keepdim=True), maximum, 0)
 
 
 class LightTransportLayer(nn.Module):
-    """Features of each point that know of the whole scene; the output is that of the second block.
+    """Features of each point that depend on the whole scene; the output is that of the second block.
 
-    Ours where the figure is silent: weights start with variance 1 / inputs [LeCun et al. 1998], so that features of
-    size 1 stay so. By torch's default, a third of that, they would enter the U-Net far below its other channels.
+    Ours where the figure gives no details: weights start with variance 1 / inputs [LeCun et al. 1998], so that features
+    of size 1 stay so. By torch's default, a third of that, they would enter the U-Net far below its other channels.
     """
 
     def __init__(self, varying: int, fixed: int) -> None:
@@ -70,10 +70,10 @@ class LightTransportLayer(nn.Module):
     def forward(self, varying: Tensor, fixed: Tensor, visible: Tensor, reference: Tensor | None = None) -> Tensor:
         """p_i and visible (B, P) → f_i (B, P, 64).
 
-        p_i comes in two parts: what differs between samples (B, P, F), and what does not (P, F′). With a reference, a
-        cloud (P, F) of which all points are visible, maxima are taken less its own, which is ours: what a moved lamp
-        does to them is little beside what all configurations have in common, and else lost in what each step of the
-        optimiser does to that.
+        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). With a reference, a
+        cloud (P, F) of which all points are visible, its maxima are subtracted, which is ours: the effect of a moved
+        lamp on them is small beside what all configurations have in common, and would be lost in the optimiser's
+        changes to that.
         """
         samples = len(varying)
         if reference is not None:

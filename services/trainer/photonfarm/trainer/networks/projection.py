@@ -18,7 +18,7 @@ from photonfarm.trainer.runs.settings import Occlusion
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What all cameras of a scene have in common, and how points that are hidden are told from those that are seen."""
+    """The optics that all cameras of a scene share, and the rule by which hidden points are found."""
 
     focal_px: float
     width: int
@@ -45,7 +45,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """Which point lands in which pixel; one entry per point that is kept."""
+    """The pixel of each point; one entry per kept point."""
 
     point: Tensor  # (K,) int64 index into B·P
     pixel: Tensor  # (K,) int64 index into B·H·W
@@ -61,13 +61,13 @@ def footprint(
     normal: Tensor,
     optics: Optics,
 ) -> Footprint:
-    """The points that are kept, and their pixels.
+    """The kept points, and their pixels.
 
     position (B, P, 3) world, visible and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
-    axis, normal (B, H, W, 3) world. Image coordinates are floored. Dropped are points flagged invisible, behind the
-    camera, off the image, or occluded. To "exact" what is not `seen` is occluded, whatever the depth; to the other
-    rules what lies behind the rendered depth by more than the tolerance, seen or not, and nothing where the depth is 0,
-    as nothing was hit there.
+    axis, normal (B, H, W, 3) world. Image coordinates are floored. Points are dropped if they are flagged invisible,
+    behind the camera, outside the image, or occluded. By the rule "exact", points that are not `seen` are occluded,
+    whatever the depth; by the other rules, points that lie behind the rendered depth by more than the tolerance, seen
+    or not, and none where the depth is 0, as nothing was hit there.
     """
     in_camera = position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]
     kept = visible & seen if optics.occlusion == "exact" else visible
@@ -85,10 +85,10 @@ def footprint(
 
 
 def _landing(in_camera: Tensor, kept: Tensor, optics: Optics) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Those of the points kept (B, P) that lie ahead and in the image: sample, point, column and row, (K,) each."""
+    """The kept points (B, P) that lie ahead and in the image: sample, point, column and row, (K,) each."""
     x, y, z = in_camera.unbind(-1)
     ahead = kept & (z > 0)
-    z = torch.where(ahead, z, 1)  # divides safely; dropped below
+    z = torch.where(ahead, z, 1)  # avoids division by zero; dropped below
     column = torch.floor(optics.focal_px * x / z + 0.5 * optics.width)
     row = torch.floor(optics.focal_px * y / z + 0.5 * optics.height)
     inside = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
@@ -97,7 +97,7 @@ def _landing(in_camera: Tensor, kept: Tensor, optics: Optics) -> tuple[Tensor, T
 
 
 def _behind_depth(z: Tensor, surface: Tensor, optics: Optics) -> Tensor:
-    """How far points at depth z lie behind the rendered surface, (K,); without meaning where the surface is 0.
+    """The distance of points at depth z behind the rendered surface, (K,); meaningless where the surface is 0.
 
     Window depth is OpenGL's, w(z) = (1/near − 1/z) / (1/near − 1/far), 0 at the near plane and 1 at the far plane. The
     supplement's ε = 1e-3 is only sensible there: on linear depth it removes points of slanted surfaces [method 2].
@@ -112,18 +112,19 @@ def _behind_depth(z: Tensor, surface: Tensor, optics: Optics) -> Tensor:
 
 
 def _through_centres(u: Tensor, v: Tensor, optics: Optics) -> Tensor:
-    """Where the rays through pixel centres cross depth 1, in camera coordinates, (K, 3)."""
+    """The points where rays through pixel centres cross depth 1, in camera coordinates, (K, 3)."""
     x = (u + 0.5 - 0.5 * optics.width) / optics.focal_px
     y = (v + 0.5 - 0.5 * optics.height) / optics.focal_px
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
 def _behind_surface(point: Tensor, ray: Tensor, surface: Tensor, normal: Tensor) -> Tensor:
-    """How far points lie behind the rendered surface continued as a plane, over its depth, (K,); all (K, 3) in camera.
+    """The distance of points behind the plane of the rendered surface, over its depth, (K,); all (K, 3) in camera.
 
-    The depth of a pixel is that of its centre. What lies elsewhere in the pixel on the same plane is at another depth,
-    by more the more it slants, and yet at distance 0 from the plane: so ε can be small, and does not depend on near and
-    far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/projection.md has figures.
+    The depth of a pixel is that of its centre. Other points of the same plane in the pixel have another depth, which
+    differs more the more the plane slants, and yet distance 0 from it: so ε can be small, and does not depend on near
+    and far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/projection.md has
+    figures.
     """
     from_eye = (normal * ray).sum(dim=-1)  # < 0: the normal is on the eye's side
     offset = ((point - ray * surface[:, None]) * normal).sum(dim=-1) * torch.sign(from_eye)

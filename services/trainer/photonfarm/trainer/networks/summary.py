@@ -1,4 +1,4 @@
-"""What a network consists of: parameters and work of its parts, counted while it makes one image.
+"""The parts of a network: their parameters and work, counted while it makes one image.
 
 Shape letters: P points, K photon slots.
 """
@@ -26,17 +26,17 @@ MODULES = {
     "photon_transport": "photon branch",
     "image_synthesis": "U-Net",
 }
-"""The part that each module of a network is; whatever lies in none is projection, and each point's descriptor."""
+"""The part to which each module of a network belongs; all others belong to projection, and to points' descriptors."""
 
 OTHER = "other"
-"""Modules of a network of a user's own."""
+"""The part of a user's own modules."""
 
 PARTS = ("point branch", "photon branch", "projection", "U-Net", OTHER)
 DESCRIPTOR = "descriptor"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class NetworkPart:
     """A part of a network."""
 
     name: str
@@ -44,8 +44,8 @@ class Part:
     gmacs: float  # 10⁹ multiply-adds of matrix products and convolutions, for one image
 
 
-def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
-    """The parts of a scene's network, those that it has. It makes one image of points and buffers made up for this.
+def summary(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
+    """The parts of a scene's network. It makes one image of made-up points and buffers for this.
 
     A multiply-add is two of the operations that torch's FlopCounterMode counts, which are those of convolutions and
     matrix products; sums, such as the mean over the points in a pixel, are not counted.
@@ -61,12 +61,12 @@ def summary(spec: SceneSpec, settings: NetworkSettings) -> list[Part]:
     rest = counts["Global"] - sum(gmacs.values())
     parameters = _parameters(network)
     gmacs[OTHER if parameters[OTHER] else "projection"] = rest
-    return [Part(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
+    return [NetworkPart(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
 
 
-def table(parts: list[Part]) -> str:
+def table(parts: list[NetworkPart]) -> str:
     """The parts and their sum, a line each."""
-    total = Part("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
+    total = NetworkPart("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
     lines = [f"{part.name:<14}{part.parameters:>12,}{part.gmacs:>10.3f}" for part in (*parts, total)]
     return "\n".join([f"{'part':<14}{'parameters':>12}{'GMAC':>10}", *lines])
 
@@ -81,7 +81,7 @@ def _parameters(network: Network) -> dict[str, int]:
 
 
 def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
-    """A frame with as many points and photons as the scene's; their values do not matter."""
+    """A frame with as many points and photons as the scene has; their values do not matter."""
     points = min(settings.points or spec.points, spec.points)
     appearance, base = np.zeros((points, 9), np.float32), np.zeros((points, 3), np.float32)
     optics = Optics.of(spec, settings.occlusion, settings.occlusion_tolerance)
@@ -90,7 +90,7 @@ def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
 
 
 def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
-    """Inputs of one image that are zero throughout: all points lie in the eye, and none is projected."""
+    """Inputs of one image that are all zero: all points lie in the eye, and none is projected."""
 
     def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(1, *shape, dtype=dtype)

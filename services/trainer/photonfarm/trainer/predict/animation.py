@@ -1,4 +1,4 @@
-"""Pictures in files: PNG, GIF, and MP4 where the extra `video` (imageio-ffmpeg) is installed. For display only.
+"""Image files: PNG, GIF, and MP4 if the extra `video` (imageio-ffmpeg) is installed. For display only.
 
 Shape letters: H W image.
 """
@@ -24,13 +24,13 @@ PICTURE_WIDTH = 256  # px, at least
 
 
 def enlarged(exposed: F32) -> Picture:
-    """Exposed linear radiance, (H, W, 3), as a display shows it; of a small image each pixel is drawn as several."""
+    """Exposed linear radiance, (H, W, 3), as a display shows it; the pixels of a small image are enlarged."""
     scale = max(1, -(-PICTURE_WIDTH // exposed.shape[1]))
     return display(exposed, 1.0).repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def write_png(picture: Picture, file: Path) -> None:
-    """One picture, (H, W, 3)."""
+    """Write one picture, (H, W, 3)."""
     from PIL import Image
 
     with store_errors("write the picture", file):
@@ -38,7 +38,7 @@ def write_png(picture: Picture, file: Path) -> None:
 
 
 def read_png(file: Path) -> Picture:
-    """What `write_png` wrote."""
+    """Read a picture that `write_png` wrote."""
     from PIL import Image
 
     with store_errors("read the picture", file), Image.open(file) as image:
@@ -46,7 +46,7 @@ def read_png(file: Path) -> Picture:
 
 
 def write_gif(pictures: Iterable[Picture], file: Path, fps: float) -> None:
-    """An animation that repeats for ever, of 256 colours a picture; a GIF counts hundredths of a second.
+    """Write an animation that repeats for ever, with 256 colours a picture; GIF rounds times to hundredths of a second.
 
     Pillow holds the pictures until it writes them, at a byte a pixel.
     """
@@ -66,7 +66,7 @@ def write_gif(pictures: Iterable[Picture], file: Path, fps: float) -> None:
 
 
 def can_write_mp4() -> bool:
-    """Whether the package that brings ffmpeg along is installed."""
+    """Whether the package that contains ffmpeg is installed."""
     try:
         import_module(FFMPEG)
     except ImportError:
@@ -75,9 +75,9 @@ def can_write_mp4() -> bool:
 
 
 def write_mp4(pictures: Iterable[Picture], file: Path, fps: float) -> None:
-    """A film, H.264 with 4:2:0 colour; odd sizes are made even by repeating the last column or row.
+    """Write a film, H.264 with 4:2:0 colour; odd sizes are made even by repeating the last column or row.
 
-    One picture at a time is in memory. Raises StoreError where ffmpeg fails, with its last words.
+    One picture at a time is in memory. Raises StoreError if ffmpeg fails, with its last line.
     """
     coming = iter(pictures)
     first = next(coming)
@@ -86,22 +86,22 @@ def write_mp4(pictures: Iterable[Picture], file: Path, fps: float) -> None:
     coded = ["-an", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     ffmpeg = import_module(FFMPEG).get_ffmpeg_exe()  # its own write_frames leaves pipes open
     command = [ffmpeg, "-loglevel", "error", "-y", *given, *coded, str(file)]
-    with store_errors("write the film", file), tempfile.TemporaryFile() as words:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=words) as process:
+    with store_errors("write the film", file), tempfile.TemporaryFile() as log:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process:
             if process.stdin is not None:
                 _pour(chain([first], coming), process.stdin)
-        words.seek(0)
-        said = words.read().decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
+        log.seek(0)
+        lines = log.read().decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
     if process.returncode:
-        raise StoreError(f"{file}: ffmpeg cannot write the film: {said[-1]}")
+        raise StoreError(f"{file}: ffmpeg cannot write the film: {lines[-1]}")
 
 
 def _pour(pictures: Iterable[Picture], pipe: IO[bytes]) -> None:
-    """Hand the pictures over for as long as they are taken, and close the pipe."""
+    """Write the pictures to the pipe until it is closed, and close it."""
     try:
         with pipe:
             for picture in pictures:
                 height, width = picture.shape[:2]
                 pipe.write(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").tobytes())
-    except BrokenPipeError:  # ffmpeg has ended, and says why
+    except BrokenPipeError:  # ffmpeg has ended, and states why
         return

@@ -1,4 +1,4 @@
-"""Held-out error with the noise removed, and the predictors it is measured against."""
+"""The held-out error with the noise removed, and the predictors to be measured."""
 
 from __future__ import annotations
 
@@ -16,54 +16,56 @@ from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_h
 from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
 
-Predictor = Callable[[Batch], F32]
-"""A batch's images, (B, H, W, 3), linear radiance × exposure."""
+Predictor = Callable[[TrainingBatch], F32]
+"""A function from a batch to its images, (B, H, W, 3), linear radiance × exposure."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
+class HeldOutErrors:
     """Errors over held-out samples, in squared exposed radiance per channel.
 
-    Views and passes of one configuration share what is hard about it, so they are averaged first; configurations are
-    what is independent.
+    Views and passes of one configuration are similarly difficult, so they are averaged first; configurations are the
+    independent units.
     """
 
     error: Estimate  # against the clean image, over configurations
-    floor: float  # noise of the target: what the error against it would show on top
+    floor: float  # noise of the target, which would be added to an error against it
     per_sample: NDArray[np.float64]  # (n,) clean error of each
-    shown: NDArray[np.float64]  # (n,) the same where light above white counts as white, as a display shows it
-    units: tuple[Key, ...]  # (n,) what each is held out by: equal for those of one configuration
+    shown: NDArray[np.float64]  # (n,) the same with light above white cut to white, as a display shows it
+    units: tuple[Key, ...]  # (n,) by which each is held out: equal for those of one configuration
 
 
 WHITE = np.float32(1)
-"""Of a display, in exposed radiance."""
+"""The white of a display, in exposed radiance."""
+
+BLOCK = 8  # px
 
 NONE_COMPLETE = "none of the samples to measure on is complete at present; wait for the workers"
 
 WARM_ROUNDS, TIMED_ROUNDS = 2, 15
-"""Calls of each predictor, all by turns: what else the machine does then is the same for all of them."""
+"""The calls of each predictor, all by turns, so that other load on the machine affects all of them alike."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DevicePredictor:
-    """A `Predictor` whose images are made of a batch's inputs alone, on a device."""
+    """A `Predictor` that makes images on a device from a batch's inputs alone."""
 
     images: Callable[[Inputs], Tensor]  # (B, H, W, 3), linear radiance × exposure
     device: torch.device
 
     @torch.no_grad()
-    def __call__(self, batch: Batch) -> F32:
+    def __call__(self, batch: TrainingBatch) -> F32:
         """A batch's images."""
         images: F32 = self.images(self._there(batch.inputs)).cpu().numpy()
         return images
 
     def of_its_own(self, inputs: Inputs) -> Inputs:
-        """A copy of these inputs on its device, which outlives their batch."""
+        """A copy of these inputs on the predictor's device, which outlives their batch."""
         return map_tensors(lambda tensor: tensor.to(self.device, copy=True), inputs)
 
     def _there(self, inputs: Inputs) -> Inputs:
@@ -71,7 +73,7 @@ class DevicePredictor:
 
     @torch.no_grad()
     def wall_s(self, inputs: Inputs) -> float:
-        """Seconds that the images of these inputs take; they lie on the device, and results are left there."""
+        """The seconds to make the images of these inputs, which are on the device; the results are left there."""
         self._wait()
         began = time.perf_counter()
         self.images(inputs)
@@ -84,13 +86,13 @@ class DevicePredictor:
 
 
 def by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
-    """What each predictor's images of its inputs take, over `TIMED_ROUNDS` rounds of all; inputs are `of_its_own`."""
+    """The time of each predictor for its inputs, over `TIMED_ROUNDS` rounds of all; the inputs are `of_its_own`."""
     rounds = [[predict.wall_s(inputs) for predict, inputs in calls] for _ in range(WARM_ROUNDS + TIMED_ROUNDS)]
     return [Seconds.of(times) for times in np.array(rounds[WARM_ROUNDS:]).T]
 
 
-def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
-    """The rows as batches, read through the feed, in their order; without those that are not complete any more."""
+def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatch]:
+    """The rows as batches, read through the feed, in their order; without those that are no longer complete."""
     for start in range(0, len(rows), size):
         feed.ask(rows[start : start + size])
         if (batch := feed.take()).rows:
@@ -98,41 +100,51 @@ def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Batch]:
 
 
 def network_predictor(network: Network) -> DevicePredictor:
-    """The network's images, made where its parameters are."""
+    """The network as a predictor, on the device of its parameters."""
     return DevicePredictor(network, next(network.parameters()).device)
 
 
-def mean_colour(found: Iterator[Batch]) -> F32:
-    """The mean exposed colour over samples and pixels, (3,): what one predicts who knows nothing of the view."""
+def mean_colour(found: Iterator[TrainingBatch]) -> F32:
+    """The mean exposed colour over samples and pixels, (3,): the best prediction without any input."""
     means = [batch.target.double().mean(dim=(1, 2, 3)).numpy() for batch in found]
     colour: F32 = np.concatenate(means).mean(axis=0).astype(np.float32)
     return colour
 
 
 def constant_predictor(colour: F32) -> Predictor:
-    """The same colour everywhere."""
+    """A predictor of the same colour everywhere."""
     return lambda batch: np.broadcast_to(colour, batch.inputs.albedo.shape)
 
 
-def error_of(batch: Batch) -> Callable[[F32, F32, F32], float]:
-    """What takes the noise out of the error of a prediction for this batch, given A and B: by whether it has seen A."""
+def error_of(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
+    """The noise-free error of predictions for this batch, given A and B; the formula depends on whether A is input."""
     return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
 
 
 def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
-    """The error of images whose light above white counts as white.
+    """The error of means over blocks of `BLOCK` × `BLOCK` pixels, with light above white cut to white.
 
-    It is not unbiased, as noise above white is cut. But a lamp in view, hundreds of times brighter than what it lights,
-    is most of the error otherwise.
+    Without the cut a lamp in view, hundreds of times brighter than the surfaces it lights, makes up most of the error.
+    Means come before the cut, as noise above white would be cut as well: of single noisy pixels the cut makes the
+    targets so much darker that a network that is too dark looks better than the right one.
     """
-    prediction, half_a, half_b = (np.minimum(image, WHITE) for image in images)
+    prediction, half_a, half_b = (np.minimum(block_means(image), WHITE) for image in images)
     return error(prediction, half_a, half_b)
 
 
-def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
+def block_means(image: F32) -> F32:
+    """Means over blocks of pixels, (H, W, 3) → (⌈H/BLOCK⌉, ⌈W/BLOCK⌉, 3); blocks at the far edges may be smaller."""
+    sums, counts = image, np.ones((*image.shape[:2], 1), np.float32)
+    for axis in (0, 1):
+        starts = np.arange(0, image.shape[axis], BLOCK)
+        sums, counts = (np.add.reduceat(values, starts, axis=axis) for values in (sums, counts))
+    return (sums / counts).astype(np.float32)
+
+
+def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
 
-    Of a predictor that is given noisy colour, which is A's, mean f² − 2fB + AB.
+    For a predictor whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB.
 
     Raises IncompleteError if there is no sample.
     """
@@ -149,4 +161,4 @@ def measure(predict: Predictor, found: Iterator[Batch]) -> HeldOut:
         raise IncompleteError(NONE_COMPLETE)
     per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
-    return HeldOut(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))
+    return HeldOutErrors(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))

@@ -1,14 +1,14 @@
-"""Pixels that were not rendered, filled in from those that were, before a denoiser which expects whole images.
+"""Fills in pixels that were not rendered from those that were, for a denoiser which expects whole images.
 
 A normalised convolution [Knutsson and Westin, 1993] of demodulated colour. With kept pixels m ∈ {0, 1}, colour c, a
 Gaussian g, and a divisor d that is the albedo where a surface has one and 1 elsewhere, a dropped pixel p becomes
 
-    d(p) · Σ_q g(p − q) m(q) c(q) / Σ_q g(p − q) m(q) d(q)
+d(p) · Σ_q g(p − q) m(q) c(q) / Σ_q g(p − q) m(q) d(q)
 
-in each channel, over those q that have an albedo if p has one, and over the others if not. So what is light on a
-texture, c = d · E, comes out exact wherever E is constant, and so does a constant image of a constant albedo; a lamp,
-whose albedo is 0, does not run into the wall beside it. A ratio of sums instead of a mean of ratios: dark surfaces,
-whose ratios are noisiest, count the least. Kept pixels stay as they are.
+in each channel, over those q that have an albedo if p has one, and over the others if not. So light on a texture,
+c = d · E, is reproduced exactly wherever E is constant, and so is a constant image of a constant albedo; a lamp, whose
+albedo is 0, does not bleed into the wall beside it. It is a ratio of sums instead of a mean of ratios: dark surfaces,
+whose ratios are noisiest, count the least. Kept pixels do not change.
 
 Shape letters: B batch, H W image.
 """
@@ -24,20 +24,20 @@ from torch.nn import functional
 from photonfarm.trainer.networks.inputs import NoisyColour
 
 LEAST_ALBEDO = 0.01
-"""Below it a channel counts as having no albedo: lamps, mirrors, glass, and what the sky shows."""
+"""The albedo below which a channel counts as having none: lamps, mirrors, glass, and the sky."""
 
 SPREAD = 0.6
 """σ of the Gaussian over the mean distance √k between kept pixels; on `room` 0.5 … 0.75 do better than 0.35 or 1."""
 
 REACH = 3
-"""Where the Gaussian is cut off, in σ."""
+"""The radius at which the Gaussian is cut off, in σ."""
 
 
 def fill_in(noisy: NoisyColour, albedo: Tensor) -> Tensor:
     """Whole images, (B, H, W, 3), linear radiance × exposure, from the kept pixels and the albedo, (B, H, W, 3).
 
-    A pixel with no kept one of its kind in reach takes a wider Gaussian, and if the image has none of its kind, all of
-    them; an image of which nothing was kept stays black.
+    A pixel without a kept one of its kind in reach takes a wider Gaussian, and if the image has none of its kind, all
+    of them; an image without kept pixels stays black.
     """
     kept = noisy.kept[..., None].to(noisy.colour)
     has_albedo = albedo >= LEAST_ALBEDO
@@ -56,7 +56,7 @@ def fill_in(noisy: NoisyColour, albedo: Tensor) -> Tensor:
 def _filled(
     image: Tensor, wanted: Tensor, open_: Tensor, colour: Tensor, weight: Tensor, divisor: Tensor, sigma: float
 ) -> tuple[Tensor, Tensor]:
-    """The image with what is wanted filled in as far as kept pixels reach, and what is still open; (B, H, W, 3) all."""
+    """The image with the wanted pixels filled in as far as kept ones reach, and those still open; (B, H, W, 3) all."""
     if not bool(wanted.any()):
         return image, open_
     light, surface = (_blurred(weight * values, sigma) for values in (colour, divisor))
@@ -65,7 +65,7 @@ def _filled(
 
 
 def _blurred(image: Tensor, sigma: float) -> Tensor:
-    """The sum over a Gaussian window around each pixel, (B, H, W, 3); beyond the border there is nothing."""
+    """The sum over a Gaussian window around each pixel, (B, H, W, 3); zero beyond the border."""
     reach = math.ceil(REACH * sigma)
     window = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(image) / sigma) ** 2)
     planes = image.movedim(-1, 1).flatten(0, 1)[:, None]  # (3 B, 1, H, W)

@@ -1,7 +1,7 @@
-"""`photonfarm infer`: what a trained network shows of a sample, or of a camera path.
+"""`photonfarm infer`: a trained network's image of a sample, or of a camera path.
 
 The views of a path are in no store, and their buffers come from the renderer: from a file that `photonfarm buffers`
-wrote, or from that verb, run as a process of its own where it is installed.
+wrote, or from that verb, run as a process of its own if it is installed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.trainer.data.dataset import Batch, fill, fill_photons, rows_held_out
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import given
@@ -38,8 +38,8 @@ NOT_JUDGED = "was trained on (it is not held out), so no error is told: the netw
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
-    """What was written, and how good it is or how fast it went."""
+class InferResult:
+    """The files that were written, and a sentence on the error or the time."""
 
     files: tuple[Path, ...]
     sentence: str
@@ -61,7 +61,7 @@ def find_row(store: str | Path, run: TrainedRun, modification: str | None, view:
     return row
 
 
-def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> Written:
+def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> InferResult:
     """Write prediction.png and target.png, the mean of both noisy halves, of one sample; StoreError without it."""
     torch.set_num_threads(run.settings.threads)
     source = _source(store, run)
@@ -77,7 +77,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     for file, pixels in zip(files, shown.values(), strict=True):
         animation.write_png(animation.enlarged(pixels), file)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
-    return Written(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
+    return InferResult(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
 
 
 def _missing(source: StoreSource, row: int) -> str:
@@ -87,7 +87,7 @@ def _missing(source: StoreSource, row: int) -> str:
     return f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers"
 
 
-def _judged(image: F32, batch: Batch) -> str:
+def _judged(image: F32, batch: TrainingBatch) -> str:
     half_a, half_b = batch.target[0].numpy()
     return f"held out; squared error {error_of(batch)(image, half_a, half_b):.5f}, the noise taken out"
 
@@ -96,9 +96,9 @@ def _judged(image: F32, batch: Batch) -> str:
 
 
 def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
-    """What `photonfarm buffers` makes of the arguments, such as --orbit 24, for the scene of the run.
+    """The frames that `photonfarm buffers` makes for the arguments, such as --orbit 24, and the scene of the run.
 
-    Raises SpecError where the verb is not installed, PhotonfarmError with its exit code where it failed.
+    Raises SpecError if the verb is not installed, PhotonfarmError with its exit code if it failed.
     """
     if not is_installed(VERB):
         raise SpecError(
@@ -115,7 +115,7 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
 
 
 def _ended(code: int) -> PhotonfarmError:
-    """An error with the exit code of the verb, which has said why."""
+    """An error with the exit code of the verb, which has printed the reason."""
     error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
     error.exit_code = code
     return error
@@ -123,7 +123,7 @@ def _ended(code: int) -> PhotonfarmError:
 
 def show_frames(
     store: str | Path, run: TrainedRun, frames: Frames, out: Path, *, fps: float = 12.0, device: str = "auto"
-) -> Written:
+) -> InferResult:
     """Write the network's images of all frames: frame-0000.png …, path.gif, and path.mp4 where that can be made.
 
     Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
@@ -145,9 +145,9 @@ def show_frames(
     animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
     if not animation.can_write_mp4():
         sentence += "; no MP4: pip install photonfarm-trainer[video]"
-        return Written((*files, out / "path.gif"), sentence)
+        return InferResult((*files, out / "path.gif"), sentence)
     animation.write_mp4(map(animation.read_png, files), out / "path.mp4", fps)
-    return Written((*files, out / "path.gif", out / "path.mp4"), sentence)
+    return InferResult((*files, out / "path.gif", out / "path.mp4"), sentence)
 
 
 def check_path(run: TrainedRun) -> None:
@@ -178,7 +178,7 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Unrendered:
-    """A frame as a sample whose image nobody rendered."""
+    """A frame in the form of a sample, without a rendered image."""
 
     modification: Modification
     view: View
@@ -190,10 +190,10 @@ class _Unrendered:
     pass_: int = 0
 
 
-def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[Batch]:
-    """The frames one by one, in memory that is used again."""
+def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[TrainingBatch]:
+    """The frames one by one, in memory that is reused."""
     points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
-    memory = Batch.empty(1, points, spec, run.needs)
+    memory = TrainingBatch.empty(1, points, spec, run.needs)
     if memory.inputs.photons is not None:
         fill_photons(memory.inputs.photons, 0, given(frames.photons))
     black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
@@ -206,7 +206,7 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
 
 
 def _source(store: str | Path, run: TrainedRun) -> StoreSource:
-    """The samples of the run's scene; StoreError where there is no store."""
+    """The samples of the run's scene; StoreError if there is no store."""
     return StoreSource(Store(store).root, run.scene_id)
 
 

@@ -1,7 +1,7 @@
-"""The denoiser that nobody trained on this scene: Intel's Open Image Denoise, on what a trained one is given.
+"""A denoiser that was not trained on the scene: Intel's Open Image Denoise, with the inputs of a trained one.
 
 It takes colour, albedo and normals of one image, and its weights are part of the package `pyoidn` (the extra `oidn`),
-whose binding has the flag for HDR. Pixels that were dropped are filled in first. Shape letters: B batch, H W image.
+whose binding has the flag for HDR. Dropped pixels are filled in first. Shape letters: B batch, H W image.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ PACKAGE = "pyoidn"
 class Oidn:
     """Whole images from the kept pixels of half A, for a `DevicePredictor` that has `Needs(points=False, kept=k)`.
 
-    On the CPU, so that images do not depend on the machine's GPU. Not for several threads at once.
+    It runs on the CPU, so that images do not depend on the machine's GPU. It is not thread-safe.
     """
 
     def __init__(self, threads: int = 1) -> None:
-        """Load it. Raises SpecError where the package is not installed or does not work here."""
+        """Load the library. Raises SpecError if the package is not installed or does not work here."""
         self._oidn = _package()
         self._device = self._oidn.Device(self._oidn.OIDN_DEVICE_TYPE_CPU)
         self._device.set_int("numThreads", threads)
@@ -44,7 +44,7 @@ class Oidn:
         return torch.from_numpy(np.stack([self.denoised(*image) for image in images]))
 
     def denoised(self, colour: F32, albedo: F32, normal: F32) -> F32:
-        """One image, (H, W, 3) each. Albedo and normals are taken as free of noise, which ours are."""
+        """One denoised image, (H, W, 3) each. Albedo and normals are taken as free of noise, which ours are."""
         result = np.empty_like(colour, order="C")
         named = {"color": colour, "albedo": np.clip(albedo, 0, 1), "normal": normal, "output": result}
         images = {name: np.ascontiguousarray(image) for name, image in named.items()}  # must live until it has run
@@ -69,7 +69,7 @@ class Oidn:
 def _package() -> ModuleType:
     try:
         return import_module(PACKAGE)
-    except (ImportError, OSError) as error:  # the latter where its library cannot be loaded
+    except (ImportError, OSError) as error:  # the latter if its library cannot be loaded
         raise SpecError(
             f"the denoiser oidn: needs the package {PACKAGE}, which cannot be imported ({error}); "
             "pip install photonfarm-trainer[oidn]"

@@ -1,4 +1,4 @@
-"""A training run as those see it who come after the training: its settings, its scene, its network."""
+"""A training run after its training: its settings, its scene, its network."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class TrainedRun:
     folder: Path
     settings: TrainSettings
     scene_id: str
-    weights: dict[str, Any]  # by which it predicts: averaged over its steps, where it was trained so
+    weights: dict[str, Any]  # that predict: averaged over its steps, if the run averages
 
     @classmethod
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
-        """The run with the weights of the checkpoint of this name, the last one that was written unless told otherwise.
+        """The run with the weights of the checkpoint of this name, by default the last one.
 
         Raises SpecError if the folder is not a run, or its settings are not those of the checkpoint; StoreError without
         a readable checkpoint.
         """
         settings, state = read_settings(folder), checkpoint.load(folder / name)
-        said = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
-        checkpoint.check_continues(folder / name, state, said)
+        identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
+        checkpoint.check_continues(folder / name, state, identity)
         weights = average["weights"] if (average := state.get("average")) else state["network"]
         return cls(folder, settings, str(state["scene_id"]), weights)
 
@@ -51,16 +51,16 @@ class TrainedRun:
 
     @property
     def name(self) -> str:
-        """Architecture, and the folder where that says more; of an absolute path its last part."""
+        """The architecture, and the folder if its name adds something; of an absolute path its last part."""
         architecture, folder = self.settings.network.architecture, self.folder
-        said = folder.name if folder.is_absolute() else str(folder)
-        return architecture if said == architecture else f"{architecture} ({said})"
+        name = folder.name if folder.is_absolute() else str(folder)
+        return architecture if name == architecture else f"{architecture} ({name})"
 
     @property
     def needs(self) -> Needs:
-        """What its network reads."""
+        """The inputs of its network."""
         return kind_of(self.settings.network.architecture).needs
 
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
-        """The network's images, made on a device. SpecError where that is not usable."""
+        """The network as a predictor on a device. SpecError if the device is not usable."""
         return network_predictor(self.network(spec, base).to(usable_device(device)).eval())

@@ -1,4 +1,4 @@
-"""Denoisers that nobody trained on the scene, beside the trained ones: what they are given is the same."""
+"""Denoisers that were not trained on the scene; they get the same inputs as the trained ones."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from photonfarm.trainer.runs.settings import TrainSettings, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True)
-class Untrained:
-    """What is made of one of `kept` pixels of half A."""
+class UntrainedPredictor:
+    """A denoiser that is given one of `kept` pixels of half A."""
 
     denoiser: UntrainedDenoiser
     kept: int
-    settings: TrainSettings  # by which samples are read
+    settings: TrainSettings  # for reading samples
 
     @property
     def name(self) -> str:
-        """Such as "oidn 1/4"."""
+        """A name such as "oidn 1/4"."""
         return f"{self.denoiser} 1/{self.kept}"
 
     @property
     def needs(self) -> Needs:
-        """Noisy colour, beside the buffers."""
+        """The noisy colour, beside the buffers."""
         return Needs(points=False, kept=self.kept)
 
     def predictor(self, *_: object) -> DevicePredictor:
-        """On the CPU, whatever the scene and the device. Raises SpecError where a package is missing."""
+        """The predictor, on the CPU, whatever the scene and the device. Raises SpecError if a package is missing."""
         return DevicePredictor(self._images(), torch.device("cpu"))
 
     def _images(self) -> Callable[[Inputs], Tensor]:

@@ -1,6 +1,6 @@
 """The report of one or several runs on one store: report.html, report.md and report.json.
 
-The page holds its pictures and plots; the Markdown has them beside it.
+The HTML contains its pictures and plots; the Markdown has them in files beside it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from photonfarm.shared.core.errors import store_errors
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluate import Tell
+from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
@@ -34,22 +34,22 @@ def write_report(
     inception: Path | None = None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     timed: bool = True,
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
 
-    Runs, and denoisers of one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder is
-    not a run or what is asked for cannot be compared, StoreError without a readable checkpoint or store or if `out`
-    cannot be written, IncompleteError if nothing is held out.
+    Runs, and denoisers given one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder
+    is not a run or the runs cannot be compared, StoreError without a readable checkpoint or store or if `out` cannot be
+    written, IncompleteError if nothing is held out.
     """
     loaded = [TrainedRun.load(run) for run in runs]
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()  # what cannot be written should not be measured first
+        tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
     contents = gathered(
         store, loaded, denoisers, references=references, inception=inception, most=most,
-        device=device, tell=tell, timed=timed,
+        device=device, on_progress=on_progress, timed=timed,
     )  # fmt: skip
     text, drawn = json.dumps(contents.document(), indent=2, ensure_ascii=False), plots(contents)
     with store_errors("write the report", out):

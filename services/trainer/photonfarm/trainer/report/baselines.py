@@ -1,4 +1,4 @@
-"""What an error is measured by who knows nothing: the mean colour, and the network before its first step."""
+"""Baselines for errors: the mean colour, and the network before its first step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.trainer.data.dataset import SampleSource
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predict.evaluation import (
-    HeldOut,
+    HeldOutErrors,
     batches,
     constant_predictor,
     mean_colour,
@@ -23,15 +23,15 @@ MOST_TRAINING = 1024  # samples to take the mean colour of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gauges:
+class Baselines:
     """Errors to compare with, in linear radiance × exposure, the targets' noise removed."""
 
-    mean_colour: HeldOut  # of the training samples, everywhere
-    untrained: HeldOut  # the first run's network before its first step
+    mean_colour: HeldOutErrors  # of the training samples, everywhere
+    untrained: HeldOutErrors  # the first run's network before its first step
 
     @classmethod
-    def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Gauges:
-        """On some held-out samples of a run; raises IncompleteError without samples to take the colour of."""
+    def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Baselines:
+        """Measure both on some held-out samples of a run; raises IncompleteError without samples for the colour."""
         settings = run.settings.model_copy(update={"device": "cpu"})
         with Feed(source, settings, needs=run.needs) as feed:
             arrived, _ = feed.arrivals()

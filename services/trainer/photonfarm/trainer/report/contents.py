@@ -1,4 +1,4 @@
-"""All that a report says, gathered once for its page, its Markdown and its JSON."""
+"""The contents of a report, gathered once for its page, its Markdown and its JSON."""
 
 from __future__ import annotations
 
@@ -12,50 +12,50 @@ import numpy as np
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, Row, Tell
+from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
-from photonfarm.trainer.report.baselines import Gauges
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
+from photonfarm.trainer.report.baselines import Baselines
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
 from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
-from photonfarm.trainer.report.worst_cases import View, WorstCase, worst_cases
+from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, worst_cases
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entry:
+class ReportEntry:
     """A row of the report's tables."""
 
     name: str
-    architecture: str | None  # of a network; None for a denoiser that nobody trained
-    row: Row
-    time: FrameTime | None  # None where the renderer is not installed
+    architecture: str | None  # of a network; None for an untrained denoiser
+    row: PredictorRow
+    time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contents:
-    """A report: the data, the runs, what their networks are worth, and where the first of them fails."""
+class ReportContents:
+    """A report: the data, the runs, the errors of their networks, and the worst cases of the first one."""
 
     card: DatasetCard
     stories: tuple[RunStory, ...]
-    gauges: Gauges
+    gauges: Baselines
     evaluation: Evaluation
-    entries: tuple[Entry, ...]
+    entries: tuple[ReportEntry, ...]
     costs: FrameCosts | None
     untimed: str  # why there are no costs
-    machine: Machine  # that times were taken on
+    machine: Machine  # on which times were taken
     worst: tuple[WorstCase, ...]
-    published: str | None  # which of the paper's tables stands beside ours
+    published: str | None  # the name of the paper's table beside ours
 
     @property
-    def measure(self) -> Entry:
-        """The entry that times are ratios of: light_transport, or else the first."""
+    def measure(self) -> ReportEntry:
+        """The entry that ratios of times refer to: light_transport, or else the first."""
         return next((entry for entry in self.entries if entry.architecture == "light_transport"), self.entries[0])
 
     def document(self) -> dict[str, Any]:
@@ -90,25 +90,25 @@ def gathered(
     inception: Path | None,
     most: int = MOST_HELD_OUT,
     device: str = "auto",
-    tell: Tell | None = None,
+    on_progress: MeasureProgress | None = None,
     timed: bool = True,
-) -> Contents:
-    """Measure everything, without the times of frames where they are not wanted. Raises what `compare` raises."""
+) -> ReportContents:
+    """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), timed=timed)
     evaluation = evaluate.compare(
-        store, runs, denoisers, references=references, inception=inception, most=most, device=device, tell=tell,
-        choose=close_look,
+        store, runs, denoisers, references=references, inception=inception, most=most, device=device,
+        on_progress=on_progress, choose=close_look,
     )  # fmt: skip
     costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
-    return Contents(
+    return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        gauges=Gauges.of(StoreSource(store, first.scene_id), first, evaluation.measured),
+        gauges=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
@@ -125,24 +125,24 @@ def _entries(
     measured: tuple[Sequence[TrainedRun], Sequence[tuple[UntrainedDenoiser, int]]],
     costs: FrameCosts | None,
     table: Mapping[str, Published],
-) -> list[Entry]:
+) -> list[ReportEntry]:
     runs, denoisers = measured
-    untrained = [Untrained(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | Untrained] = [*runs, *untrained]
+    untrained = [UntrainedPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
+    predictors: list[TrainedRun | UntrainedPredictor] = [*runs, *untrained]
     entries = []
     for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
         name, architecture = row.name, None
         if isinstance(predictor, TrainedRun):
             name, architecture = names[place], predictor.settings.network.architecture
         time = None if costs is None else frame_time(predictor, row.seconds, costs)
-        entries.append(Entry(name, architecture, row, time, table.get(architecture or "")))
+        entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return entries
 
 
 class _CloseLook:
-    """What is measured of single frames once the first network has made its images: their costs, and the worst cases.
+    """Measures single frames once the first network has made its images: their costs, and the worst cases.
 
-    Called as `evaluate.Choose`, right after networks have been timed, it names the worst cases' rows.
+    It is called as `evaluate.Choose`, right after networks have been timed, and returns the worst cases' rows.
     """
 
     def __init__(
@@ -163,8 +163,8 @@ class _CloseLook:
         self.worst = worst_cases(self._views(images, references))
         return [case.row for case in self.worst]
 
-    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[View]:
-        """The views that have references, with the images that the first network made of them."""
+    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
+        """The views that have references, with the first network's images of them."""
         source = StoreSource(self._store, self._scene_id)
         source.refresh()
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
@@ -173,5 +173,5 @@ class _CloseLook:
             (sample,) = source.read_batch([row])
             read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
             a, b = references[row].half_a, references[row].half_b
-            views.append(View(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
+            views.append(HeldOutView(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
         return sorted(views, key=lambda view: view.row)

@@ -1,4 +1,4 @@
-"""What the data are that a network was trained on: their scene, what they cost, and how they can be made again."""
+"""The data that a network was trained on: their scene, their cost, and how to make them again."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStatus, SceneStore, Store, store_status
 
 SAMPLES = "samples"
-"""The kind of plans whose rows are of new views; others add passes to these, which take no photons and no buffers."""
+"""The kind of plans whose rows are of new views; others add passes to these, which need no photons and no buffers."""
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
-    """What plans of one kind of request came to."""
+class PlanTotals:
+    """The totals of the plans of one kind of request."""
 
     planned: int  # rows
     rows: int  # of committed jobs
@@ -26,14 +26,14 @@ class Spent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DatasetCard:
-    """A scene of a store, as its plans and markers tell."""
+    """A scene of a store, described by its plans and markers."""
 
     spec: SceneSpec
     status: SceneStatus
-    requests: tuple[dict[str, Any], ...]  # of each plan: all that its rows follow from
-    versions: dict[str, list[str]]  # of the packages that rendered, each with all that took part
-    workers: int  # how many took part
-    spent: dict[str, Spent]  # by the kind of request that the plans are of; those without a committed job left out
+    requests: tuple[dict[str, Any], ...]  # of each plan: all rows follow from them
+    versions: dict[str, list[str]]  # of the packages that rendered, each with all versions
+    workers: int  # the number of workers
+    spent: dict[str, PlanTotals]  # by the kind of the plans' requests; without kinds that have no committed job
 
     @classmethod
     def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
@@ -47,9 +47,9 @@ class DatasetCard:
         workers = set()
         core_s: dict[int, float] = {}
         committed, guided = scene.committed_jobs(), scene.guides.committed_jobs()
-        told = [(job, scene.marker(job)) for job in sorted(committed)]
-        told += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
-        for job, marker in told:
+        marked = [(job, scene.marker(job)) for job in sorted(committed)]
+        marked += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
+        for job, marker in marked:
             figures = marker["figures"]
             core_s[job] = core_s.get(job, 0.0) + figures["core_s"]
             workers.add(figures["worker"])
@@ -60,23 +60,23 @@ class DatasetCard:
         return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
 
     @property
-    def samples(self) -> Spent:
-        """Rows of new views: what networks are trained on, but for those that are held out."""
-        return self.spent.get(SAMPLES, Spent(0, 0, 0.0))
+    def samples(self) -> PlanTotals:
+        """The rows of new views: the samples that networks are trained on, except held-out ones."""
+        return self.spent.get(SAMPLES, PlanTotals(0, 0, 0.0))
 
     @property
-    def further_passes(self) -> Spent:
-        """Rows that add passes to views, such as for references."""
+    def further_passes(self) -> PlanTotals:
+        """The rows that add passes to views, such as for references."""
         others = [spent for kind, spent in self.spent.items() if kind != SAMPLES]
-        return Spent(*(sum(getattr(spent, name) for spent in others) for name in Spent.__slots__))
+        return PlanTotals(*(sum(getattr(spent, name) for spent in others) for name in PlanTotals.__slots__))
 
     @property
     def core_s_per_sample(self) -> float:
-        """Processor time of a sample of a new view, buffers, guides and photons included; 0 without one."""
+        """The processor time of a sample of a new view, with buffers, guides and photons; 0 without one."""
         return self.samples.core_s / self.samples.rows if self.samples.rows else 0.0
 
     def document(self) -> dict[str, Any]:
-        """What report.json says of it."""
+        """Its part of report.json."""
         spec, status = self.spec, self.status
         return {
             "scene": spec.name,
@@ -107,14 +107,14 @@ class DatasetCard:
         }
 
 
-def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, Spent]:
-    """By kind of request, from the seconds of the committed jobs."""
-    found: dict[str, Spent] = {}
+def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
+    """The totals by kind of request, given the seconds of the committed jobs."""
+    found: dict[str, PlanTotals] = {}
     for plan in scene.plans():
         used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
         done = [job for job in range(plan.first_job, plan.end_job) if job in core_s]
-        before = found.get(plan.request.kind, Spent(0, 0, 0.0))
-        found[plan.request.kind] = Spent(
+        before = found.get(plan.request.kind, PlanTotals(0, 0, 0.0))
+        found[plan.request.kind] = PlanTotals(
             before.planned + plan.samples,
             before.rows + sum(int(used[job - plan.first_job]) for job in done),
             before.core_s + sum(core_s[job] for job in done),
@@ -123,7 +123,7 @@ def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, Spent]:
 
 
 def kind(spec: SceneSpec) -> str:
-    """What may change in a scene, in words."""
+    """The variable parts of a scene, in words."""
     if not spec.groups:
         return "static: views alone differ"
     movable = [

@@ -1,6 +1,6 @@
-"""What a frame costs from the scene to the image, on one machine in one run: rendering, buffers, points, network.
+"""The cost of a frame from the scene to the image, on one machine in one run: rendering, buffers, points, network.
 
-The parts that a renderer makes are measured by its verb, in a process of its own; the network by `evaluation`.
+The renderer's verb measures its parts, in a process of its own; `evaluation` measures the network.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import Untrained
+from photonfarm.trainer.predict.untrained import UntrainedPredictor
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
@@ -23,30 +23,30 @@ TIMED = 15  # frames
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """Wall seconds of one frame, by parts; None for what a predictor does not need.
+    """Wall seconds of one frame, by parts; None for parts that a predictor does not need.
 
-    Editing the scene is not in it, which all do alike.
+    Editing the scene is left out, as it costs all the same.
     """
 
     render: Seconds | None  # of half A, at 1/k of the pixels
     buffers: Seconds  # depth, albedo, normal
-    guides: Seconds | None  # what is known of the view beside them, direct light above all
+    guides: Seconds | None  # the guides of the view, mainly direct light
     points: Seconds | None  # which points of the cloud the view sees
     photons: Seconds | None  # tracing them, and which the view sees
     network: Seconds
 
     @property
     def parts(self) -> dict[str, Seconds | None]:
-        """By their names, in the order in which they are made."""
+        """The parts by their names, in the order in which they are made."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def total(self) -> float:
-        """Of the whole frame: the medians together."""
+        """The time of the whole frame: the sum of the medians."""
         return sum(part.median for part in self.parts.values() if part)
 
     def document(self) -> dict[str, Any]:
-        """What report.json says: medians, 0 for what is not needed, and the range of each part that is."""
+        """Its part of report.json: medians, 0 for unneeded parts, and the range of each part."""
         medians = {name: part.median if part else 0.0 for name, part in self.parts.items()}
         ranges = {name: [part.low, part.high] for name, part in self.parts.items() if part}
         return {**medians, "total": self.total, "ranges": ranges}
@@ -55,9 +55,9 @@ class FrameTime:
 def measured_costs(
     store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int], points: int | None
 ) -> FrameCosts | str:
-    """What the renderer measures of the frames in some rows, with so many points of the cloud, or with all.
+    """The renderer's measurement of the frames in some rows, with so many points of the cloud, or with all.
 
-    Or why it does not: what it said stands on stderr.
+    Or the reason why there is none; the renderer's own messages go to stderr.
     """
     if not is_installed(VERB):
         return "the renderer, which makes buffers and photons, is not installed here"
@@ -73,12 +73,12 @@ def measured_costs(
 
 
 def points_used(runs: Sequence[TrainedRun]) -> int | None:
-    """The most points that a network of these has to know the visibility of; None for all of the cloud."""
+    """The most points whose visibility one of these networks needs; None for the whole cloud."""
     used = [run.settings.network.points for run in runs if _sees_points(run)]
     return None if None in used else max((points for points in used if points), default=None)
 
 
-def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: FrameCosts) -> FrameTime:
+def frame_time(predictor: TrainedRun | UntrainedPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
     return FrameTime(
@@ -91,6 +91,6 @@ def frame_time(predictor: TrainedRun | Untrained, network: Seconds, costs: Frame
     )
 
 
-def _sees_points(predictor: TrainedRun | Untrained) -> bool:
+def _sees_points(predictor: TrainedRun | UntrainedPredictor) -> bool:
     projects = predictor.needs.points and not predictor.needs.guides  # lit points are summed over, seen or not
     return projects and predictor.settings.network.occlusion == "exact"

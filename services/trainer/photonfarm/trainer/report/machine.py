@@ -13,21 +13,21 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What times depend on beside the program."""
+    """The properties of a machine that times depend on."""
 
-    cpu: str | None  # its model, where the system tells
+    cpu: str | None  # its model, if the system states it
     cores: int
     architecture: str
     load_average: tuple[float, float, float]  # processes that ran or waited to, in the last 1, 5 and 15 minutes
 
     @classmethod
     def here(cls) -> Machine:
-        """That of this process, as busy as it is now."""
+        """The machine of this process, with its present load."""
         return cls(_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
 
     @property
     def stated(self) -> str:
-        """In words, all on one line."""
+        """The machine in words, on one line."""
         load = ", ".join(f"{average:.1f}" for average in self.load_average)
         return (
             f"{self.cpu or 'a CPU of unknown model'}, {self.cores} cores, {self.architecture}; load average {load} "

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from photonfarm.trainer.compare.markdown import markdown_table
-from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
 
 
-def markdown(contents: Contents, drawn: list[Plot], pictures: str) -> str:
+def markdown(contents: ReportContents, drawn: list[Plot], pictures: str) -> str:
     """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
     first, *others = tables(contents)
     card = "\n".join(f"- **{name}**: {value}" for name, value in facts(contents))
@@ -24,9 +24,9 @@ def markdown(contents: Contents, drawn: list[Plot], pictures: str) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def _plots(title: str, said: str, drawn: list[Plot]) -> str:
+def _plots(title: str, explanation: str, drawn: list[Plot]) -> str:
     images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
-    return f"## {title}\n\n{said}\n\n{images}"
+    return f"## {title}\n\n{explanation}\n\n{images}"
 
 
 def _table(table: Table) -> str:

@@ -1,4 +1,4 @@
-"""Held-out views in a report: the target, each predictor's image, and where it is wrong [supplement Figs. 6 to 8]."""
+"""Held-out views in a report: the target, each predictor's image, and its errors [supplement Figs. 6 to 8]."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from photonfarm.shared.core.pictures import Picture, display, display_values
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.evaluation_samples import Target
-from photonfarm.trainer.report.contents import Contents
+from photonfarm.trainer.report.contents import ReportContents
 
 OVERVIEW = "overview.png"
 OVERVIEW_WIDTH = 192  # px, at least, of each picture of it
@@ -45,8 +45,8 @@ class Panel:
     picture: Picture
 
 
-def rows(contents: Contents) -> list[list[Panel]]:
-    """What went in, what came out, what is right, and the difference: of the first entry, by view, best first."""
+def rows(contents: ReportContents) -> list[list[Panel]]:
+    """Rows of pictures: the first entry's input, output, target and difference, one row for each view, best first."""
     entry = contents.entries[0]
     there = [target for target in contents.evaluation.shown if target.row in entry.row.shown]
     made = [(_shown(entry.name, entry.row.shown[target.row], target.image), target) for target in there]
@@ -54,28 +54,28 @@ def rows(contents: Contents) -> list[list[Panel]]:
     return [_panels(contents, shown, target) for shown, target in made]
 
 
-def first_row(contents: Contents) -> list[Panel]:
-    """The panels of the view whose error is the median of those that are shown; none where none was measured."""
+def first_row(contents: ReportContents) -> list[Panel]:
+    """The panels of the view whose error is the median of the shown ones; none if none was measured."""
     found = rows(contents)
     return found[(len(found) - 1) // 2] if found else []
 
 
-def overview(contents: Contents) -> Picture:
-    """All rows as one picture without words, each pixel drawn as several."""
+def overview(contents: ReportContents) -> Picture:
+    """All rows as one picture without text, each pixel enlarged."""
     lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in rows(contents)]
     sheet: Picture = np.concatenate(lines)
     return sheet[:-GAP, :-GAP]
 
 
 def _framed(picture: Picture) -> Picture:
-    """The picture at a size to be looked at, with a white margin to the right and below."""
+    """The picture enlarged, with a white margin to the right and below."""
     scale = max(1, -(-OVERVIEW_WIDTH // picture.shape[1]))
     large = picture.repeat(scale, axis=0).repeat(scale, axis=1)
     framed: Picture = np.pad(large, ((0, GAP), (0, GAP), (0, 0)), constant_values=255)
     return framed
 
 
-def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
+def _panels(contents: ReportContents, shown: Shown, target: Target) -> list[Panel]:
     right = f"reference, {target.spp} samples per pixel" if target.is_reference else "mean of both noisy halves"
     half_spp = contents.card.spec.transport.half_spp
     return [
@@ -86,13 +86,13 @@ def _panels(contents: Contents, shown: Shown, target: Target) -> list[Panel]:
     ]
 
 
-def cases(contents: Contents) -> list[Case]:
-    """Some views as they come, then the worst."""
+def cases(contents: ReportContents) -> list[Case]:
+    """The first views, then the worst ones."""
     return [_case(contents, target) for target in contents.evaluation.shown]
 
 
-def legend_of_cases(contents: Contents) -> str:
-    """What the pictures show, in sentences."""
+def legend_of_cases(contents: ReportContents) -> str:
+    """The legend of the pictures, in sentences."""
     others = "" if not contents.worst else f", then the worst cases of {contents.entries[0].name}, found automatically"
     return (
         "Shown as clip(exposure · I, 0, 1)^(1/2.2); below each image its difference to the target, from black (0) over "
@@ -101,7 +101,7 @@ def legend_of_cases(contents: Contents) -> str:
     )
 
 
-def _case(contents: Contents, target: Target) -> Case:
+def _case(contents: ReportContents, target: Target) -> Case:
     kinds = [f"worst of {case.kind}" for case in contents.worst if case.row == target.row]
     what = "reference" if target.is_reference else "noisy target"
     caption = f"row {target.row}{''.join(f', {kind}' for kind in kinds)}; {what} of {target.spp} samples per pixel"

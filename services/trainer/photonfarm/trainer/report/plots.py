@@ -1,4 +1,4 @@
-"""The plots of a report, as SVG: error over what was spent on it, and over the time of a frame [supplement Fig. 5]."""
+"""The plots of a report, as SVG: error over its cost, and over the time of a frame [supplement Fig. 5]."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.report.contents import Contents, Entry
-from photonfarm.trainer.report.trained_runs import Point, RunStory
+from photonfarm.trainer.report.contents import ReportContents, ReportEntry
+from photonfarm.trainer.report.trained_runs import CurvePoint, RunStory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,12 +37,12 @@ COLOURS = (
     "#1f5fa8", "#c2571a", "#3b8f4d", "#8a4fa3", "#8c6d31", "#777777", "#d62728", "#17a2b8", "#e377c2", "#a6a61a",
     "#111111", "#8fbcff",
 )  # fmt: skip
-"""Of the predictors, by their places in the tables: each has its own in all plots; beyond twelve they come again."""
+"""The colours of the predictors, by their places in the tables, in all plots; they repeat beyond twelve."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot, and what it shows in words."""
+    """A plot, and its content in words."""
 
     name: str  # of its file
     about: str
@@ -50,7 +50,7 @@ class Plot:
 
 
 CURVES, TIMES = "curve-", "time-"
-"""How the names of both kinds of plots begin."""
+"""The beginnings of the names of both kinds of plots."""
 
 OF_CURVES = (
     "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
@@ -59,14 +59,14 @@ OF_CURVES = (
 
 
 def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
-    """Title, a sentence on how they are read, and plots of each kind that there are any of."""
+    """The title, an explanation, and the plots of each kind, without empty kinds."""
     kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
-    found = [(title, said, [plot for plot in drawn if plot.name.startswith(kind)]) for title, said, kind in kinds]
+    found = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
     return [each for each in found if each[2]]
 
 
-def plots(contents: Contents) -> list[Plot]:
-    """Learning curves, then each metric over the time of a frame where that is known."""
+def plots(contents: ReportContents) -> list[Plot]:
+    """Learning curves, then each metric over the time of a frame if that is known."""
     return [*_curves(contents), *_over_time(contents)]
 
 
@@ -88,10 +88,10 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
 # -------------------------------------------------------------------------------------------------------------- curves
 
 
-def _curves(contents: Contents) -> Iterator[Plot]:
+def _curves(contents: ReportContents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
-    axes: tuple[tuple[str, str, Callable[[RunStory, Point], float]], ...] = (
+    axes: tuple[tuple[str, str, Callable[[RunStory, CurvePoint], float]], ...] = (
         ("samples", "samples drawn, repeats counted", lambda _, point: point.draws),
         ("rendering", "core-seconds of rendering", lambda _, point: point.core_s(per_sample)),
         (
@@ -101,12 +101,12 @@ def _curves(contents: Contents) -> Iterator[Plot]:
     )  # fmt: skip
     for name, label, x in axes:
         if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
-            continue  # all was rendered before much was learned
+            continue  # everything was rendered before the first validation
         about = f"Held-out error over {label}"
         yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
 
 
-def _curve(axes: Axes, contents: Contents, x: Callable[[RunStory, Point], float], label: str) -> None:
+def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoint], float], label: str) -> None:
     for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
         places = [(x(story, point), point.error) for point in shown]
@@ -135,43 +135,43 @@ def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 @dataclass(frozen=True, slots=True)
-class Measure:
+class PlottedMetric:
     """A metric of the tables."""
 
     name: str
     title: str
-    of: Callable[[Entry], Estimate | None]
+    of: Callable[[ReportEntry], Estimate | None]
 
 
-def measures() -> list[Measure]:
-    """The metrics of Fig. 5, and those that we put beside them."""
+def measures() -> list[PlottedMetric]:
+    """The metrics of Fig. 5, and further ones of ours."""
 
-    def feature(block: int) -> Measure:
-        def value(entry: Entry) -> Estimate | None:
+    def feature(block: int) -> PlottedMetric:
+        def value(entry: ReportEntry) -> Estimate | None:
             found = entry.row.metrics
             return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate
 
-        return Measure(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
+        return PlottedMetric(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
 
-    def of(field: str) -> Callable[[Entry], Estimate | None]:
+    def of(field: str) -> Callable[[ReportEntry], Estimate | None]:
         return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate
 
-    def fid(entry: Entry) -> Estimate | None:
+    def fid(entry: ReportEntry) -> Estimate | None:
         found = entry.row.metrics
         return None if found is None or found.fid is None else Estimate(found.fid.value, None, found.fid.predictions)
 
     return [
-        Measure("mse", "MSE", of("mse")),
-        Measure(MSSIM, "MSSIM", of("mssim")),
-        Measure("fid", "FID", fid),
+        PlottedMetric("mse", "MSE", of("mse")),
+        PlottedMetric(MSSIM, "MSSIM", of("mssim")),
+        PlottedMetric("fid", "FID", fid),
         *(feature(block) for block in range(4)),
-        Measure(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
-        Measure("flip", "FLIP", of("flip")),
+        PlottedMetric(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
+        PlottedMetric("flip", "FLIP", of("flip")),
     ]
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PlottedPredictor:
     """A predictor in a plot over the time of a frame."""
 
     milliseconds: float
@@ -181,10 +181,10 @@ class Placed:
     value: Estimate
 
 
-def _over_time(contents: Contents) -> Iterator[Plot]:
+def _over_time(contents: ReportContents) -> Iterator[Plot]:
     for measure in measures():
         points = [
-            Placed(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
+            PlottedPredictor(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
             for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
             if entry.time is not None and (value := measure.of(entry)) is not None
         ]
@@ -194,7 +194,7 @@ def _over_time(contents: Contents) -> Iterator[Plot]:
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
-"""Kinds of predictors, each with how matplotlib marks them and joins them by a line: as `OF_TIME` says."""
+"""The kinds of predictors, each with its marker and the line that joins them; `OF_TIME` explains them."""
 
 OF_TIME = (
     "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
@@ -203,14 +203,14 @@ OF_TIME = (
 )
 
 
-def _group(entry: Entry) -> str:
+def _group(entry: ReportEntry) -> str:
     networks, trained, untrained = GROUPS
     if not entry.row.kept:
         return networks
     return untrained if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: Measure, points: Sequence[Placed]) -> None:
+def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[PlottedPredictor]) -> None:
     least = min(point.value.mean for point in points)
     logarithmic = measure.name not in (MSSIM, KID) and least > 0
     floor = least / 2 if logarithmic else -math.inf
@@ -241,7 +241,7 @@ def _scatter(axes: Axes, measure: Measure, points: Sequence[Placed]) -> None:
 
 
 def _plain_ticks(axes: Axes) -> None:
-    """Round numbers on logarithmic axes of so little that few powers of ten lie in them, written in full."""
+    """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
     from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
@@ -254,6 +254,6 @@ def _plain_ticks(axes: Axes) -> None:
 
 
 def _round_numbers(low: float, high: float) -> list[float]:
-    """1, 2, 3, 5 and 7, and ten times and a tenth of these and so on, as far as they lie between."""
+    """The numbers 1, 2, 3, 5 and 7, times powers of ten, that lie between two values."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     return [number for decade in decades for one in (1, 2, 3, 5, 7) if low <= (number := one * 10.0**decade) <= high]

@@ -1,6 +1,6 @@
 """The published tables, to stand beside ours [supplement 4, Tables 1 and 2].
 
-They are of four rooms at 256², on the authors' GPU: no value can be compared with ours, but orders of errors can, and
+They are of four rooms at 256², on the authors' GPU: values cannot be compared with ours, but orders of errors can, and
 ratios of networks' times. Denoisers' times are mostly rendering, of as many samples per pixel as the authors chose.
 """
 
@@ -50,7 +50,7 @@ Table = dict[str, Published]
 
 
 def table_of(spec: SceneSpec) -> tuple[str, Table] | None:
-    """What the published table for scenes of this kind is called, and its rows; None for a static scene."""
+    """The name of the published table for scenes of this kind, and its rows; None for a static scene."""
     if spec.lights:
         return "Table 2, movable objects and lights", MOVABLE_LIGHTS
     return ("Table 1, movable objects and fixed lights", FIXED_LIGHTS) if spec.objects else None

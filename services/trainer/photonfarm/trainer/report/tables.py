@@ -10,7 +10,7 @@ from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
-from photonfarm.trainer.report.contents import Contents, Entry
+from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 from photonfarm.trainer.report.plots import measures
 
 
@@ -24,12 +24,12 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def tables(contents: Contents) -> list[Table]:
+def tables(contents: ReportContents) -> list[Table]:
     """All tables, in the order of the report."""
     return [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
 
 
-def facts(contents: Contents) -> list[tuple[str, str]]:
+def facts(contents: ReportContents) -> list[tuple[str, str]]:
     """The dataset's card: names and values."""
     card, about = contents.card, contents.card.document()
     spec, status = card.spec, card.status
@@ -55,12 +55,12 @@ def facts(contents: Contents) -> list[tuple[str, str]]:
     ]  # fmt: skip
 
 
-def _further_passes(contents: Contents) -> str:
+def _further_passes(contents: ReportContents) -> str:
     further = contents.card.further_passes
     return f"; and {further.rows} further passes of their views, as references need" if further.rows else ""
 
 
-def _cost(contents: Contents) -> str:
+def _cost(contents: ReportContents) -> str:
     card, further = contents.card, contents.card.further_passes
     spent = f"{card.samples.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample"
     if further.rows:
@@ -68,8 +68,8 @@ def _cost(contents: Contents) -> str:
     return f"{spent}; {card.status.redrawn} renders drawn again, as they were not finite"
 
 
-def _gpu(contents: Contents) -> str:
-    """What a GPU took part in."""
+def _gpu(contents: ReportContents) -> str:
+    """The tasks that ran on a GPU."""
     trained = [story.name for story in contents.stories if story.on_gpu]
     found = [f"trained {', '.join(trained)}"] if trained else []
     if contents.evaluation.device != "cpu":
@@ -81,7 +81,7 @@ def _gpu(contents: Contents) -> str:
     )
 
 
-def _seeds(contents: Contents) -> str:
+def _seeds(contents: ReportContents) -> str:
     asked = []
     for number, request in enumerate(contents.card.requests):
         if request["kind"] == "samples":
@@ -103,8 +103,8 @@ def _versions(versions: dict[str, list[str]]) -> str:
 # -------------------------------------------------------------------------------------------------- the paper's columns
 
 
-def _paper(contents: Contents) -> Table:
-    """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; published figures beside ours, where there are."""
+def _paper(contents: ReportContents) -> Table:
+    """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; with the published figures, if there are any."""
     beside = contents.published is not None
     columns = ["time per frame, ms", f"× {contents.measure.name}"]
     if _has_references(contents):
@@ -116,19 +116,19 @@ def _paper(contents: Contents) -> Table:
             head.append("paper")
     rows = [_paper_row(contents, entry, beside=beside) for entry in contents.entries]
     named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
-    said = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
-    return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(said))
+    below = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
+    return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(below))
 
 
-def _has_references(contents: Contents) -> bool:
+def _has_references(contents: ReportContents) -> bool:
     return any(entry.row.metrics is not None for entry in contents.entries)
 
 
-def _has_denoisers(contents: Contents) -> bool:
+def _has_denoisers(contents: ReportContents) -> bool:
     return any(entry.row.kept is not None for entry in contents.entries)
 
 
-def _of_time(contents: Contents) -> str:
+def _of_time(contents: ReportContents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
     frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
@@ -141,23 +141,23 @@ def _of_time(contents: Contents) -> str:
     )
 
 
-def _of_paper(contents: Contents) -> str:
+def _of_paper(contents: ReportContents) -> str:
     film, unit = contents.card.spec.film, contents.measure.published
-    said = (
+    times = (
         "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on another "
         "machine: orders of errors can be compared, values cannot. Of time, the networks' ratios can"
         f"{'' if unit is None else f' ({contents.measure.architecture} took {unit.seconds:g} s there)'}"
     )
     if not _has_denoisers(contents):
-        return said
+        return times
     return (
-        f"{said}. The denoisers' cannot: their time is mostly rendering, here of "
+        f"{times}. The denoisers' cannot: their time is mostly rendering, here of "
         f"{contents.card.spec.transport.half_spp} samples per pixel at {film.width} × {film.height}, where starting "
         "takes much of it, and of another number in the paper"
     )
 
 
-def _paper_row(contents: Contents, entry: Entry, *, beside: bool) -> tuple[str, ...]:
+def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
     metrics, paper, unit = entry.row.metrics, entry.published, contents.measure
     headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[HEADLINE_BLOCK].estimate
     cells = [
@@ -176,11 +176,11 @@ def _paper_row(contents: Contents, entry: Entry, *, beside: bool) -> tuple[str, 
     return tuple(row)
 
 
-def _ratio(entry: Entry, unit: Entry) -> str:
+def _ratio(entry: ReportEntry, unit: ReportEntry) -> str:
     return NOT_AVAILABLE if entry.time is None or unit.time is None else f"{entry.time.total / unit.time.total:.2f}"
 
 
-def _published_ratio(entry: Entry, unit: Entry) -> str:
+def _published_ratio(entry: ReportEntry, unit: ReportEntry) -> str:
     if entry.published is None or unit.published is None:
         return ""
     return f"{entry.published.seconds / unit.published.seconds:.2f}"
@@ -198,8 +198,8 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 # -------------------------------------------------------------------------------------------------------------- further
 
 
-def _further(contents: Contents) -> Table:
-    """What the paper does not have, and its Fig. 5 in numbers."""
+def _further(contents: ReportContents) -> Table:
+    """Metrics that the paper does not have, and its Fig. 5 in numbers."""
     shown = [m for m in measures() if m.name.startswith(("feature", "flip"))] if _has_references(contents) else []
     first = contents.evaluation.rows[0]
     rows = []
@@ -211,17 +211,17 @@ def _further(contents: Contents) -> Table:
         rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
     titles = (*(m.title for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
-    said = [notes(contents.evaluation)[0]]
+    below = [notes(contents.evaluation)[0]]
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
-        said.append(
+        below.append(
             f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
             f"{weights.source}, sha256 {weights.sha256}; images are resized to 299 × 299 bilinearly without aligned "
             "corners. KID's interval is the jackknife's over views; FID has none"
         )
-    return Table("Further metrics", head, tuple(rows), tuple(said))
+    return Table("Further metrics", head, tuple(rows), tuple(below))
 
 
-def _frame_parts(contents: Contents) -> list[Table]:
+def _frame_parts(contents: ReportContents) -> list[Table]:
     if contents.costs is None:
         return []
     rows = tuple(
@@ -234,20 +234,20 @@ def _frame_parts(contents: Contents) -> list[Table]:
         if entry.time
     )
     head = ("architecture", "render 1/k", "buffers", "guides", "points seen", "photons", "network", "all")
-    said = ["milliseconds: the median, and the middle 80 % of the times"]
+    below = ["milliseconds: the median, and the middle 80 % of the times"]
     if _has_denoisers(contents):
-        said.append(
+        below.append(
             "denoisers are given one half-estimate of 1/k of the pixels; as splats of light paths do not stop at "
             "these, their light paths are as many as for the whole image (up to 64 × as many per pixel)"
         )
     networks = {story.name: story.run.settings.network for story in contents.stories}
     transport = {name: of for name, of in networks.items() if of.architecture.startswith("light_transport")}
     if relative := [name for name, of in transport.items() if of.maxima == "relative"]:
-        said.append(
+        below.append(
             f"{', '.join(relative)}: maxima are relative, for which the network runs over the base cloud anew in each "
             "frame, though what that gives is the same each time: a renderer would keep it"
         )
-    return [Table("Where the time of a frame goes", head, rows, tuple(said))]
+    return [Table("Where the time of a frame goes", head, rows, tuple(below))]
 
 
 def _ms(time: Seconds) -> str:
@@ -257,7 +257,7 @@ def _ms(time: Seconds) -> str:
 # ---------------------------------------------------------------------------------------------------------- runs, cases
 
 
-def _runs(contents: Contents) -> Table:
+def _runs(contents: ReportContents) -> Table:
     rows = []
     for story in contents.stories:
         about = story.document()
@@ -276,14 +276,14 @@ def _runs(contents: Contents) -> Table:
     return Table("Training", head, tuple(rows))
 
 
-def _worst(contents: Contents) -> list[Table]:
+def _worst(contents: ReportContents) -> list[Table]:
     if not contents.worst:
         return []
     rows = tuple((c.kind, f"{c.row}", f"{c.pixels:.1%}", f"{c.mse:.4f}") for c in contents.worst)
-    said = (
+    note = (
         f"of all views with references, those in which pixels of one kind cost {contents.entries[0].name} most: the "
         "sum of their squared error in the metric space, the references' noise taken out; one view may be the worst of "
         "several kinds. Close: nearer than 5 % of what is seen. Fine shadows: in both halves of the reference light "
         "steps where surface, normal and colour do not"
     )
-    return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (said,))]
+    return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (note,))]

@@ -1,4 +1,4 @@
-"""What each training run of a report did: settings, curve, waits, cost."""
+"""The training runs of a report: settings, curve, waits, cost."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, wai
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
-    """A validation on the way."""
+class CurvePoint:
+    """A validation of a run."""
 
     step: int
-    draws: int  # samples drawn by then
+    draws: int  # samples drawn by then, repeats counted
     samples: int  # that had arrived, held-out ones among them
-    used: int  # that had been drawn at least once
+    used: int  # samples drawn at least once
     train_s: float  # wall seconds of steps
     error: float  # on held-out samples, noise removed
-    held_out: int  # these samples
+    held_out: int  # the number of these samples
 
     def core_s(self, per_sample: float) -> float:
-        """Of rendering the samples that had been used by then, where each took `per_sample`."""
+        """The core-seconds to render the samples used by then, at `per_sample` each."""
         return self.used * per_sample
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunStory:
-    """One run as its checkpoint and its log tell it."""
+    """One run, described by its checkpoint and its log."""
 
     name: str
     run: TrainedRun
-    state: dict[str, Any]  # of the checkpoint: what is no weight
-    curve: tuple[Point, ...]
+    state: dict[str, Any]  # of the checkpoint, without weights
+    curve: tuple[CurvePoint, ...]
 
     @classmethod
     def of(cls, name: str, run: TrainedRun) -> RunStory:
-        """Of a run; raises StoreError for a log that cannot be read."""
+        """Read the story of a run; raises StoreError for a log that cannot be read."""
         records = metrics_log.read(run.folder / METRICS)
         state = checkpoint.load(run.folder / CHECKPOINT)
         arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
         training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived
         points = (
-            Point(
+            CurvePoint(
                 r["step"], r["draws"], r["samples"], min(r["draws"], int(training[min(r["samples"], len(arrived))])),
                 r["seconds"]["train"], r["error"], r["held_out"],
             )
@@ -60,21 +60,21 @@ class RunStory:
 
     @property
     def trained_on(self) -> int:
-        """How many samples it draws from: those that have arrived and are not held out."""
+        """The number of samples to draw from: those that have arrived and are not held out."""
         return len(self.state["following"]["sampler"]["rows"])
 
     @property
     def on_gpu(self) -> bool:
-        """Whether its steps were a GPU's: by its settings and, where these say auto, by what that is here."""
+        """Whether its steps ran on a GPU: by its settings and, if these are "auto", by this machine."""
         device = self.run.settings.device
         return (str(usable_device(device)) if device == AUTO else device).startswith("cuda")
 
-    def step_core_s(self, point: Point) -> float:
-        """Core-seconds of the steps up to a point; on a GPU their wall seconds."""
+    def step_core_s(self, point: CurvePoint) -> float:
+        """The core-seconds of the steps up to a point; on a GPU their wall seconds."""
         return point.train_s * (1 if self.on_gpu else self.run.settings.threads)
 
     def document(self) -> dict[str, Any]:
-        """What report.json says of it."""
+        """Its part of report.json."""
         state, settings = self.state, self.run.settings
         draws = state["step"] * settings.batch
         shares = waits(state["seconds"])
@@ -99,7 +99,7 @@ class RunStory:
 
 
 def short_names(runs: list[TrainedRun]) -> list[str]:
-    """What each is called in a report: by its architecture, or its folder where that says more."""
+    """The name of each run in a report: its architecture, or its folder if that adds something."""
     for names in ([run.settings.network.architecture for run in runs], [run.folder.name for run in runs]):
         if len(set(names)) == len(runs):
             return [*names]

@@ -1,4 +1,4 @@
-"""Where a network fails most, found by what each pixel shows [supplement 4: its known failures; Figs. 6 to 8].
+"""The worst failures of a network, by kind of pixels [supplement 4: its known failures; Figs. 6 to 8].
 
 Shape letters: H W image.
 """
@@ -17,25 +17,25 @@ from photonfarm.shared.core.records import F32, ViewBuffers
 
 Mask = NDArray[np.bool_]
 
-CLOSE = 0.05  # quantile of all depths: what is nearer is close to the camera
+CLOSE = 0.05  # quantile of all depths below which a pixel is close to the camera
 MIRRORS, SPECULAR, NEAR, SHADOWS, ALL = KINDS = (
     "mirrors and clear glass", "specular surfaces", "close to the camera", "fine shadows", "all pixels",
 )  # fmt: skip
-LEAST = 0.005  # share of the image's pixels that a case has at the least
+LEAST = 0.005  # the least share of the image's pixels in a case
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
-SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to which difference, cosine and ratio nothing else does
+SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to this difference, cosine and ratio surfaces are the same
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """One held-out view: what it shows, and the network's image of it."""
+class HeldOutView:
+    """One held-out view: its reference and buffers, and the network's image of it."""
 
     row: int
     image: F32  # (H, W, 3) exposed linear radiance, by the network
     half_a: F32  # of the reference, exposed; independent of `half_b`
     half_b: F32
     buffers: ViewBuffers
-    surface: NDArray[np.uint8] | None  # (H, W) kinds of `frame_costs.Surface`; None where the renderer is not at hand
+    surface: NDArray[np.uint8] | None  # (H, W) kinds of `frame_costs.Surface`; None without the renderer
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +48,10 @@ class WorstCase:
     mse: float  # of these pixels, in the metric space, the reference's noise taken out
 
 
-def worst_cases(views: list[View]) -> list[WorstCase]:
-    """For each kind of pixels the view that it costs most, in the order of `KINDS`; one view may be that of several.
+def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
+    """The view with the largest error for each kind of pixels, in the order of `KINDS`; views may repeat.
 
-    What counts is the sum of the error over the pixels: of two views with one wrong mirror the larger mirror.
+    Errors are summed over the pixels: of two views with one wrong mirror, the one with the larger mirror is worse.
     """
     if not views:
         return []
@@ -67,15 +67,15 @@ def worst_cases(views: list[View]) -> list[WorstCase]:
     return [max(scored[kind], key=lambda each: each[0])[1] for kind in KINDS if kind in scored]
 
 
-def squared_error(view: View) -> NDArray[np.float64]:
-    """Of each pixel (H, W), over channels, in the metric space: (f − A)(f − B), in which noise averages to nothing."""
+def squared_error(view: HeldOutView) -> NDArray[np.float64]:
+    """The error of each pixel (H, W), over channels, in the metric space: (f − A)(f − B), whose noise averages out."""
     shown, a, b = (display_values(image).astype(np.float64) for image in (view.image, view.half_a, view.half_b))
     product: NDArray[np.float64] = ((shown - a) * (shown - b)).mean(axis=-1)
     return product
 
 
-def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
-    """The kinds of pixels that are looked for, each with its mask (H, W)."""
+def kinds(view: HeldOutView, close: float) -> Iterator[tuple[str, Mask]]:
+    """The kinds of pixels, each with its mask (H, W)."""
     if view.surface is not None:
         yield MIRRORS, view.surface == Surface.MIRROR
         yield SPECULAR, view.surface == Surface.SPECULAR
@@ -84,10 +84,10 @@ def kinds(view: View, close: float) -> Iterator[tuple[str, Mask]]:
     yield ALL, np.ones_like(view.buffers.depth, np.bool_)
 
 
-def shadow_edges(view: View) -> Mask:
-    """Where the irradiance steps between neighbours that are alike in all else, (H, W).
+def shadow_edges(view: HeldOutView) -> Mask:
+    """The pixels where the irradiance steps between neighbours that are otherwise alike, (H, W).
 
-    It must step the same way in both halves of the reference: their noise is independent, and steps alike by chance.
+    It must step the same way in both halves of the reference: their noise is independent, and agrees only by chance.
     """
     albedo = np.log(view.buffers.albedo.mean(axis=-1) + 1e-2)
     irradiance = np.stack([np.log(half.mean(axis=-1) + 1e-3) - albedo for half in (view.half_a, view.half_b)])
@@ -110,7 +110,7 @@ def _neighbours(length: int, axis: int) -> tuple[Part, Part]:
 
 
 def _alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
-    """Whether two pixels show one surface of one colour."""
+    """Whether two pixels show the same surface and colour."""
     depth, other = buffers.depth[first], buffers.depth[second]
     near = (depth > 0) & (other > 0) & (np.abs(depth - other) < SAME_DEPTH * np.maximum(depth, other))
     colour = np.abs(buffers.albedo[first] - buffers.albedo[second]).max(axis=-1) < SAME_ALBEDO

@@ -1,7 +1,7 @@
-"""What training refuses, because noisy targets would move its least away from the clean image; light to import.
+"""The settings that training refuses, because they bias under noisy targets; light to import.
 
-A network that is trained on noisy targets finds the clean image only if the gradient is, but for factors that do not
-see the noise, linear in the target: then its mean is the gradient with the mean target [supplement 3.2, Lemma 1].
+A network that is trained on noisy targets finds the clean image only if the gradient is, up to factors that do not
+depend on the noise, linear in the target: then its mean is the gradient with the mean target [supplement 3.2, Lemma 1].
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 PAGE = "docs/results/firefly.md"
-"""Where the figures below are made: a pixel of mean 0.90 with rare bright samples."""
+"""The source of the figures below: a pixel of mean 0.90 with rare bright samples."""
 
 
 @dataclass(frozen=True, slots=True)
-class Bias:
-    """Why something is refused."""
+class BiasReason:
+    """The reason why a setting is refused."""
 
     why: str
     ends_at: tuple[float, float, float] | None = None  # of PAGE's pixel, at 4, 16 and 256 samples a target
 
     def rule(self, instead: str) -> str:
-        """The second half of a message: what was measured, and what is allowed."""
+        """The second half of a message: the measurement, and what is allowed instead."""
         measured = ""
         if self.ends_at is not None:
             values = ", ".join(f"{value:.2f}" for value in self.ends_at)
@@ -33,21 +33,21 @@ class Bias:
         return f"is refused, as it biases under noisy targets: {self.why}{measured}; {instead}"
 
 
-L1 = Bias("its least is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
-HUBER = Bias("its least is between the targets' median and their mean", (0.32, 0.39, 0.88))
-LOG = Bias("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
-DISPLAY = Bias("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
-TARGET_WEIGHT = Bias("the weight depends on the target's own noise", (0.20, 0.27, 0.59))
-UNDETACHED = Bias(
+L1 = BiasReason("its least is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
+HUBER = BiasReason("its least is between the targets' median and their mean", (0.32, 0.39, 0.88))
+LOG = BiasReason("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
+DISPLAY = BiasReason("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
+TARGET_WEIGHT = BiasReason("the weight depends on the target's own noise", (0.20, 0.27, 0.59))
+UNDETACHED = BiasReason(
     "the gradient passes through the weight, which rewards bright predictions of noisy pixels", (10.73, 3.36, 1.05)
 )
-STRUCTURE = Bias("it compares contrasts and features, which noise adds to and averaging takes away")
-CLIPPED_GRADIENT = Bias(
+STRUCTURE = BiasReason("it compares contrasts and features, which noise adds to and averaging takes away")
+CLIPPED_GRADIENT = BiasReason(
     "it shortens most the steps in which a rare bright target would make up for the others", HUBER.ends_at
 )
-CLAMPED = Bias("clamped targets have a smaller mean than the clean image", (0.33, 0.40, 0.79))
+CLAMPED = BiasReason("clamped targets have a smaller mean than the clean image", (0.33, 0.40, 0.79))
 
-LOSSES: Mapping[str, Bias] = {
+LOSSES: Mapping[str, BiasReason] = {
     **dict.fromkeys(("l1", "mae", "absolute"), L1),
     **dict.fromkeys(("huber", "smooth_l1", "charbonnier"), HUBER),
     **dict.fromkeys(("log", "log1p", "log_mse", "msle"), LOG),
@@ -56,19 +56,19 @@ LOSSES: Mapping[str, Bias] = {
     **dict.fromkeys(("relative_undetached", "relative_prediction"), UNDETACHED),
     **dict.fromkeys(("ssim", "ms_ssim", "dssim", "lpips", "perceptual", "vgg", "flip"), STRUCTURE),
 }
-"""Values of `loss` that users of other trainers know."""
+"""The values of `loss` that users of other trainers know."""
 
-KEYS: Mapping[str, Bias] = {
+KEYS: Mapping[str, BiasReason] = {
     **dict.fromkeys(("gradient_clip", "gradient_clipping", "gradient_clip_val", "grad_clip"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clip_gradient", "clip_gradients", "clip_grad_norm", "max_grad_norm"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clamp", "clamp_targets", "clip_targets", "firefly_clamp", "max_radiance"), CLAMPED),
     **dict.fromkeys(("tone_map", "tone_mapping", "tonemap", "gamma"), DISPLAY),
 }
-"""Keys that other trainers have."""
+"""The keys of other trainers."""
 
 
 def refuse(settings: Any) -> Any:
-    """The settings as they are; ValidationError, which names key, value and reason, if something in them biases."""
+    """Return the settings unchanged; ValidationError, which names key, value and reason, if one of them biases."""
     if not isinstance(settings, Mapping):
         return settings
     found = {key: KEYS[key].rule("leave the key out") for key in settings if key in KEYS}

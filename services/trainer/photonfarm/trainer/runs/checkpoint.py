@@ -1,8 +1,8 @@
-"""Checkpoints: safetensors with what is no tensor as JSON inside; written whole or not at all, enough to go on exactly.
+"""Checkpoints: safetensors with the rest of the state as JSON inside; written atomically; enough to resume exactly.
 
-A file's tensors are named by where they stand in the state, `network.image_synthesis.out.weight`. The rest of the state
-is the JSON under `photonfarm` in the file's metadata, where {"tensor": NAME} stands for each of them; it has a digest
-of their bytes.
+Tensors in the file are named by their place in the state, `network.image_synthesis.out.weight`. The rest of the state
+is the JSON under `photonfarm` in the file's metadata, with {"tensor": NAME} in place of each tensor, and a digest of
+their bytes.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ METADATA = "photonfarm"
 TENSOR = "tensor"
 
 Changes = dict[str, tuple[Any, Any]]
-"""Settings by key, as they were and as they are."""
+"""Changed settings by key: the old and the new value."""
 
 LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
-"""What a run keeps for as long as it lasts. The rest may be changed where it goes on."""
+"""The settings that a run keeps for ever. The others may change when it is resumed."""
 
 OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed")
-"""Those with an option of their own on the command line; the others are told by --set."""
+"""The settings with an option of their own on the command line; --set takes the others."""
 
 UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)
-"""What is raised on bytes that were not written here."""
+"""The errors of reading bytes that were not written here."""
 
 
 def save(path: Path, state: Mapping[str, Any]) -> None:
-    """Write a checkpoint: to a temporary name, synced, renamed, and the rename synced. StoreError where that fails.
+    """Write a checkpoint: to a temporary name, synced, renamed, and the rename synced. StoreError if that fails.
 
-    A state is made of dictionaries by string, lists, tensors, and what JSON has beside them.
+    A state consists of dictionaries by string, lists, tensors, and the other types of JSON.
     """
     tensors: dict[str, Tensor] = {}
     described = _apart(state, "", tensors)
@@ -66,7 +66,7 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
 def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
     """A checkpoint's content, on the CPU; nothing in it is executed.
 
-    Raises StoreError if it cannot be read; `without` says what the run does if the file is taken away.
+    Raises StoreError if it cannot be read; `without` states, in the message, what the run does if the file is removed.
     """
     document, tensors = _read(path, without)
     if (found := document.get("format")) != FORMAT:
@@ -78,7 +78,7 @@ def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
 
 
 def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What is no tensor, and the tensors by their names."""
+    """The JSON document, and the tensors by their names."""
     try:
         with safe_open(path, framework="pt") as file:
             document = dict(json.loads((file.metadata() or {}).get(METADATA, "{}")))
@@ -94,7 +94,7 @@ def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
-    """Of names and bytes."""
+    """The digest of the tensors' names and bytes."""
     found = hashlib.sha256()
     for name in sorted(tensors):
         found.update(name.encode())
@@ -103,7 +103,7 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
-    """The value with a reference for each tensor; these are put into `tensors`, by their names."""
+    """The value with a reference in place of each tensor; the tensors are put into `tensors`, by their names."""
     if isinstance(value, Tensor):
         tensors[name] = value.detach().cpu().contiguous()
         return {TENSOR: name}
@@ -115,7 +115,7 @@ def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
 
 
 def _together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """The value with a tensor for each reference."""
+    """The value with a tensor in place of each reference."""
     if isinstance(value, dict):
         if value.keys() == {TENSOR}:
             return tensors[value[TENSOR]]
@@ -124,12 +124,12 @@ def _together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
 
 
 def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
-    """What a checkpoint has seen of a store: scene, plans, and how many samples had arrived; `following` has which."""
+    """The state of the store at a checkpoint: scene, plans, and how many samples had arrived; `following` has which."""
     return {"scene_id": scene_id, "plans": list(plans), "samples": samples}
 
 
 def versions() -> dict[str, str]:
-    """What the arithmetic of a run depends on."""
+    """The versions of the packages that a run's arithmetic depends on."""
     return {
         "photonfarm-trainer": version("photonfarm-trainer"),
         "python": platform.python_version(),
@@ -139,11 +139,11 @@ def versions() -> dict[str, str]:
 
 
 def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str, Any]) -> Changes:
-    """Raise SpecError if the checkpoint is of another scene or of a run that `LASTING` settings make another one.
+    """Raise SpecError if the checkpoint is of another scene, or has other `LASTING` settings.
 
-    Returns which other settings are not what they were. Both have `scene_id` and `settings`.
+    Returns the other settings that have changed. Both arguments have `scene_id` and `settings`.
     """
-    then, now = ({"scene_id": said["scene_id"], **said["settings"]} for said in (state, identity))
+    then, now = ({"scene_id": one["scene_id"], **one["settings"]} for one in (state, identity))
     check_of_this_version(path, then["network"])
     changed = _differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
@@ -156,16 +156,16 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
 
 
 def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
-    """Raise SpecError unless what a run wrote of its network says all that makes one today.
+    """Raise SpecError unless a run's stored settings of its network have all present keys.
 
-    What it left out would be today's default, and another network.
+    A missing key would take today's default, and make another network.
     """
     if unsaid := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
         raise SpecError(f"{path}: lacks {unsaid} of the network: another version's run; train anew, in another folder")
 
 
 def _option(key: str, value: Any) -> str:
-    """What sets a key to a value on the command line."""
+    """The command-line option that sets a key to a value."""
     name = key.split(".")[-1]
     if name in OPTIONS:
         return f"no --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
@@ -173,7 +173,7 @@ def _option(key: str, value: Any) -> str:
 
 
 def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
-    """What is not the same in both, (then, now), by key; a key within another one as OUTER.INNER."""
+    """The values that differ, (then, now), by key; a key within another one as OUTER.INNER."""
     found: Changes = {}
     for key in {**before, **now}:
         then, value = before.get(key), now.get(key)
@@ -185,9 +185,9 @@ def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = 
 
 
 def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:
-    """Raise SpecError unless the store's plans begin with those that the checkpoint saw: rows are numbered by them.
+    """Raise SpecError unless the store's plans begin with those of the checkpoint, which number the rows.
 
-    StoreError if it holds weights alone, as of a run that has not begun.
+    StoreError if it holds only weights, as that of a run that has not begun.
     """
     if "store" not in state:
         raise StoreError(f"{path}: holds weights alone, and not where a run stood; without this file it begins anew")

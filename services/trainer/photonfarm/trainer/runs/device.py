@@ -1,4 +1,4 @@
-"""Where a network runs: the device of a name, and what its arithmetic is there."""
+"""The device of a network, and its arithmetic there."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ AUTO = "auto"
 
 
 def usable_device(name: str) -> torch.device:
-    """The device of this name, "cpu", "cuda" or "cuda:N"; of "auto", cuda where there is one and otherwise the cpu.
+    """The device of this name, "cpu", "cuda" or "cuda:N"; for "auto", cuda if there is one and otherwise the cpu.
 
-    On CUDA float32 then means float32 in this process: by torch's default convolutions round what they multiply to
-    TF32, whose mantissa has 10 bits; `precision = bfloat16` is the way to ask for speed. Raises SpecError where torch
-    cannot use the device.
+    On CUDA float32 then means float32 in this process: by torch's default convolutions round their factors to TF32,
+    whose mantissa has 10 bits; `precision = bfloat16` is the setting for speed. Raises SpecError if torch cannot use
+    the device.
     """
     try:
         device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == AUTO else name)
         if device.type not in ("cpu", "cuda"):
             raise SpecError(f"device = {name!r}: must be auto, cpu or cuda")
         torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:  # the latter where torch was built without CUDA
+    except (RuntimeError, AssertionError) as error:  # the latter if torch was built without CUDA
         raise SpecError(f"device = {name!r}: cannot be used here: {str(error).splitlines()[0]}") from error
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
@@ -30,7 +30,7 @@ def usable_device(name: str) -> torch.device:
 
 
 def described(device: torch.device, precision: Precision = "float32") -> str:
-    """The device as a line of text names it: "cpu", or "cuda (NVIDIA H200)"; and if the precision does not suit it."""
+    """The device in words: "cpu", or "cuda (NVIDIA H200)"; with a warning if it is slow at this precision."""
     if device.type == "cuda":
         return f"{device} ({torch.cuda.get_device_name(device)})"
     if precision == "bfloat16" and not torch.ops.mkldnn._is_mkldnn_bf16_supported():

@@ -1,4 +1,4 @@
-"""metrics.jsonl: one record a line, appended as training goes."""
+"""metrics.jsonl: one record a line, appended during training."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from photonfarm.shared.core.errors import StoreError, store_errors
 
 
 class MetricsLog:
-    """The log of one run. `listen` gets each record as it is written; StoreError where it cannot be."""
+    """The log of one run. `on_record` is called with each record as it is written; StoreError if the disk refuses."""
 
-    def __init__(self, path: Path, listen: Callable[[dict[str, Any]], object] | None = None) -> None:
-        self._path, self._listen = path, listen
+    def __init__(self, path: Path, on_record: Callable[[dict[str, Any]], object] | None = None) -> None:
+        self._path, self._on_record = path, on_record
 
     def cut(self, step: int) -> list[dict[str, Any]]:
-        """Drop what was logged after the checkpoint of `step`, which who continues from there writes again.
+        """Drop the records after the checkpoint of `step`, which a resumed run writes again.
 
-        Returns the records that stay. They are renamed into place, so that whoever reads along finds a whole file under
-        this name. A training record of `step` itself was written before the checkpoint, and so was all up to an end
-        there; a validation or a change of settings that no end follows was written after it.
+        Returns the records that stay. They are renamed into place, so that a concurrent reader always finds a whole
+        file. A training record of `step` itself was written before the checkpoint, and so was everything up to an end
+        there; a validation or a change of settings without an end after it was written after the checkpoint.
         """
         with store_errors("cut the log", self._path):
             lines = _lines(self._path)
@@ -41,8 +41,8 @@ class MetricsLog:
         record = {"kind": kind, **values}
         with store_errors("write the log", self._path), self._path.open("ab") as file:
             file.write(json.dumps(record).encode() + b"\n")
-        if self._listen:
-            self._listen(record)
+        if self._on_record:
+            self._on_record(record)
 
 
 def _is_after(record: dict[str, Any], step: int) -> bool:

@@ -1,4 +1,4 @@
-"""Networks and losses of a user's own, named `MODULE:NAME` as entry points are."""
+"""A user's own networks and losses, named `MODULE:NAME` like entry points."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def is_own(name: str) -> bool:
 
 
 def load(key: str, name: str) -> Any:
-    """What `MODULE:NAME` stands for; the module is looked for where Python does, and in the current folder.
+    """Load the object `MODULE:NAME`; the module is searched for on Python's path and in the current folder.
 
-    `key` is the setting that names it. Raises SpecError if there is no such module or it lacks the name; whatever else
-    the module raises goes on as it is.
+    `key` is the setting that names it. Raises SpecError if there is no such module or it lacks the name; other errors
+    of the module are not caught.
     """
     module, _, attribute = name.partition(":")
     if (here := str(Path.cwd())) not in sys.path:

@@ -20,7 +20,7 @@ SETTINGS = "settings.json"
 def held(folder: Path) -> Iterator[None]:
     """Make the folder and lock it; raises StoreError if another trainer has it or it cannot be written.
 
-    The system lets go of the lock when its process ends, however it ends.
+    The system releases the lock when its process ends, however it ends.
     """
     with store_errors("keep a training run here", folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What can be set about training, with each default and its reason; light to import (no torch).
+"""The settings of training, with each default and its reason; light to import (no torch).
 
 Where a default is the supplement's, its section is named; the others are ours.
 """
@@ -36,7 +36,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 def _one_of(kind: Any) -> BeforeValidator:
-    """What allows the values of a literal, and `MODULE:NAME`."""
+    """A validator for the values of a literal, and for `MODULE:NAME`."""
 
     def check(name: object) -> object:
         if name not in get_args(kind) and not (isinstance(name, str) and is_own(name)):
@@ -52,7 +52,7 @@ ArchitectureName = Annotated[str, _one_of(Architecture)]
 LossName = Annotated[str, _one_of(Loss)]
 
 MOST_HELD_OUT = 512
-"""Samples that a finished run is measured on, at most."""
+"""The most samples that a finished run is measured on."""
 
 
 class _Frozen(BaseModel):
@@ -60,7 +60,7 @@ class _Frozen(BaseModel):
 
 
 class NetworkSettings(_Frozen):
-    """The network; changing any of these makes another network, and old checkpoints are refused."""
+    """The settings of the network; other values make another network, and old checkpoints are refused."""
 
     architecture: ArchitectureName = "light_transport"  # or MODULE:NAME, a class of your own
     width: Annotated[int, Field(ge=1, le=512)] = 64  # d of the image synthesis layer [S Fig. 2]
@@ -88,7 +88,7 @@ class NetworkSettings(_Frozen):
 
 
 class TrainSettings(_Frozen):
-    """A training run."""
+    """The settings of a training run."""
 
     network: NetworkSettings = NetworkSettings()
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
@@ -146,27 +146,28 @@ class TrainSettings(_Frozen):
 
 
 KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model_fields) if key != "network")
-"""Every key that can be set, those of the network among them."""
+"""Every key that can be set, including those of the network."""
 
 
 def paper_static(**changes: object) -> TrainSettings:
-    """The supplement's settings for a static scene: batches of 128; the image is what the scene's film is."""
+    """The supplement's settings for a static scene: batches of 128; the image has the size of the scene's film."""
     return paper_dynamic(**{"batch": 128, **changes})
 
 
 def paper_dynamic(**changes: object) -> TrainSettings:
     """The supplement's settings for movable objects and lights: width 64, 16 384 points (ours), batches of 32 [S 3.1].
 
-    Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they are what the scene's film is.
+    Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they have the size of the scene's film.
     """
     return TrainSettings.model_validate({"network": NetworkSettings(points=16384), **changes})
 
 
 def paper(**changes: object) -> TrainSettings:
-    """The supplement to the letter, as far as it says: as `paper_dynamic`, without what is ours in the network.
+    """The supplement to the letter, as far as it goes: `paper_dynamic` without our changes to the network.
 
-    Positions without octaves, the projection's rule on the depth buffer [S 1.2], maxima as they are [S Fig. 1], the
-    linear loss [S 3.2], and no going back. docs/training.md lists what is left of ours, and why.
+    Positions have no octaves, projection uses the rule on the depth buffer [S 1.2], maxima are absolute [S Fig. 1], the
+    loss is linear [S 3.2], and a run never goes back. docs/training.md lists the remaining choices of ours, with
+    reasons.
     """
     network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
     return TrainSettings.model_validate({"network": network, "recover": False, **changes})
@@ -175,9 +176,9 @@ def paper(**changes: object) -> TrainSettings:
 def small(**changes: object) -> TrainSettings:
     """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2. All ours.
 
-    The network is told what is known of a view, and its rate rises and falls over the whole run, however short; weights
-    are averaged over the last hundred steps. One configuration of eight is held out. Maxima over the points, of the
-    networks that take them, are relative, as so short a run learns little of lights from absolute ones.
+    The network uses guides, and its rate rises and falls over the whole run, however short; weights are averaged over
+    the last hundred steps. One configuration of eight is held out. In networks with maxima over the points, these are
+    relative, as so short a run learns little of lights from absolute ones.
     """
     described: dict[str, object] = {
         "network": NetworkSettings(architecture="guided_transport", width=16, points=4096, maxima="relative"),

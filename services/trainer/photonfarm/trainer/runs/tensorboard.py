@@ -1,4 +1,4 @@
-"""A run as TensorBoard shows it: event files beside metrics.jsonl, of the same records, and pictures now and then."""
+"""A run in TensorBoard: event files beside metrics.jsonl, with the same records, and pictures at validations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from photonfarm.shared.core.pictures import display
 from photonfarm.shared.core.records import F32
 
 FOLDER = "tensorboard"
-SHOWN = 4  # pictures of one validation at most
+SHOWN = 4  # the most pictures of one validation
 
 NAMES = {
     "loss": "loss/training",
@@ -28,13 +28,13 @@ NAMES = {
     "draws": "samples/drawn",
     "samples_per_used": "samples/arrived for each used",
 }
-"""What is drawn of a record of metrics.jsonl, and as what."""
+"""The names of curves, by the keys of records in metrics.jsonl."""
 
 
 class EventFiles:
-    """Event files of one session of a run.
+    """The event files of one session of a run.
 
-    What an earlier session wrote after the checkpoint that this one goes on from is taken out of the curves.
+    Events of an earlier session after the checkpoint that this one resumes from are removed from the curves.
     """
 
     def __init__(self, folder: Path, *, writer: Any) -> None:
@@ -42,7 +42,7 @@ class EventFiles:
         self._writer: Any = None
 
     def record(self, record: dict[str, Any]) -> None:
-        """Draw the figures of a record of metrics.jsonl."""
+        """Add the figures of a record of metrics.jsonl."""
         step = record["step"]
         holds = record["kind"] in ("changes", "recovered", "end")  # what was shown of that step itself
         writer = self._from(step + holds)
@@ -53,17 +53,17 @@ class EventFiles:
         writer.flush()
 
     def pictures(self, step: int, target: F32, prediction: F32) -> None:
-        """Show targets (the means of A and B) above predictions, at most `SHOWN`, as clip(I, 0, 1)^(1/2.2)."""
+        """Add targets (the means of A and B) above predictions, at most `SHOWN`, as clip(I, 0, 1)^(1/2.2)."""
         rows = [np.concatenate([display(image, 1.0) for image in images[:SHOWN]], 1) for images in (target, prediction)]
         self._from(step).add_image("held out/target above prediction", np.concatenate(rows), step, dataformats="HWC")
 
     def close(self) -> None:
-        """Leave the files complete."""
+        """Close the files, complete."""
         if self._writer is not None:
             self._writer.close()
 
     def _from(self, step: int) -> Any:
-        """The writer; curves that exist end before the first step that is asked for."""
+        """The writer; existing curves are cut before the first step that is written."""
         if self._writer is None:
             self._writer = self._make(str(self._folder), purge_step=step)
         return self._writer
@@ -71,7 +71,7 @@ class EventFiles:
 
 @contextmanager
 def event_files(run: Path) -> Iterator[EventFiles | None]:
-    """Event files in the folder `run`/tensorboard; None where TensorBoard is not installed."""
+    """Event files in the folder `run`/tensorboard; None if TensorBoard is not installed."""
     if find_spec("tensorboard") is None:
         yield None
         return

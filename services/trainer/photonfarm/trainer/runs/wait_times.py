@@ -1,4 +1,4 @@
-"""Where a run's time goes: whether rendering, reading or training is what the others wait for."""
+"""The division of a run's time: whether rendering, reading or training is the bottleneck."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from contextlib import contextmanager
 from typing import Literal
 
 Kind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
-"""What time goes to: building network and feed; steps; validations; waiting for samples to be rendered, and to be read;
-checkpoints; and what is left, as writing the log and drawing."""
+"""The kinds of time.
+
+They are: building network and feed; steps; validations; waiting for samples to be rendered, and to be read;
+checkpoints; and the rest, such as writing the log and drawing.
+"""
 
 KINDS: tuple[Kind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
 
@@ -18,31 +21,31 @@ NONE: Mapping[str, float] = {}
 
 
 class Stopwatch:
-    """The seconds of a run by what they go to: at any moment to one kind, so that together they are its wall time."""
+    """The seconds of a run by kind: at any moment one kind runs, so that their sum is the wall time."""
 
     def __init__(self, clock: Callable[[], float], kind: Kind, ahead: float = 0.0) -> None:
-        """Begin with `kind`, to which `ahead` seconds have gone already."""
+        """Begin with `kind`, at `ahead` seconds."""
         self._clock, self._kind, self._since = clock, kind, clock() - ahead
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Up to now, by kind."""
+        """The seconds so far, by kind."""
         self.turn(self._kind)
         return dict(self._spent)
 
     @property
     def total(self) -> float:
-        """All of them together."""
+        """The sum of all kinds."""
         return sum(self.seconds.values())
 
     def add(self, seconds: Mapping[str, float]) -> None:
-        """Count those of an earlier session of the run."""
+        """Add the seconds of an earlier session of the run."""
         for kind, value in seconds.items():
             self._spent[kind] += value
 
     def turn(self, kind: Kind) -> Kind:
-        """Let time go to another kind from now on; returns which it went to."""
+        """Switch to another kind; returns the one before."""
         before, now = self._kind, self._clock()
         self._spent[before] += now - self._since
         self._kind, self._since = kind, now
@@ -50,7 +53,7 @@ class Stopwatch:
 
     @contextmanager
     def on(self, kind: Kind) -> Iterator[None]:
-        """Let time go to a kind for a while."""
+        """Switch to a kind while the block runs."""
         before = self.turn(kind)
         try:
             yield
@@ -66,22 +69,22 @@ def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> d
 
 
 def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """What to speed up: that to which most of the time goes, by `waits`, the rest of it being training."""
+    """The part that takes most of the time, by `waits`; the rest of the time is training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])
 
 
 def samples_per_used(samples: int, draws: int) -> float:
-    """Samples that have arrived for each that has been used: above their `--ahead`, workers leave the scene alone.
+    """The number of arrived samples for each used one: above their `--ahead`, workers skip the scene.
 
-    Used are as many as have been drawn, and held-out ones at once: what Redis is told for the workers.
+    Used are all drawn samples, and held-out ones at once, as reported to Redis for the workers.
     """
     return samples / max(min(draws, samples), 1)
 
 
 def stated(shares: Mapping[str, float], ahead: float) -> str:
-    """Both waits, the workers' side and what it comes to, as part of a line."""
+    """Both waits, the ratio of samples and the bottleneck, as part of a line."""
     return (
         f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
         f"{ahead:.2f} samples there for each used (--ahead): {bottleneck(shares)} is the bottleneck"

@@ -1,4 +1,4 @@
-"""What the other processes of a group do while rank 0 trains: their part of each batch, and what it tells them."""
+"""The other processes of a group while rank 0 trains: they compute their part of each batch, at its commands."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from photonfarm.trainer.training.recovery import GoodState
 
 
 def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
-    """Train with rank 0 until that ends; `source` makes the samples of a scene by its id.
+    """Train with rank 0 until that ends; `source` makes the samples of a scene, given its id.
 
-    The folder `run`, which rank 0 writes, is read where the run goes on. Raises what `train` does.
+    A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
     """
     torch.set_num_threads(settings.threads)
-    what, told = ranks.hear()
-    if what == "end":
+    command, value = ranks.receive()
+    if command == "end":
         return
     own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
-    with Feed(source(told["scene_id"]), own) as feed:
-        good, step = GoodState(Learner(feed, settings, ranks)), told["step"]
-        if told["continues"]:
+    with Feed(source(value["scene_id"]), own) as feed:
+        good, step = GoodState(Learner(feed, settings, ranks)), value["step"]
+        if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
         _follow(ranks, feed, good, step)
 
 
 def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
-    """Do what rank 0 tells, until it tells the end."""
-    while (heard := ranks.hear())[0] != "end":
-        what, told = heard
-        if what == "rows":
-            feed.ask(ranks.part(told))
-        elif what == "keep":
-            good.keep(told)
-        elif what == "back":
-            good.go_back(told)
+    """Follow the commands of rank 0, until it sends the end."""
+    while (received := ranks.receive())[0] != "end":
+        command, value = received
+        if command == "rows":
+            feed.ask(ranks.part(value))
+        elif command == "keep":
+            good.keep(value)
+        elif command == "back":
+            good.go_back(value)
         elif ranks.joined((batch := feed.take()).rows):  # "take"
             good.step_or_go_back(step, batch)
             step += 1

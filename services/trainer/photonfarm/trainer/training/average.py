@@ -1,4 +1,4 @@
-"""The average of a network's weights over its training, by which it predicts."""
+"""The average of a network's weights over its training, which makes its predictions."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ class WeightAverage:
     """A network whose weights are the running mean of another's, which is trained."""
 
     def __init__(self, network: Network, decay: float) -> None:
-        """At first, the weights that the network has."""
+        """Begin with the network's present weights."""
         self.network = copy.deepcopy(network).requires_grad_(False)
         self._decay = decay
         self._steps = 0
 
     @torch.no_grad()
     def take(self, network: Network) -> None:
-        """Take in the weights after a step: mean ← d · mean + (1 − d) · weights, d = min(decay, (1 + n) / (10 + n)).
+        """Add the weights after a step: mean ← d · mean + (1 − d) · weights, d = min(decay, (1 + n) / (10 + n)).
 
-        n is how many were taken in before: so the first weights, which know nothing, are soon forgotten. That is the
+        n is the number of steps added before: so the first weights, which are random, are soon forgotten. That is the
         correction of tf.train.ExponentialMovingAverage, with its num_updates (Abadi et al., TensorFlow, 2016).
         """
         decay = min(self._decay, (1 + self._steps) / (10 + self._steps))
@@ -32,7 +32,7 @@ class WeightAverage:
         self._steps += 1
 
     def state(self) -> dict[str, Any]:
-        """The mean weights, and of how many steps they are."""
+        """The mean weights, and the number of steps in them."""
         return {"weights": self.network.state_dict(), "steps": self._steps}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What learns: a network and its optimiser, a step at a time, by one process or by several that share each batch."""
+"""The learner: a network and its optimiser, trained a step at a time by one process or several that share batches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import torch
 
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.average import WeightAverage
 from photonfarm.trainer.training.losses import loss_of
@@ -21,9 +21,9 @@ from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
 
 class DivergedError(IncompleteError):
-    """Loss or held-out error are no longer finite, or much worse than they were; the same run would come to that again.
+    """Loss or held-out error are no longer finite, or much worse than before; the same run would diverge again.
 
-    `found` says which, and at which step.
+    `found` states which, and at which step.
     """
 
     exit_code = 8
@@ -38,36 +38,36 @@ class DivergedError(IncompleteError):
 class Learner:
     """The network of a scene, equal in all processes of a group, before and after each step."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, group: Group = ALONE) -> None:
-        """The untrained network of the feed's scene, on the device of this process."""
+    def __init__(self, feed: Feed, settings: TrainSettings, group: TrainingGroup = SINGLE_PROCESS) -> None:
+        """Make the untrained network of the feed's scene, on the device of this process."""
         frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
         self._settings, self._group = settings, group
         self._device = group.device(settings.device)
         self.network = build(settings.network, frame, settings.seed).to(self._device)
-        self._loss, self.verdict = loss_of(settings.loss)  # and whether it was found to be unbiased
+        self._loss, self.verdict = loss_of(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(self.network.parameters(), settings)
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
-        self.rate_factor = 1.0  # on top of the schedule; no part of the state below
+        self.rate_factor = 1.0  # times the schedule; not part of the state below
 
     @property
     def predicting(self) -> Network:
-        """The network to predict by: of averaged weights, where there are some."""
+        """The network that makes predictions: with averaged weights, if there are any."""
         return self.network if self.average is None else self.average.network
 
     def rate(self, number: int) -> float:
         """The learning rate of step `number`."""
         return self.rate_factor * rate_at(number, self._settings)
 
-    def step(self, number: int, batch: Batch) -> float:
-        """Step `number` of the optimiser on this process' part of a batch [supplement 3.1]; returns the batch's loss.
+    def step(self, number: int, batch: TrainingBatch) -> float:
+        """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss.
 
-        It is the same in all processes. If it is not finite, all is as it was before.
+        The loss is the same in all processes. If it is not finite, nothing has changed.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
         self.optimiser.zero_grad()
         loss = torch.zeros((), device=self._device)
-        if batch.rows:  # of a part, all may have been taken back
+        if batch.rows:  # all samples of a part may have become incomplete
             batch = batch.to(self._device).for_training()
             loss = self._loss(self.network(batch.inputs), batch.target)
             torch.autograd.backward(loss)
@@ -79,16 +79,16 @@ class Learner:
         return value
 
     def state(self) -> dict[str, Any]:
-        """Weights, their average if there is one, and the optimiser's memory, for a checkpoint."""
+        """The weights, their average if there is one, and the optimiser's state, for a checkpoint."""
         state = self.optimiser.state_dict()
         memory = [state["state"].get(place, {}) for place in range(len(list(self.network.parameters())))]
         average = None if self.average is None else self.average.state()
         return {"network": self.network.state_dict(), "average": average, "optimiser_state": memory}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`; the optimiser's own settings stay those of now.
+        """Continue from a `state`; the optimiser keeps its present settings.
 
-        An average that is not in it begins with its weights, as a run may go on with one that had none.
+        If the state has no average, it begins with the weights, as averaging may be switched on when a run is resumed.
         """
         self.network.load_state_dict(state["network"])
         memory = {place: values for place, values in enumerate(state["optimiser_state"]) if values}

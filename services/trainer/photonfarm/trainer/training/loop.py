@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,20 +16,20 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.processes import Stop
-from photonfarm.trainer.data.dataset import Batch, SampleSource
+from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.growth import Following, Growth
+from photonfarm.trainer.data.growth import BatchStream, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import ALONE, Group
+from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, waits
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
-from photonfarm.trainer.training.validation import Best, Comparison, Show, Validation, compared, validate
+from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ NAP_SECONDS = 0.05  # between looks at the feed while there is nothing to train 
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
@@ -48,7 +48,7 @@ class Outcome:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """What SIGTERM and SIGINT set, for `train`; for the main thread of a process."""
+    """A `Stop` for `train` that SIGTERM and SIGINT set; for the main thread of a process."""
     stop = Stop()
     names = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(name, lambda *_: stop.set()) for name in names]
@@ -60,76 +60,62 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What a session of training has around it; `train` says what each is for."""
+class Hooks:
+    """What a session of training calls and heeds; each part may be left out."""
 
-    run: Path
-    watch: Stopwatch
-    stop: Stop
-    group: Group
-    script: Growth | None
-    listen: Callable[[dict[str, Any]], object] | None
-    count: Callable[[int, int], None] | None
-    show: Show | None
+    stop: Stop = field(default_factory=Stop)  # ends the session once it is set
+    on_record: Callable[[dict[str, Any]], object] | None = None  # gets each record of metrics.jsonl as it is written
+    on_draws: Callable[[int, int], object] | None = None  # at the beginning and after each step: draws so far, and
+    # samples that have arrived
+    on_images: Show | None = None  # at each validation: step, targets and predictions of the first held-out samples
+    script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
+    group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
+    waited: float = 0.0  # seconds that have passed already
+    clock: Callable[[], float] = time.monotonic
 
 
-def train(
-    source: SampleSource,
-    settings: TrainSettings,
-    run: Path,
-    *,
-    stop: Stop | None = None,
-    clock: Callable[[], float] = time.monotonic,
-    script: Growth | None = None,
-    listen: Callable[[dict[str, Any]], object] | None = None,
-    count: Callable[[int, int], None] | None = None,
-    waited: float = 0.0,
-    group: Group = ALONE,
-    show: Show | None = None,
-) -> Outcome:
-    """Train on a source while it grows, or continue a run; everything is left in the directory `run`.
+def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
+    """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
-    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `stop` is set; each leaves a
-    checkpoint. `script` repeats the growth of an earlier run, to the bit on a CPU. `listen` gets each record of
-    metrics.jsonl as it is written; `count`, after each step and where a run begins, how many draws there were by then
-    and how many samples have arrived. `waited` seconds have gone by already. Of a `group` this is rank 0. At each
-    validation `show` gets the step, targets and predictions of the first held-out samples. Raises SpecError for a run
-    of another network, scene or store, a device that is not there or a hold-out that leaves nothing, StoreError for a
-    folder that cannot be written or that another trainer has, DivergedError where a loss is not finite, or the held-out
-    error is that or much worse than it was, and there is nothing to go back to, or it has been gone back to too often;
-    the last checkpoint stays.
+    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `hooks.stop` is set; each
+    leaves a checkpoint.
+
+    Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
+    nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
+    the held-out error is not finite, or the latter much worse than before, and there is no good state, or the run has
+    gone back too often; the last checkpoint stays.
     """
+    hooks = hooks or Hooks()
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
-    stop, watch = stop or Stop(), Stopwatch(clock, "wait_data", waited)
+    watch = Stopwatch(hooks.clock, "wait_data", hooks.waited)
     with held(run):
         while not source.ready():
-            if stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
-                return Outcome(0, "stopped" if stop.is_set() else "seconds", None)
+            if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
+                return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
-        with Feed(source, settings, clock) as feed:
-            around = Surroundings(run, watch, stop, group, script, listen, count, show)
-            return Session(feed, settings, around).run()
+        with Feed(source, settings, hooks.clock) as feed:
+            return Session(feed, settings, run, watch, hooks).run()
 
 
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, around: Surroundings) -> None:
-        self._feed, self._settings, self._around = feed, settings, around
-        self._run, self._watch, self._stop = around.run, around.watch, around.stop
-        self._log = MetricsLog(around.run / METRICS, around.listen)
-        self._learner = Learner(feed, settings, around.group)
+    def __init__(self, feed: Feed, settings: TrainSettings, run: Path, watch: Stopwatch, hooks: Hooks) -> None:
+        self._feed, self._settings, self._run, self._watch, self._hooks = feed, settings, run, watch, hooks
+        self._stop = hooks.stop
+        self._log = MetricsLog(run / METRICS, hooks.on_record)
+        self._learner = Learner(feed, settings, hooks.group)
         self._good = GoodState(self._learner)
-        self._best: Best | None = None
-        self._following = Following(feed, settings, around.script, around.group)
+        self._best: BestValidation | None = None
+        self._following = BatchStream(feed, settings, hooks.script, hooks.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
-        self._seconds_told: dict[str, float] = {}  # by the last validation
+        self._seconds_logged: dict[str, float] = {}  # at the last validation
 
-    def run(self) -> Outcome:
+    def run(self) -> TrainingOutcome:
         """Train until something ends it."""
         self._begin()
         self._watch.turn("other")
@@ -146,7 +132,7 @@ class Session:
             self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
-        return Outcome(self._step, reason, self._last_error)
+        return TrainingOutcome(self._step, reason, self._last_error)
 
     def _begin(self) -> None:
         path = self._run / CHECKPOINT
@@ -159,34 +145,34 @@ class Session:
             self._log.write("changes", step=self._step, changes=changed)
         if self._learner.verdict is not None:
             self._log.write("loss", step=self._step, loss=self._settings.loss, verdict=str(self._learner.verdict))
-        self._tell_count()
+        self._report_draws()
 
     def _start(self) -> checkpoint.Changes:
-        self._tell_begin(continues=False)
+        self._send_begin(continues=False)
         settle(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 
     def _continue(self, path: Path) -> checkpoint.Changes:
-        """Go on from a checkpoint; returns which settings are others than they were."""
+        """Resume from a checkpoint; returns the changed settings."""
         state = checkpoint.load(path)
         changed = checkpoint.check_continues(path, state, self._identity())
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
-        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have none
+        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have no recovery
         settle(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
-        if recovery["best"] and self._good.step is not None:  # with nothing to go back to, a best is of no use
-            self._best = Best.of(recovery["best"])
+        if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
+            self._best = BestValidation.of(recovery["best"])
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
-        self._seconds_told = dict(state["seconds"])
-        self._tell_begin(continues=True)
+        self._seconds_logged = dict(state["seconds"])
+        self._send_begin(continues=True)
         self._following.restore(state["following"])
         return changed
 
-    def _tell_begin(self, *, continues: bool) -> None:
-        told = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
-        self._around.group.tell("begin", told)
+    def _send_begin(self, *, continues: bool) -> None:
+        beginning = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
@@ -228,7 +214,7 @@ class Session:
                 self._stop.wait(NAP_SECONDS)
         return found
 
-    def _next_batch(self) -> Batch | None:
+    def _next_batch(self) -> TrainingBatch | None:
         if not self._following.draw_ahead(self._settings.max_steps):
             return None
         with self._watch.on("wait_read"):
@@ -251,7 +237,7 @@ class Session:
             raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
 
     def _validate(self) -> None:
-        """Log the held-out error of the network that predicts, and compare it with the best before."""
+        """Log the held-out error of the predicting network, and compare it with the best before."""
         self._compared = None
         rows = self._following.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
@@ -259,8 +245,8 @@ class Session:
             found = batches(self._feed, rows, self._settings.batch)
             try:
                 predict, loss = network_predictor(self._learner.predicting), self._settings.loss
-                now = validate(predict, self._step, found, self._around.show, loss=loss)
-            except IncompleteError:  # a repair has taken all of them back, for now
+                now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
+            except IncompleteError:  # a repair has removed all of them, for now
                 return
             finally:
                 self._following.ask_again()
@@ -281,30 +267,30 @@ class Session:
             shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
-            waits=waits(seconds := self._watch.seconds, self._seconds_told),
+            waits=waits(seconds := self._watch.seconds, self._seconds_logged),
             **self._counts(),
         )
-        self._seconds_told = seconds
+        self._seconds_logged = seconds
 
     def _compare(self, now: Validation) -> None:
         self._compared = compared(now, self._best)
         if self._compared.is_best:
-            self._best = Best(now.step, now.errors, now.by_shown)
+            self._best = BestValidation(now.step, now.errors, now.judge)
 
     def _keep_or_go_back(self) -> None:
-        """Do what the last validation asks for, in all processes."""
+        """Keep the state after the last validation, or go back, in all processes."""
         found = self._compared
         if found is not None and found.is_clearly_worse:
-            told = f"step {self._step}: {found.stated}"
-            self._around.group.tell("back", told)
-            self._good.go_back(told)
+            reason = f"step {self._step}: {found.stated}"
+            self._hooks.group.send("back", reason)
+            self._good.go_back(reason)
             self._log_recovered("held-out error", found)
         elif found is not None and not found.is_worse:
-            self._around.group.tell("keep", self._step)
+            self._hooks.group.send("keep", self._step)
             self._good.keep(self._step)
 
     def _end_no_worse(self) -> None:
-        """Validate the last step, and end with the last good state if that is worse than one may be."""
+        """Validate the last step, and end with the last good state if the last one is worse than allowed."""
         if self._step != self._validated:
             self._validate()
         found = self._compared
@@ -316,7 +302,7 @@ class Session:
             self._validate()
 
     def _log_recovered(self, cause: str, found: Comparison | None = None) -> None:
-        self._compared = None  # the learner is another one now
+        self._compared = None  # the learner has changed
         self._log.write(
             "recovered",
             step=self._step,
@@ -328,12 +314,12 @@ class Session:
         )
 
     def _used(self) -> tuple[int, int]:
-        """Draws so far, and samples that have arrived."""
+        """The number of draws so far, and of arrived samples."""
         return self._step * self._settings.batch, len(self._following.growth.rows)
 
-    def _tell_count(self) -> None:
-        if self._around.count is not None:
-            self._around.count(*self._used())
+    def _report_draws(self) -> None:
+        if self._hooks.on_draws is not None:
+            self._hooks.on_draws(*self._used())
 
     def _counts(self) -> dict[str, Any]:
         draws, samples = self._used()
@@ -341,13 +327,13 @@ class Session:
         seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
         return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}
 
-    def _train_step(self, batch: Batch) -> None:
+    def _train_step(self, batch: TrainingBatch) -> None:
         with self._watch.on("train"):
             value = self._good.step_or_go_back(self._step, batch)
         if value is None:
             self._log_recovered("loss")
         self._step += 1
-        self._tell_count()
+        self._report_draws()
         if value is not None and self._step % LOG_EVERY == 0:
             rate = self._learner.rate(self._step - 1)
             self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())

@@ -1,4 +1,4 @@
-"""What is minimised. All losses are unbiased under noisy targets, and every change here must keep them so.
+"""The losses. All are unbiased under noisy targets, and every change here must keep them so.
 
 Nothing may be clipped, compressed, or weighted by its own noise: each moves the minimum away from the clean image.
 Shape letters: B batch, H W image.
@@ -16,8 +16,11 @@ from photonfarm.trainer.runs import own
 from photonfarm.trainer.training.unbiasedness import Verdict, judged
 
 RELATIVE_EPSILON = 0.05
-"""Squared exposed radiance: the display's middle grey, 0.5^2.2 ≈ 0.22. What is darker counts about as in the linear
-loss; with the white's 1 instead, the edges of lamps still outweighed what their light does to a room."""
+"""The ε of the relative loss, squared exposed radiance: the display's middle grey, 0.5^2.2 ≈ 0.22.
+
+Darker pixels count about as in the linear loss; with the white's 1 instead, the edges of lamps still outweighed the
+effect of their light on a room.
+"""
 
 
 def linear_loss(prediction: Tensor, target: Tensor) -> Tensor:
@@ -30,31 +33,31 @@ def linear_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def relative_loss(prediction: Tensor, target: Tensor) -> Tensor:
-    """The same error relative to the brightness of the prediction, which no gradient passes through.
+    """The squared error relative to the brightness of the prediction, through which no gradient passes.
 
-    Each pixel's weight 1 / (mean² + ε) is the network's own and not the target's, so the noise cannot bend it: in
+    Each pixel's weight 1 / (mean² + ε) depends on the network and not on the target, so the noise cannot bias it: in
     expectation the gradient is the one with the clean image and the same weights (Lehtinen et al., Noise2Noise, 2018;
     detached as in Müller et al., Real-time Neural Radiance Caching, 2021). A lamp in view, hundreds of times brighter
-    than what it lights, no longer outweighs everything else. Ours, and not what the supplement trained with.
+    than the surfaces it lights, no longer outweighs everything else. Ours; the supplement trained with another loss.
     """
     brightness = prediction.detach().mean(dim=-1, keepdim=True)
     return torch.mean((prediction[:, None] - target) ** 2 / (brightness**2 + RELATIVE_EPSILON)[:, None])
 
 
-def paired_loss(prediction: Tensor, target: Tensor, told: Tensor | None = None) -> Tensor:
-    """The relative error of each half, whose weight is of the prediction and of the other half: (B, 2, H, W, 3).
+def paired_loss(prediction: Tensor, target: Tensor, weighting: Tensor | None = None) -> Tensor:
+    """The relative error of each half, with a weight from the prediction and the other half: (B, 2, H, W, 3).
 
     Where the prediction is far too dark, as beside lamps at first, the relative loss's weight is far too large, and a
-    few such pixels are most of the gradient. The other half knows that they are bright. Its noise is independent of
-    this half's: E w(B) (f − A) = E w(B) · (f − I), zero for the clean image. How much a pixel counts depends on the
-    noise, and so of a network that cannot be right everywhere where it is. Ours. `told` are the halves that the weights
-    are made of, if not the target's. Raises ValueError unless there are two.
+    few such pixels make up most of the gradient. The other half shows that they are bright. Its noise is independent of
+    this half's: E w(B) (f − A) = E w(B) · (f − I), zero for the clean image. The weight of a pixel depends on the
+    noise, and so does, for a network that cannot be right everywhere, where it is right. Ours. `weighting` are the
+    halves that give the weights, if not the target's. Raises ValueError unless there are two.
     """
-    told = target if told is None else told
-    if told.shape[1] != 2:
-        raise ValueError(f"has {told.shape[1]} half-estimates; each of two is weighted by the other")
+    weighting = target if weighting is None else weighting
+    if weighting.shape[1] != 2:
+        raise ValueError(f"has {weighting.shape[1]} half-estimates; each of two is weighted by the other")
     prediction = prediction[:, None]
-    brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), told.flip(1)))
+    brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), weighting.flip(1)))
     return torch.mean((prediction - target) ** 2 / (brightness**2 + of_other**2 + RELATIVE_EPSILON))
 
 
@@ -66,10 +69,10 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | None]:
-    """The loss of a name; of one of a user's own (`MODULE:NAME`) with what the test of its unbiasedness found.
+    """The loss of a name; for a user's own (`MODULE:NAME`) also the result of the test of its unbiasedness.
 
-    That takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), and returns the mean over the batch, ().
-    Raises SpecError if it cannot be had, and if it biases.
+    A loss takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), and returns the mean over the batch, ().
+    Raises SpecError if it cannot be loaded, and if it biases.
     """
     if name in LOSSES:
         return LOSSES[name], None

@@ -1,4 +1,4 @@
-"""What a run goes back to when it gets much worse: the learner's state at its last good validation."""
+"""Recovery of a run that gets much worse: the learner's state at its last good validation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from photonfarm.shared.core.errors import store_errors
-from photonfarm.trainer.data.dataset import Batch
+from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.training.learner import DivergedError, Learner
 
@@ -20,28 +20,28 @@ NEXT = "good.next.safetensors"  # in the run's folder too, until the checkpoint 
 WITHOUT = "without this file the run goes on, with nothing to go back to before its next good validation"
 
 MOST = 8
-"""How often a run may go back: the rate is 1/256 then, and what still diverges does so for another reason."""
+"""How often a run may go back: by then the rate is 1/256, and it diverges for another reason."""
 
 FACTOR = 0.5
-"""What the rate is multiplied by each time."""
+"""The factor on the rate each time."""
 
 
 class GoodState:
-    """The state of a learner that was good, and goes back to it; equal in all processes of a group."""
+    """A good state of a learner, to go back to; equal in all processes of a group."""
 
     def __init__(self, learner: Learner) -> None:
         self._learner = learner
         self._kept: dict[str, Any] = {}  # in memory of its own
-        self._is_new = False  # it is in no file
+        self._is_new = False  # not in any file yet
         self.step: int | None = None  # at which it was kept; None if nothing is
         self.recoveries = 0
 
     def keep(self, step: int) -> None:
-        """Keep the state that the learner has at a step."""
+        """Keep the learner's state at a step."""
         self._kept, self.step, self._is_new = _copied(self._learner.state()), step, True
 
-    def step_or_go_back(self, number: int, batch: Batch) -> float | None:
-        """The loss of a step of the learner; None if it was not finite, and the learner went back.
+    def step_or_go_back(self, number: int, batch: TrainingBatch) -> float | None:
+        """Take a step; returns the loss, or None if it was not finite and the learner went back.
 
         Raises DivergedError as `go_back` does.
         """
@@ -52,9 +52,9 @@ class GoodState:
         return None
 
     def go_back(self, found: str) -> None:
-        """Give the learner the state that was kept, and half the rate from now on.
+        """Give the learner the kept state, and half the rate from now on.
 
-        Raises DivergedError, which says what was found, if nothing is kept, or after `MOST` times.
+        Raises DivergedError, with `found` in its message, if nothing is kept, or after `MOST` times.
         """
         if self.recoveries == MOST:
             raise DivergedError(f"{found}, after the run has gone back {MOST} times")
@@ -63,19 +63,19 @@ class GoodState:
         self._learner.rate_factor *= FACTOR
 
     def give(self, found: str) -> None:
-        """Give the learner the state that was kept; DivergedError, which says what was found, if nothing is."""
+        """Give the learner the kept state; DivergedError, with `found` in its message, if nothing is kept."""
         if self.step is None:
             raise DivergedError(found)
-        self._learner.restore(_copied(self._kept))  # a copy, as the optimiser works on what it is given
+        self._learner.restore(_copied(self._kept))  # a copy, as the optimiser changes the tensors it is given
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds of it; the rest is in a file beside, by `saved_with`."""
+        """Its part of a checkpoint; the rest is in a file beside it, by `saved_with`."""
         return {"good": self.step, "recoveries": self.recoveries, "rate_factor": self._learner.rate_factor}
 
     def restore(self, state: dict[str, Any], run: Path, *, recover: bool) -> None:
-        """Continue, and have the learner continue, from a checkpoint's state and the file beside it.
+        """Continue, and let the learner continue, from a checkpoint's state and the file beside it.
 
-        Nothing is kept if that is gone, or unless told to `recover`. Raises StoreError if it cannot be read.
+        Nothing is kept if the file is gone, or without `recover`. Raises StoreError if it cannot be read.
         """
         self._learner.restore(state)
         if (own := state.get("recovery")) is None:  # of an older version
@@ -86,9 +86,9 @@ class GoodState:
 
     @contextmanager
     def saved_with(self, run: Path, identity: Mapping[str, Any]) -> Iterator[None]:
-        """Write what is kept; within, a checkpoint that refers to it is written, and then it replaces the one before.
+        """Write the kept state; inside, the checkpoint that refers to it is written; then it replaces the one before.
 
-        So a run that is killed at any moment finds that which its last checkpoint refers to, by `settle`.
+        So a run that is killed at any moment finds the state that its last checkpoint refers to, by `settle`.
         """
         if self._is_new:
             checkpoint.save(run / NEXT, {**self._kept, "step": self.step, **identity})
@@ -100,7 +100,7 @@ class GoodState:
 
 
 def settle(run: Path, step: int | None) -> None:
-    """Finish what a killed run may have left: what its last checkpoint refers to, kept at `step`, is GOOD."""
+    """Finish the work of a killed run: make the state that its last checkpoint refers to, kept at `step`, GOOD."""
     with store_errors("keep the last good state", run):
         if step is None:
             (run / GOOD).unlink(missing_ok=True)
@@ -110,12 +110,12 @@ def settle(run: Path, step: int | None) -> None:
 
 
 def _loaded(path: Path) -> dict[str, Any]:
-    """What was written there; empty if nothing was."""
+    """The content of a file; empty if there is none."""
     return checkpoint.load(path, without=WITHOUT) if path.exists() else {}
 
 
 def _copied(value: Any) -> Any:
-    """The value with tensors of its own, on the CPU."""
+    """The value with copies of its tensors, on the CPU."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     if isinstance(value, Mapping):

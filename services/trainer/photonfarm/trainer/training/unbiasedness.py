@@ -1,8 +1,8 @@
-"""Whether a loss finds the clean image under noisy targets: its gradient, averaged over noise whose mean is known.
+"""A test whether a loss finds the clean image under noisy targets: its gradient, averaged over noise of known mean.
 
-A network that is trained on noisy targets finds the clean image if the mean of the gradient is zero there. If in
-addition it is the gradient with the clean target wherever the prediction is, noise changes nothing but the variance of
-a step [supplement 3.2, Lemma 1].
+A network that is trained on noisy targets finds the clean image if the mean of the gradient is zero there. If for any
+prediction it is also the gradient with the clean target, noise changes only the variance of a step [supplement 3.2,
+Lemma 1].
 
 Shape letters: N draws of the noise, B batch, H W image.
 """
@@ -18,27 +18,27 @@ from torch import Tensor
 Loss = Callable[[Tensor, Tensor], Tensor]
 
 DRAWS = 8192
-"""Targets by which a loss is judged: a bias of 6 % of a gradient's standard deviation is then five standard errors."""
+"""The targets of the test: a bias of 6 % of a gradient's standard deviation is then five standard errors."""
 
 BATCH = 64
 SIZE = 4  # px
 LIMIT = 5.5
-"""Standard errors. Of the 48 gradients of an unbiased loss one is beyond with a probability of 2e-6."""
+"""The limit in standard errors, which one of an unbiased loss's 48 gradients exceeds with a probability of 2e-6."""
 
 RARE = 0.125
-"""The probability of the bright value: noise of light that is hard to find, dark with rare bright samples."""
+"""The probability of the bright value: like noise of light that is hard to find, dark with rare bright samples."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What was found of a loss."""
+    """The result of the test of a loss."""
 
-    at_clean: float  # largest mean gradient where the prediction is the clean image, in standard errors
+    at_clean: float  # largest mean gradient at the clean image, in standard errors
     elsewhere: float  # largest difference to the gradient with the clean target, likewise, at other predictions
 
     @property
     def is_unbiased(self) -> bool:
-        """Whether the clean image is where noisy targets lead to."""
+        """Whether noisy targets lead to the clean image."""
         return self.at_clean <= LIMIT
 
     def __str__(self) -> str:
@@ -54,7 +54,7 @@ class Verdict:
 
 
 def judged(loss: Loss) -> Verdict:
-    """A loss on images of random brightness, whose pixels are dark with rare bright samples; deterministic.
+    """Test a loss on images of random brightness, whose pixels are dark with rare bright samples; deterministic.
 
     `loss` takes a prediction (B, H, W, 3) and targets (B, 2, H, W, 3), and returns the mean over the batch, ().
     """
@@ -67,7 +67,7 @@ def judged(loss: Loss) -> Verdict:
 
 
 def _away(loss: Loss, at: Tensor, clean: Tensor, wanted: Tensor, generator: torch.Generator) -> float:
-    """How far the mean gradient at a prediction is from the wanted one, in standard errors; the largest."""
+    """The largest distance of the mean gradient at a prediction from the wanted one, in standard errors."""
     drawn = [_gradients(loss, at, _noisy(clean, generator)) for _ in range(DRAWS // BATCH)]
     gradients = torch.cat(drawn).double()
     error = gradients.std(dim=0) / len(gradients) ** 0.5
@@ -77,14 +77,14 @@ def _away(loss: Loss, at: Tensor, clean: Tensor, wanted: Tensor, generator: torc
 
 
 def _gradients(loss: Loss, at: Tensor, targets: Tensor) -> Tensor:
-    """The gradients with each of some targets, as if it were a batch of its own: (B, H, W, 3)."""
+    """The gradients with each target, as if it were a batch of its own: (B, H, W, 3)."""
     prediction = at.expand(len(targets), -1, -1, -1).clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(prediction, targets), prediction)
     return gradient.detach() * len(targets)
 
 
 def _noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
-    """Targets with the clean image as their mean: (B, 2, H, W, 3), a fifth of it, or rarely much more."""
+    """Targets whose mean is the clean image: (B, 2, H, W, 3), mostly a fifth of it, rarely much more."""
     bright = torch.rand(BATCH, 2, *clean.shape[1:], generator=generator) < RARE
     return torch.where(bright, (1 - 0.2 * (1 - RARE)) / RARE, 0.2) * clean[:, None]
 

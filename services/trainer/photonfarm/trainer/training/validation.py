@@ -1,4 +1,4 @@
-"""A validation on the way, and how it compares with the best one of its run."""
+"""A validation during training, and its comparison with the best one of the run."""
 
 from __future__ import annotations
 
@@ -12,17 +12,22 @@ import torch
 
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import Batch
-from photonfarm.trainer.predict.evaluation import HeldOut, Predictor, measure
+from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 
 Show = Callable[[int, F32, F32], None]
 
 WORSE = 0.1
-"""By which share of the best error a validation may be worse: less is the shaking of a rate that has not fallen yet."""
+"""The share of the best error by which a validation may be worse: less is noise of a learning rate still high."""
 
 DEVIATIONS = 2.0
-"""By how many standard errors of the paired difference it must be worse to be clearly so: few configurations are held
-out while a store is young."""
+"""The standard errors of the paired difference by which it must be worse to be clearly so.
+
+Few configurations are held out while a store is young.
+"""
+
+ALL_LIGHT = "all light"
+UP_TO_WHITE = "means of blocks, up to white"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,82 +35,82 @@ class Validation:
     """The held-out error of a network at a step."""
 
     step: int
-    rows: tuple[int, ...]  # (n,) those measured, in the order of `held_out.per_sample`
-    held_out: HeldOut
-    by_shown: bool = False  # it is compared by the error of light up to white, and not by that of all light
+    rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
+    held_out: HeldOutErrors
+    judge: str = ALL_LIGHT  # which error is compared
 
     @property
     def errors(self) -> dict[int, float]:
-        """The error of each row, by which it is compared."""
-        errors = self.held_out.shown if self.by_shown else self.held_out.per_sample
+        """The error of each row, by which validations are compared."""
+        errors = self.held_out.shown if self.judge == UP_TO_WHITE else self.held_out.per_sample
         return dict(zip(self.rows, errors.tolist(), strict=True))
 
     @property
     def is_finite(self) -> bool:
-        """Whether the error is."""
+        """Whether the error is finite."""
         return math.isfinite(self.held_out.error.mean)
 
 
 def validate(
-    predict: Predictor, step: int, found: Iterator[Batch], show: Show | None = None, *, loss: str = "linear"
+    predict: Predictor, step: int, found: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
 ) -> Validation:
-    """The error of a network over held-out samples; `show` gets targets and predictions of the first batch.
+    """Measure a network over held-out samples; `show` gets targets and predictions of the first batch.
 
-    The linear loss weighs all light alike. A network of another one is compared by the error of light up to white: it
-    cares less for lamps in view, which most of the error of all light comes from, and may learn the rest meanwhile.
+    The linear loss weights all light alike. A network with another loss is compared by the error of light up to white:
+    that loss gives less weight to lamps in view, which make up most of the error of all light.
 
     Raises IncompleteError if there is no sample.
     """
     rows: list[int] = []
 
-    def noted() -> Iterator[Batch]:
+    def noted() -> Iterator[TrainingBatch]:
         for batch in found:
             rows.extend(batch.rows)
             yield batch
 
-    def predict_and_show(batch: Batch) -> F32:
+    def predict_and_show(batch: TrainingBatch) -> F32:
         images = predict(batch)
         if show is not None and rows == list(batch.rows):
             show(step, batch.target.mean(dim=1).cpu().numpy(), images)
         return images
 
-    with np.errstate(invalid="ignore", over="ignore"):  # of a network that has diverged: it is told as that
+    with np.errstate(invalid="ignore", over="ignore"):  # overflows of a diverged network, which is reported as such
         held_out = measure(predict_and_show, noted())
-    return Validation(step, tuple(rows), held_out, by_shown=loss != "linear")
+    return Validation(step, tuple(rows), held_out, ALL_LIGHT if loss == "linear" else UP_TO_WHITE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Best:
+class BestValidation:
     """The best validation of a run so far."""
 
     step: int
-    errors: dict[int, float]  # of each row that was measured
-    by_shown: bool = False
+    errors: dict[int, float]  # of each measured row
+    judge: str = ALL_LIGHT
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """The state for a checkpoint."""
         rows, errors = list(self.errors), list(self.errors.values())
         return {
             "step": self.step,
-            "by_shown": self.by_shown,
+            "judge": self.judge,
             "rows": torch.tensor(rows, dtype=torch.int64),
             "errors": torch.tensor(errors, dtype=torch.float64),
         }
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Self:
-        """That of a `state`; older ones are of all light."""
+        """The validation of a `state`; older ones are of all light, or of an error that nothing compares any more."""
         errors = dict(zip(state["rows"].tolist(), state["errors"].tolist(), strict=True))
-        return cls(state["step"], errors, state.get("by_shown", False))
+        return cls(state["step"], errors, state.get("judge", "pixels" if state.get("by_shown") else ALL_LIGHT))
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A validation beside the best one before, over the rows that both have measured."""
+    """A validation compared with the best one before, over the rows that both have measured."""
 
     error: float  # of this validation
     best: float  # of the best
-    difference: Estimate  # this less the best, over configurations
+    difference: Estimate  # this minus the best, over configurations
     is_best: bool  # this validation is the best from now on
 
     @property
@@ -115,7 +120,7 @@ class Comparison:
 
     @property
     def is_clearly_worse(self) -> bool:
-        """Whether that is more than chance as well; of a single configuration, chance is not known."""
+        """Whether it is worse by more than chance as well; for a single configuration, chance is not known."""
         if not math.isfinite(self.error):
             return True
         deviation = self.difference.standard_error
@@ -123,25 +128,25 @@ class Comparison:
 
     @property
     def stated(self) -> str:
-        """Both in words."""
+        """Both errors in words."""
         before = f", and was {self.best:.5g} at best" if math.isfinite(self.best) else ""
         return f"the held-out error is {self.error:.5g}{before}"
 
     def document(self) -> dict[str, float | None]:
-        """Both for the log, whose JSON has no number for what is not finite."""
+        """Both errors for the log; its JSON has no number for values that are not finite."""
         errors = {"now": self.error, "best": self.best}
         return {name: error if math.isfinite(error) else None for name, error in errors.items()}
 
 
-def compared(now: Validation, best: Best | None) -> Comparison:
-    """A validation beside the best one; beside itself if there is none, none of the same rows, or of the same error.
+def compared(now: Validation, best: BestValidation | None) -> Comparison:
+    """Compare a validation with the best one; with itself if there is none of the same rows and the same error.
 
-    The set that is held out grows while the store does, and samples are taken back for a while: the mean over other
-    rows would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
+    The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows
+    would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
     """
     mine = now.errors
     theirs = mine
-    if best is not None and best.by_shown == now.by_shown and not best.errors.keys().isdisjoint(mine):
+    if best is not None and best.judge == now.judge and not best.errors.keys().isdisjoint(mine):
         theirs = best.errors
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]

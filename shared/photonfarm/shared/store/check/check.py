@@ -1,7 +1,7 @@
-"""`photonfarm store check`: reads everything that a store holds, says what is wrong with it, and sets that aside.
+"""`photonfarm store check`: reads everything in a store, reports what is wrong with it, and sets that aside.
 
-Nothing is deleted and no value is changed. One scene after the other, and one row after the other: memory is what the
-plans take, 32 bytes a sample, and one row of each array for each thread.
+Nothing is deleted and no value is changed. Scenes and rows are read one after the other: memory holds the plans, 32
+bytes a sample, and one row of each array for each thread.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ from math import ceil
 
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.guide_check import GuideCheck
 from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.job_pool import JobPool
 from photonfarm.shared.store.check.plan_check import PlanCheck
 from photonfarm.shared.store.check.plan_repair import PlanRepair
 from photonfarm.shared.store.check.repeated_seeds import equal_samples
-from photonfarm.shared.store.check.unplanned_files import strangers
+from photonfarm.shared.store.check.unplanned_files import unplanned_files
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.findings import Cause, Finding, Findings, Group, JobPart, Remedy
+from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, JobPart, Remedy
 from photonfarm.shared.store.write.guides import GUIDES
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.write.store import Store
 
-Progress = Callable[[str, int, int, int], None]
-"""Is told the scene's name, jobs checked, jobs to check, and bytes read."""
+CheckProgress = Callable[[str, int, int, int], None]
+"""Called with the scene's name, the jobs checked, the jobs to check, and the bytes read."""
 
 
 AT_ONCE = 32
-"""Jobs handed to the threads at a time, in whose order findings are told."""
+"""The number of jobs handed to the threads at a time; findings are reported in their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class SceneReport:
     size_bytes: int
     back_facing_share: float | None  # of the pixels that meet something; None if none does
     halves: HalvesResult | None
-    groups: tuple[Group, ...]
+    groups: tuple[FindingGroup, ...]
     set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
 
 
@@ -74,7 +74,12 @@ class StoreReport:
 
 
 def check_store(
-    store: Store, scene_id: str | None = None, *, when: str, repair: bool = False, tell: Progress | None = None
+    store: Store,
+    scene_id: str | None = None,
+    *,
+    when: str,
+    repair: bool = False,
+    on_progress: CheckProgress | None = None,
 ) -> StoreReport:
     """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
 
@@ -89,16 +94,16 @@ def check_store(
         quarantine = Quarantine(storage, when)
         reports = []
         for each in ids:
-            checking = _SceneChecking(storage, each, len(ids), tell or (lambda *_: None))
+            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None))
             reports.append(checking.run(quarantine if repair else None))
         return StoreReport(
             tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
         )
 
 
-def said(halves: HalvesResult) -> str:
-    """The outcome of the test between A and B in words."""
-    few = "" if halves.tells else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
+def halves_in_words(halves: HalvesResult) -> str:
+    """The outcome of the test between A and B, in words."""
+    few = "" if halves.is_conclusive else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
     return few + (
         f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
         f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
@@ -109,16 +114,16 @@ def said(halves: HalvesResult) -> str:
 class _SceneChecking:
     """One scene on its way through the check."""
 
-    def __init__(self, storage: Storage, scene_id: str, scenes: int, tell: Progress) -> None:
+    def __init__(self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress) -> None:
         self._storage = storage
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
-        self._tell = tell
+        self._on_progress = on_progress
         self._findings = Findings()
         self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
-        self._same: dict[int, bool] = {}  # of such jobs: whether they came out the same when they were rendered again
+        self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
         self._scenes = scenes
-        self._tally, self._guide_tally = Tally(HalvesTest(scenes)), Tally(HalvesTest(scenes))
+        self._tally, self._guide_tally = CheckTotals(HalvesTest(scenes)), CheckTotals(HalvesTest(scenes))
 
     def run(self, quarantine: Quarantine | None) -> SceneReport:
         """Check everything; set aside what is damaged, unless `quarantine` is None."""
@@ -135,7 +140,7 @@ class _SceneChecking:
         self._add(inputs.check_base(committed))
         scene = None
         if inputs.shard_rows is not None:
-            scene = Checked(
+            scene = CheckTarget(
                 self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
             self._jobs(scene, sorted(committed))
@@ -143,7 +148,7 @@ class _SceneChecking:
         return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
-        """The plans once they are checked, and which were written again; before the jobs, which need them."""
+        """Check the plans, before the jobs, which need them; also returns what was written again."""
         check = PlanCheck(self._storage, spec, self._name)
         found = list(check.check_plans())
         self._add(found)
@@ -164,14 +169,14 @@ class _SceneChecking:
         self._add([finding for finding in check.check_plans() if finding not in found])
         return check, rewritten
 
-    def _jobs(self, scene: Checked, committed: list[int]) -> None:
+    def _jobs(self, scene: CheckTarget, committed: list[int]) -> None:
         self._read(scene, committed, self._tally, scene.spec.name)
         self._add(self._again(equal_samples(scene, self._tally)))
         if (halves := self._tally.halves.result()) is not None and not halves.passed:
-            self._add([Finding(Cause.HALVES_DIFFER, said(halves), self._scene_id)])
+            self._add([Finding(Cause.HALVES_DIFFER, halves_in_words(halves), self._scene_id)])
 
-    def _guides(self, guides: Checked, committed: set[int], quarantine: Quarantine | None) -> list[str]:
-        """Check the scene's guides, if it has some; what of their settings and declarations has been mended."""
+    def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
+        """Check the scene's guides, if it has some; returns what of their settings and declarations was mended."""
         if not self._storage.names(guides.name):
             return []
         check = GuideCheck(guides, committed)
@@ -180,23 +185,23 @@ class _SceneChecking:
         self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
         return check.repair(quarantine, found) if quarantine else []
 
-    def _read(self, scene: Checked, committed: list[int], total: Tally, called: str) -> None:
-        """Read all that committed jobs have stored there, and look for what they have not."""
+    def _read(self, scene: CheckTarget, committed: list[int], total: CheckTotals, called: str) -> None:
+        """Read everything that committed jobs stored there, and look for what is missing."""
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):
                 jobs = committed[done : done + AT_ONCE]
-                self._tell(called, done, len(committed), pool.size_bytes)
+                self._on_progress(called, done, len(committed), pool.size_bytes)
                 for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
                     if found:
                         self._markers[scene.guides, job] = marker
                         self._add(self._again(found))
             for tally in pool.tallies:
                 total.add(tally)
-        self._tell(called, len(committed), len(committed), total.size_bytes)
-        self._add(strangers(scene))
+        self._on_progress(called, len(committed), len(committed), total.size_bytes)
+        self._add(unplanned_files(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
-        """Findings; equal halves that came out equal when they were rendered again are not set aside once more."""
+        """The findings, with another cause for equal halves that were equal again after being rendered again."""
         for finding in found:
             equal = finding.cause in (Cause.EQUAL_HALVES, Cause.EQUAL_SAMPLES)
             again = equal and finding.job is not None and self._came_out_the_same(finding.job)
@@ -205,12 +210,12 @@ class _SceneChecking:
     def _came_out_the_same(self, job: int) -> bool:
         if job not in self._same:
             self._same[job] = False
-            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or a finding of its own
+            with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or reported by itself
                 self._same[job] = was_set_aside(self._storage, self._name, job, self._marker((False, job)))
         return self._same[job]
 
     def _marker(self, part: JobPart) -> bytes:
-        """The marker that findings of a job are about; raises FileNotFoundError if it is set aside in the meantime."""
+        """The marker that findings of a job refer to; raises FileNotFoundError if it was set aside in the meantime."""
         if part not in self._markers:  # found when all samples were looked at
             self._markers[part] = self._storage.read(markers.name_of(self._name, part[1]))
         return self._markers[part]
@@ -228,7 +233,7 @@ class _SceneChecking:
 
     # ----------------------------------------------------------------------------------------------------------- repair
 
-    def _repair(self, scene: Checked | None, quarantine: Quarantine) -> list[str]:
+    def _repair(self, scene: CheckTarget | None, quarantine: Quarantine) -> list[str]:
         aside = []
         for (guides, job), why in sorted(self._findings.jobs.items(), key=lambda found: found[0]):
             if scene is None or scene.plans is None:
@@ -248,7 +253,7 @@ class _SceneChecking:
                 aside.append(f"job {jobs - 1} (whole; rendered again, as a job writes the base)")
         return aside
 
-    def _set_aside(self, scene: Checked, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
+    def _set_aside(self, scene: CheckTarget, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
         files = set(scene.files_of(job).values())
         try:
             marker = self._marker((scene.guides, job))

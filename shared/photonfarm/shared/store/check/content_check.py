@@ -1,4 +1,4 @@
-"""What the values of stored rows show: images and views that cannot be right, or hardly.
+"""What the values of stored rows show: images and views that are certainly or probably wrong.
 
 Shape letters: H W image, P pixels.
 """
@@ -19,12 +19,12 @@ from photonfarm.shared.store.format.schema import bit_counts
 from photonfarm.shared.store.write.findings import Cause
 
 _FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)}
-"""Of a float of so many bytes: its bits' type, those of its magnitude, and the magnitude of infinity."""
+"""The integer type, the mask of the magnitude and the magnitude of infinity, by the bytes of a float."""
 
 
 @dataclass(slots=True)
-class Tally:
-    """What the jobs of a scene add up to."""
+class CheckTotals:
+    """Totals over the jobs of a scene."""
 
     halves: HalvesTest
     fingerprints: Fingerprints = field(default_factory=Fingerprints)
@@ -34,8 +34,8 @@ class Tally:
     hit_pixels: int = 0  # first hits, of all views
     back_facing_pixels: int = 0  # of these, seen from behind
 
-    def add(self, other: Tally) -> None:
-        """Take in what other jobs of the scene add up to."""
+    def add(self, other: CheckTotals) -> None:
+        """Add the totals of other jobs of the scene."""
         self.halves.merge(other.halves)
         self.fingerprints.merge(other.fingerprints)
         for name in ("jobs", "samples", "size_bytes", "hit_pixels", "back_facing_pixels"):
@@ -43,14 +43,14 @@ class Tally:
 
 
 class ContentCheck:
-    """Looks at the rows of a scene, one after the other; says what is found as a cause and a detail."""
+    """Checks the rows of a scene, one after the other; yields each finding as a cause and a detail."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self._spec = spec
         self._rays: NDArray[np.float32] | None = None
 
-    def radiance(self, row: int, halves: NDArray[Any], tally: Tally) -> Iterator[tuple[Cause, str]]:
-        """The halves of a sample, (2, H, W, 3) finite, scaled as they are stored."""
+    def radiance(self, row: int, halves: NDArray[Any], tally: CheckTotals) -> Iterator[tuple[Cause, str]]:
+        """Check the halves of a sample, (2, H, W, 3) finite, scaled as they are stored."""
         tally.samples += 1
         tally.halves.add(halves)
         black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
@@ -63,13 +63,13 @@ class ContentCheck:
             yield Cause.EQUAL_HALVES, "A = B in every pixel"
 
     def view(
-        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: Tally
+        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: CheckTotals
     ) -> Iterator[tuple[Cause, str]]:
-        """The buffers of a view: depth (H, W), normals (H, W, 3) as modelled.
+        """Check the buffers of a view: depth (H, W), normals (H, W, 3) as modelled.
 
         Normals are not turned to the camera, so that the inside of a box or the back of a leaf is rightly seen from
-        behind; and views from inside an object are not rejected. So a share of such pixels is counted, and only a view
-        of nothing else is told.
+        behind; and views from inside an object are not rejected. So such pixels are only counted, and a view is
+        reported only if it shows nothing else.
         """
         hit = depth > 0
         hits = int(np.count_nonzero(hit))
@@ -83,7 +83,7 @@ class ContentCheck:
                 yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
 
     def bits(self, name: str, packed: NDArray[np.uint8]) -> Iterator[tuple[Cause, str]]:
-        """Which points or photons a view sees, as they are stored: `point_seen` or `photon_seen`."""
+        """Check the stored bits of which points or photons a view sees: `point_seen` or `photon_seen`."""
         count = bit_counts(self._spec)[name]
         if count % 8 and packed[-1] >> count % 8:
             yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
@@ -104,7 +104,7 @@ class ContentCheck:
 
 
 def is_constant(half: NDArray[Any]) -> bool:
-    """Whether all pixels of (H, W, 3) are equal: then there was no noise, and no seed can be told from it."""
+    """Whether all pixels of (H, W, 3) are equal: then there was no noise, and the image does not depend on the seed."""
     return bool((half == half[0, 0]).all())
 
 

@@ -1,6 +1,6 @@
-"""Checks what a scene's guides lie beside: their settings, and the declarations by which other programs read them.
+"""Checks the files beside a scene's guides: their settings, and the declarations by which other programs read them.
 
-Their jobs are checked as those of samples are, by `job_check`.
+The jobs of guides are checked as those of samples are, by `job_check`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence, Set
 from typing import Any
 
 from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.plan_check import UNREADABLE, declaration
 from photonfarm.shared.store.check.plan_repair import differs
 from photonfarm.shared.store.write import plans
@@ -25,13 +25,13 @@ _GONE = "is missing, and guides are there"
 class GuideCheck:
     """Checks settings and declarations of one scene's guides, and mends them."""
 
-    def __init__(self, guides: Checked, committed: Set[int]) -> None:
+    def __init__(self, guides: CheckTarget, committed: Set[int]) -> None:
         """Take the guides, and the jobs that had their marker before anything else was read."""
         self._guides = guides
         self._committed = committed
 
     def run(self) -> Iterator[Finding]:
-        """What is wrong."""
+        """Yield what is wrong."""
         yield from self._settings()
         for plan in self._guides.plans or []:
             try:
@@ -40,7 +40,7 @@ class GuideCheck:
                 yield self._finding(Cause.UNREADABLE, error.strerror or str(error), plan.folder)
 
     def repair(self, quarantine: Quarantine, found: Sequence[Finding]) -> list[str]:
-        """Set damaged settings aside, and write damaged declarations again; what was done."""
+        """Set damaged settings aside, and write damaged declarations again; returns what was done."""
         done = []
         why = [finding for finding in found if finding.cause is Cause.GUIDE_SETTINGS]
         if why and quarantine.settings(self._guides.name, why):
@@ -84,9 +84,9 @@ class GuideCheck:
                 yield self._finding(Cause.PLAN_INPUTS, detail, f"{folder}/{name}/zarr.json")
 
     def _declare(self, plan: StoredPlan, quarantine: Quarantine, why: Sequence[Finding]) -> None:
-        """Write again what was found of a plan's declarations, or all: they follow from the spec and the plan.
+        """Write the damaged declarations of a plan again: they follow from the spec and the plan.
 
-        All if the group's own is damaged, without which nothing is known of the arrays'.
+        If the group's own is damaged, all are compared, since without it the arrays' could not be checked.
         """
         storage = self._guides.storage
         built = storage.part()
@@ -106,5 +106,5 @@ class GuideCheck:
 
 
 def _is_in(finding: Finding, plan: StoredPlan) -> bool:
-    """Whether a finding is of a file in a plan's folder."""
+    """Whether a finding is about a file in a plan's folder."""
     return str(finding.file).startswith(f"{plan.folder}/")

@@ -1,4 +1,4 @@
-"""What the two halves of the samples show when all of them are looked at: repeated seeds, and a half that is wrong.
+"""Tests of the halves of all samples together: repeated seeds, and a half that differs systematically.
 
 Shape letters: H W image, T tests.
 """
@@ -19,7 +19,7 @@ BLOCKS = 8
 """Blocks along each side of an image, whose sides are multiples of 8."""
 
 SIGNIFICANCE = 1e-6
-"""Probability that a store without a fault is said to have halves that differ, at most, over all tests of a check."""
+"""The largest probability of reporting different halves in a store without a fault, over all tests of a check."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class HalvesResult:
     limit: float  # what |S| reaches by chance with probability SIGNIFICANCE at most, over all tests together
     where: str  # the block of the largest |S|, or the whole image
     difference: float  # mean over the samples of (A − B) / (A + B) of whole images
-    standard_error: float  # of `difference`; 0 of a single sample
+    standard_error: float  # of `difference`; 0 for a single sample
 
     @property
     def passed(self) -> bool:
@@ -39,7 +39,7 @@ class HalvesResult:
         return self.statistic < self.limit
 
     @property
-    def tells(self) -> bool:
+    def is_conclusive(self) -> bool:
         """Whether there are enough samples for a difference to show: |S| is √n at most."""
         return sqrt(self.samples) >= self.limit
 
@@ -56,13 +56,13 @@ class HalvesTest:
     """
 
     def __init__(self, scenes: int = 1) -> None:
-        """Begin; the significance is shared with the tests of other scenes."""
+        """Begin without samples; the significance is shared with the tests of other scenes."""
         self._tests = scenes * (BLOCKS * BLOCKS + 1)
         self._samples = 0
         self._sum, self._squares = np.zeros((2, BLOCKS * BLOCKS + 1))
 
     def add(self, halves: NDArray[Any]) -> None:
-        """Take a sample in, (2, H, W, 3) of any float type and any scale; not finite ones count as equal halves."""
+        """Add a sample, (2, H, W, 3) of any float type and scale; samples that are not finite count as equal halves."""
         _, height, width, _ = halves.shape
         wide = halves.astype(np.float32 if halves.dtype == np.float16 else np.float64)
         rows = wide.reshape(2, BLOCKS, height // BLOCKS, width * 3).sum(axis=2)
@@ -75,13 +75,13 @@ class HalvesTest:
         self._squares += d**2
 
     def merge(self, other: HalvesTest) -> None:
-        """Take in the samples of another test of the same scene."""
+        """Add the samples of another test of the same scene."""
         self._samples += other._samples
         self._sum += other._sum
         self._squares += other._squares
 
     def result(self) -> HalvesResult | None:
-        """The test of all samples taken in; None if there was none."""
+        """The test over all samples added; None if there are none."""
         n = self._samples
         if not n:
             return None
@@ -96,13 +96,13 @@ class HalvesTest:
 
 
 class Fingerprints:
-    """Which halves may be equal, of all samples: 64 bits of each are kept, 32 bytes a sample."""
+    """Finds halves that may be equal among all samples, by 64 bits of each: 32 bytes a sample."""
 
     def __init__(self) -> None:
         self._prints, self._rows = array("Q"), array("q")
 
     def add(self, row: int, half: NDArray[Any]) -> int:
-        """Take in one half of a sample, contiguous; its fingerprint: CRC-32C of the first and of the second part."""
+        """Add one half of a sample, contiguous; returns its fingerprint: CRC-32C of the first and the second part."""
         content = np.ravel(half).view(np.uint8)
         middle = len(content) // 2
         fingerprint = int(crc32c(content[:middle])) << 32 | int(crc32c(content[middle:]))
@@ -111,7 +111,7 @@ class Fingerprints:
         return fingerprint
 
     def merge(self, other: Fingerprints) -> None:
-        """Take in the halves of other samples."""
+        """Add the halves of other samples."""
         self._prints.extend(other._prints)
         self._rows.extend(other._rows)
 

@@ -1,6 +1,6 @@
-"""Reads everything that one committed job has stored: its marker, its files, each of their rows.
+"""Reads everything that one committed job stored: its marker, its files, each of their rows.
 
-Of its samples or of its guides, which have markers of their own.
+A job's samples and its guides have markers of their own, and are checked separately.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.check.content_check import ContentCheck, Tally, is_finite
+from photonfarm.shared.store.check.content_check import CheckTotals, ContentCheck, is_finite
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import Storage
@@ -28,19 +28,19 @@ KINDS: tuple[schema.Kind, ...] = ("sample", "view", "modification")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Checked:
-    """What has plans and markers and is being checked, and what is known of it: a scene's samples, or its guides."""
+class CheckTarget:
+    """A folder with plans and markers that is being checked: a scene's samples, or its guides."""
 
     storage: Storage
     scene_id: str
     name: str  # of the folder that has the plans and markers
     spec: SceneSpec
-    plans: list[StoredPlan] | None  # None if one is damaged: then only what markers tell can be checked
+    plans: list[StoredPlan] | None  # None if one is damaged: then only what markers state can be checked
     shard_rows: int
     lost: frozenset[str] = frozenset()  # folders of plans that are missing
-    guides: bool = False  # whether it is the guides
+    guides: bool = False  # True: the folder of the guides
 
-    def of_guides(self) -> Checked:
+    def of_guides(self) -> CheckTarget:
         """The guides of the scene, whose plans and jobs have the same numbers."""
         name = f"{self.name}/{GUIDES}"
         found = None if self.plans is None else [beside(plan, name) for plan in self.plans]
@@ -49,7 +49,7 @@ class Checked:
 
     @property
     def arrays(self) -> Mapping[str, schema.ArraySchema]:
-        """What jobs store there, by name."""
+        """The arrays that jobs store there, by name."""
         return schema.guide_arrays(self.spec) if self.guides else schema.output_arrays(self.spec)
 
     def wanted(self, rows: JobRows) -> dict[schema.Kind, Set[int]]:
@@ -60,7 +60,7 @@ class Checked:
         return {"sample": samples, "view": rows.new_views, "modification": rows.new_modifications}
 
     def finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
-        """Something found of a job."""
+        """A finding about a job."""
         return Finding(cause, detail, self.scene_id, job, row, file, self.guides)
 
     def plan_of(self, folder: str) -> str:
@@ -69,7 +69,7 @@ class Checked:
         return f"{scene}{folder.removeprefix(self.name)}"
 
     def files_of(self, job: int) -> dict[str, str]:
-        """The names that a job's files may have, by array; none for a job of no plan that is known."""
+        """The names that a job's files may have, by array; empty for a job of no known plan."""
         for plan in self.plans or []:
             if plan.first_job <= job < plan.end_job:
                 return {name: plan.shard(name, array, job) for name, array in self.arrays.items()}
@@ -79,17 +79,17 @@ class Checked:
 class JobCheck:
     """Checks jobs of a scene one after the other, with the same memory for each."""
 
-    def __init__(self, scene: Checked) -> None:
+    def __init__(self, scene: CheckTarget) -> None:
         self._scene = scene
         self._finding = scene.finding
         self._arrays = scene.arrays
         self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
         self._contents = ContentCheck(scene.spec)
 
-    def run(self, job: int, tally: Tally) -> tuple[list[Finding], bytes]:
-        """What is found of a job, and its marker; nothing if that is taken back in the meantime.
+    def run(self, job: int, tally: CheckTotals) -> tuple[list[Finding], bytes]:
+        """The findings of a job, and its marker; nothing if the marker is removed in the meantime.
 
-        What it adds to the scene is counted in `tally`.
+        The totals of the job are added to `tally`.
         """
         self._tally = tally
         storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
@@ -116,7 +116,7 @@ class JobCheck:
         try:
             named = markers.files(marker, scene.name, job)
         except CorruptError as error:
-            yield self._finding(Cause.MARKER, job, _said(error), name)
+            yield self._finding(Cause.MARKER, job, _error_text(error), name)
             return
         files = {file: about for file, about in named.items() if _array_of(file) in self._arrays}  # others may be added
         self._tally.jobs += 1
@@ -130,7 +130,7 @@ class JobCheck:
             yield from self._rows(job, kind, files, shards, rows)
 
     def _without_plan(self, job: int, marker: bytes, name: str) -> Finding:
-        """What a marker of no plan tells: that the last plan is missing, if it names files in the folder of one."""
+        """The finding for a marker without a plan: the last plan is missing if the marker names files in its folder."""
         scene = self._scene
         with contextlib.suppress(CorruptError):
             named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
@@ -141,7 +141,7 @@ class JobCheck:
     # ------------------------------------------------------------------------------------------------------------ files
 
     def _open(self, job: int, file: str, about: dict[str, Any], shards: dict[str, Shard]) -> Iterator[Finding]:
-        """Open a file that the marker names, by its array, and compare it with what the marker tells."""
+        """Open a file that the marker names, by its array, and compare it with the marker."""
         array = self._arrays[_array_of(file)]
         try:
             size = self._scene.storage.size(file)
@@ -160,7 +160,7 @@ class JobCheck:
             shard = Shard(self._scene.storage.local(file), array, self._scene.shard_rows)
             crc32c = shard.summary()["crc32c"]
         except CorruptError as error:
-            yield self._finding(Cause.CHECKSUM, job, _said(error), file)
+            yield self._finding(Cause.CHECKSUM, job, _error_text(error), file)
             return
         except OSError as error:
             yield self._unreadable(job, file, error)
@@ -173,7 +173,7 @@ class JobCheck:
     def _against_plan(
         self, rows: JobRows, files: dict[str, dict[str, Any]], own: dict[str, str], shards: dict[str, Shard]
     ) -> Iterator[Finding]:
-        """What the plan wants and the files do not have, and the other way round."""
+        """Find rows that the plan requires and the files lack, and the other way round."""
         for file in sorted(files.keys() - own.values()):
             yield self._finding(Cause.MARKER, rows.job, "the marker names it, and it is another job's", file)
         for file in sorted(own.values() - files.keys()):
@@ -195,7 +195,7 @@ class JobCheck:
     def _of_radiance(
         self, job: int, samples: Set[int], own: dict[str, str], held: dict[str, set[int]], unread: set[str]
     ) -> Iterator[Finding]:
-        """Samples that lie in both of its arrays, or in none; no array has only some of them."""
+        """Find samples that are in both radiance arrays, or in none; no array has only some of them."""
         narrow, wide = held.get("radiance", set()), held.get("radiance_wide", set())
         for row in sorted(narrow & wide & samples):
             yield self._finding(Cause.TWICE, job, "radiance has it already", own["radiance_wide"], row)
@@ -230,12 +230,12 @@ class JobCheck:
                 yield self._finding(cause, job, detail, row=row)
 
     def _read(self, shard: Shard, name: str, i: int) -> tuple[Cause, str] | None:
-        """Read a row into the array's memory; what is wrong with it, if anything."""
+        """Read a row into the array's memory; returns what is wrong with it, if anything."""
         values = self._memory[name]
         try:
             shard.read_into(i, values)
         except CorruptError as error:
-            return Cause.CHECKSUM, _said(error)
+            return Cause.CHECKSUM, _error_text(error)
         if values.dtype.kind == "f" and not is_finite(values):
             return Cause.NOT_FINITE, name
         return None
@@ -252,7 +252,7 @@ class JobCheck:
                 yield from self._contents.bits(name, values[name])
 
     def _unreadable(self, job: int, file: str, error: OSError) -> Finding:
-        """The finding for a file that cannot be read; raises OSError if it is the whole store that cannot be."""
+        """The finding for a file that cannot be read; raises OSError if the whole store cannot be read."""
         self._scene.storage.names(self._scene.name)
         return self._finding(Cause.UNREADABLE, job, error.strerror or str(error), file)
 
@@ -267,6 +267,6 @@ def _plan_of(file: str) -> str:
     return file.rsplit("/", 2)[0]
 
 
-def _said(error: CorruptError) -> str:
-    """What an error says, without the file, which the finding names."""
+def _error_text(error: CorruptError) -> str:
+    """The text of an error without the file, which the finding names."""
     return str(error).partition(": ")[2] or str(error)

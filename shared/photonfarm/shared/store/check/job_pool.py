@@ -9,21 +9,21 @@ from types import TracebackType
 from typing import Self
 
 from photonfarm.shared.core.processes import usable_cores
-from photonfarm.shared.store.check.content_check import Tally
+from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.halves import HalvesTest
-from photonfarm.shared.store.check.job_check import Checked, JobCheck
+from photonfarm.shared.store.check.job_check import CheckTarget, JobCheck
 from photonfarm.shared.store.io.storage import renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 
 MOST_THREADS = 4
-"""More of them would wait for the disk, or for each other."""
+"""The most threads: more would wait for the disk, or for each other."""
 
 
 class JobPool:
     """Threads that check jobs, each with memory of its own; a context manager."""
 
-    def __init__(self, scene: Checked, scenes: int) -> None:
-        self.tallies: list[Tally] = []
+    def __init__(self, scene: CheckTarget, scenes: int) -> None:
+        self.tallies: list[CheckTotals] = []
         self._own = threading.local()
         self._scene = scene
         self._scenes = scenes
@@ -43,7 +43,7 @@ class JobPool:
         return sum(tally.size_bytes for tally in self.tallies)
 
     def run(self, jobs: list[int]) -> Iterator[tuple[list[Finding], bytes]]:
-        """What is found of each job, and its marker, in order."""
+        """The findings of each job, and its marker, in order."""
         return self._threads.map(self._check, jobs)
 
     def _check(self, job: int) -> tuple[list[Finding], bytes]:
@@ -55,28 +55,28 @@ class JobPool:
 
 
 class _Checker:
-    """Checks jobs of a scene one after the other; knows damage of the store from that of this machine's copies."""
+    """Checks jobs of a scene one after the other; tells damage of the store from that of this machine's copies."""
 
-    def __init__(self, scene: Checked, scenes: int) -> None:
-        self.tally = Tally(HalvesTest(scenes))
+    def __init__(self, scene: CheckTarget, scenes: int) -> None:
+        self.tally = CheckTotals(HalvesTest(scenes))
         self._scene = scene
         self._scenes = scenes
         self._check = JobCheck(scene)
 
     def run(self, job: int) -> tuple[list[Finding], bytes]:
-        """What is found of a job, and its marker; where copies may be to blame, of new ones."""
+        """The findings of a job, and its marker; damaged local copies are replaced and read again first."""
         found, marker, tally = self._run(job)
         if self._renewed(found):
             found, marker, tally = self._run(job)
         self.tally.add(tally)
         return found, marker
 
-    def _run(self, job: int) -> tuple[list[Finding], bytes, Tally]:
-        tally = Tally(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
+    def _run(self, job: int) -> tuple[list[Finding], bytes, CheckTotals]:
+        tally = CheckTotals(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
         return *self._check.run(job, tally), tally
 
     def _renewed(self, found: list[Finding]) -> bool:
-        """Whether what was read differs from what was committed, and was a copy: then the copies are new now."""
+        """Replace the local copies of files with wrong checksums; returns whether there were any."""
         damaged = {finding.file for finding in found if finding.cause is Cause.CHECKSUM and finding.file}
         renewed = [renew_copy(self._scene.storage, file) for file in sorted(damaged)]
         return any(renewed)

@@ -1,6 +1,6 @@
 """Reads what a scene's jobs are made from and refer to: its plans and its base.
 
-A chunk that is missing is read by Zarr as fill values, in silence; so the chunks are counted first.
+Zarr reads a missing chunk as fill values, in silence; so the chunks are counted first.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import read_base
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError)
-"""What zarr-python raises for damaged metadata and chunks; a group in the place of an array lacks its attributes."""
+"""What zarr-python raises for damaged metadata and chunks; a group in place of an array lacks its attributes."""
 
 _INPUTS = tuple(field.name for field in fields(PlannedRows))
 
@@ -37,14 +37,14 @@ class PlanCheck:
         self._storage = storage
         self._spec = spec
         self._scene = scene  # its folder
-        self.shard_rows: int | None = None  # as the first plan that can be read tells
+        self.shard_rows: int | None = None  # as the first readable plan states
         self.plans: list[StoredPlan] | None = None  # once checked; None if one is damaged
         self.lost: set[str] = set()  # folders of plans that are missing
 
     # ------------------------------------------------------------------------------------------------------------ plans
 
     def check_plans(self) -> Iterator[Finding]:
-        """What is wrong with the plans."""
+        """Yield what is wrong with the plans."""
         found: list[Finding] = []
         for number in range(plans.count(self._storage, self._scene)):
             folder = plans.folder(self._scene, number)
@@ -71,7 +71,7 @@ class PlanCheck:
         return Finding(Cause.UNREADABLE, error.strerror or str(error), self._id, file=folder)
 
     def _plan(self, folder: str) -> Iterator[Finding]:
-        """What is wrong with the files of a plan."""
+        """Yield what is wrong with the files of a plan."""
         import zarr
 
         if not self._storage.exists(f"{folder}/zarr.json"):
@@ -98,7 +98,7 @@ class PlanCheck:
                 yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
 
     def _array(self, group: Any, folder: str, name: str, rows: int | None = None) -> str:
-        """What is wrong with an array of inputs or of the base; empty if nothing is."""
+        """What is wrong with an array of inputs or of the base; empty if nothing."""
         try:
             array = group[name]
             if rows is not None and array.shape[0] != rows:
@@ -111,7 +111,7 @@ class PlanCheck:
         return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
 
     def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
-        """Rows and jobs that do not follow each other, and samples that refer to rows that hold nothing."""
+        """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
         modification, view = _stacked(found)
         first_job = 0
         for plan in found:
@@ -134,7 +134,7 @@ class PlanCheck:
             first_job = plan.end_job
 
     def _keys(self, found: list[StoredPlan]) -> Iterator[Finding]:
-        """Samples whose content key is not that of their content, or is another sample's as well."""
+        """Find samples whose content key does not match their content, or belongs to another sample as well."""
         modification, view = _stacked(found)
         for plan in found:
             rows = plan.rows
@@ -154,9 +154,10 @@ class PlanCheck:
     # ------------------------------------------------------------------------------------------------------------- base
 
     def check_base(self, committed: Set[int]) -> Iterator[Finding]:
-        """What is wrong with geometry and base point cloud, which are there once a job is committed.
+        """Yield what is wrong with geometry and base point cloud, which are there once a job is committed.
 
-        Any job that is rendered writes them: without them and with one of the plans' jobs to come, workers mend that.
+        Any job writes them when it is rendered: if they are missing and a planned job is still to come, workers mend
+        that.
         """
         folder = f"{self._scene}/base"
         try:
@@ -195,7 +196,7 @@ class PlanCheck:
 
 
 def declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:
-    """What is wrong with the declaration of an output array, which other programs read it by; empty if nothing is."""
+    """What is wrong with the declaration of an output array, by which other programs read it; empty if nothing."""
     try:
         declared = group[array.name]
         found = declared.shape, declared.dtype, declared.chunks, declared.shards
@@ -215,7 +216,7 @@ def _stacked(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.f
 
 
 def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> str:
-    """Which index points at nothing; empty if none does."""
+    """Which index is out of range; empty if none is."""
     limits: dict[str, tuple[NDArray[Any], int]] = {
         "geometry/faces": (geometry.faces, len(geometry.vertices)),
         "geometry/face_shape": (geometry.face_shape, len(geometry.shape_group)),

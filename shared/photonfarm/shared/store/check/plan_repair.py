@@ -1,7 +1,7 @@
 """Damaged inputs of a plan are written again: they are a function of its request and of the plans before it.
 
-What the request gives is believed only where everything that can still be read agrees with it bit by bit, and where
-that settles each sample: by its content key, or by its own row with its view's and its modification's.
+The rows of the request are trusted only if all that can still be read agrees with them bit by bit, and if that
+determines each sample: by its content key, or by its own row with those of its view and modification.
 
 Shape letters: R rows of the plan.
 """
@@ -23,11 +23,11 @@ from photonfarm.shared.core.errors import CorruptError, SpecError
 from photonfarm.shared.plan.request import UNUSED, PlannedRows
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.format.declarations import Declared
+from photonfarm.shared.store.format.declarations import ArrayDeclaration
 from photonfarm.shared.store.io.storage import Storage, read_or_none
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Finding
-from photonfarm.shared.store.write.plans import About, StoredPlan
+from photonfarm.shared.store.write.plans import PlanAttributes, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
 
 Mask = NDArray[np.bool_]
@@ -36,20 +36,20 @@ _CRC_BYTES = 4
 
 
 class PlanRepair:
-    """Writes damaged files of a scene's plans again; the first plan first, as later ones follow from it."""
+    """Writes damaged files of a scene's plans again, in their order, as later plans follow from earlier ones."""
 
     def __init__(self, storage: Storage, spec: SceneSpec, scene: str, quarantine: Quarantine) -> None:
-        """Take the scene, whose folder is `scene`, and where damaged files are set aside."""
+        """Take the scene, whose folder is `scene`, and the quarantine for damaged files."""
         self._storage = storage
         self._spec = spec
         self._scene = scene
         self._quarantine = quarantine
 
     def run(self, number: int, why: Sequence[Finding]) -> None:
-        """Write again what is found of a plan, whose folder must have its zarr.json.
+        """Write the damaged files of a plan again; its folder must have its zarr.json.
 
-        Raises CorruptError where the request does not give what can still be read, or too little of that is left, and
-        where a plan before it is damaged.
+        Raises CorruptError if the request disagrees with what can still be read, if too little of that is left, or if
+        an earlier plan is damaged.
         """
         before = plans.load_all(self._storage, self._scene, [], until=number)
         folder = plans.folder(self._scene, number)
@@ -70,7 +70,7 @@ class PlanRepair:
         finally:
             shutil.rmtree(built, ignore_errors=True)
 
-    def _about(self, folder: str) -> About:
+    def _about(self, folder: str) -> PlanAttributes:
         import zarr
 
         try:
@@ -79,8 +79,8 @@ class PlanRepair:
         except (ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError) as error:
             raise self._hopeless(folder, f"its zarr.json cannot be read: {error}") from error
 
-    def _rows(self, folder: str, about: About, before: list[StoredPlan]) -> PlannedRows:
-        """What the request gives after the plans before it."""
+    def _rows(self, folder: str, about: PlanAttributes, before: list[StoredPlan]) -> PlannedRows:
+        """The rows that the request gives after the earlier plans."""
         first_job = before[-1].end_job if before else 0
         if about.first_job != first_job or any(plan.shard_rows != about.shard_rows for plan in before):
             raise self._hopeless(folder, f"its zarr.json names job {about.first_job}; it begins at job {first_job}")
@@ -95,7 +95,7 @@ class PlanRepair:
         return rows
 
     def _compare(self, folder: str, rows: PlannedRows, first_row: int) -> None:
-        """Return if everything that can be read of the inputs agrees, and settles every sample; else CorruptError."""
+        """Return if all readable inputs agree with these rows and determine every sample; else raise CorruptError."""
         read: dict[str, Mask] = {}
         for declared in declarations.PLAN_INPUTS:
             values = getattr(rows, declared.name)
@@ -116,7 +116,7 @@ class PlanRepair:
             raise self._hopeless(folder, "too little of it can be read to tell that its request gives the same")
 
     def _intact_chunks(
-        self, folder: str, declared: Declared, values: NDArray[Any]
+        self, folder: str, declared: ArrayDeclaration, values: NDArray[Any]
     ) -> Iterator[tuple[int, NDArray[Any]]]:
         """The chunks that are whole by their checksum, each with its first row; read without the array's zarr.json."""
         length = min(max(len(values), 1), schema.INPUT_ROWS_PER_CHUNK)
@@ -137,7 +137,7 @@ class PlanRepair:
 
 
 def differs(storage: Storage, name: str, built: Path) -> bool:
-    """Whether a file is damaged or missing: a chunk by its checksum, a declaration by what it says."""
+    """Whether a file is damaged or missing: a chunk by its checksum, a declaration by its content."""
     content = read_or_none(storage, name)
     if content is None or not name.endswith("zarr.json"):
         return content is None or not _is_whole(content)
@@ -153,7 +153,7 @@ def _is_whole(content: bytes) -> bool:
 
 
 def _known(references: NDArray[np.int64], own: Mask, first_row: int) -> Mask:
-    """Whether the rows (R,) that samples refer to have been read; those of older plans have, and none need not be."""
+    """Whether the rows (R,) that samples refer to are known: they were read, are of older plans, or are unused."""
     known = references < first_row
     known[~known] = own[references[~known] - first_row]
     return known | (references == UNUSED)

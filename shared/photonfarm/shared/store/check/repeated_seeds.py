@@ -1,7 +1,7 @@
 """Samples that have a half in common: a seed was used twice.
 
-Seeds have 32 bits, so that among many samples some have one in common by chance. Rendered again, these would come out
-the same; so they are told from those that a fault has made.
+Seeds have 32 bits, so that among many samples some have one in common by chance. Such samples would be equal again when
+rendered again, so they are distinguished from those that a fault has made.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.keys import seed_of
-from photonfarm.shared.store.check.content_check import Tally, is_constant
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.content_check import CheckTotals, is_constant
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Cause, Finding
 
 DRAWN = 4
-"""Seeds of a half that a renderer may draw: three are tried, and one may be the other half's."""
+"""The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""
 
 
-def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
+def equal_samples(scene: CheckTarget, tally: CheckTotals) -> Iterator[Finding]:
     """Samples that have a half in common. Constant halves may rightly be equal: there is no noise in them."""
     for rows in tally.fingerprints.suspects():
         read = ((row, halves) for row in rows if (halves := _halves(scene, row)) is not None)
@@ -42,13 +42,13 @@ def equal_samples(scene: Checked, tally: Tally) -> Iterator[Finding]:
             yield _shared(scene, cause, first, max(row for row in causes if causes[row] is cause))
 
 
-def _shared(scene: Checked, cause: Cause, row: int, other: int) -> Finding:
+def _shared(scene: CheckTarget, cause: Cause, row: int, other: int) -> Finding:
     detail = f"has a half in common with row {other}"
     return Finding(cause, detail, scene.scene_id, row // scene.shard_rows, row)
 
 
-def _seeds(scene: Checked, row: int) -> set[int]:
-    """The seeds that the halves of a sample may have been rendered with, by its key; none if no plan tells that."""
+def _seeds(scene: CheckTarget, row: int) -> set[int]:
+    """The seeds that the halves of a sample may have been rendered with, by its key; none without a plan."""
     sample = plans.sample_at(scene.plans, row) if scene.plans else None
     if sample is None:
         return set()
@@ -56,7 +56,7 @@ def _seeds(scene: Checked, row: int) -> set[int]:
     return {seed_of(sample.key, purpose) for purpose in purposes}
 
 
-def _halves(scene: Checked, row: int) -> NDArray[np.floating] | None:
+def _halves(scene: CheckTarget, row: int) -> NDArray[np.floating] | None:
     """The stored halves of a row; None if they cannot be read (any more)."""
     job, i = divmod(row, scene.shard_rows)
     arrays, files = schema.output_arrays(scene.spec), scene.files_of(job)

@@ -6,13 +6,13 @@ import re
 from collections.abc import Iterator
 from itertools import chain
 
-from photonfarm.shared.store.check.job_check import Checked
+from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.write.findings import Cause, Finding
 
 
-def strangers(scene: Checked) -> Iterator[Finding]:
-    """Files of jobs that are not committed, and files that are none of ours."""
+def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
+    """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
     foreign = [
         f"{scene.name}/{markers.COMMITTED}/{name}"
@@ -33,7 +33,7 @@ def strangers(scene: Checked) -> Iterator[Finding]:
     yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
 
 
-def _array_folders(scene: Checked) -> Iterator[tuple[str, int, int, schema.ArraySchema]]:
+def _array_folders(scene: CheckTarget) -> Iterator[tuple[str, int, int, schema.ArraySchema]]:
     arrays = scene.arrays.values()
     return chain.from_iterable(
         ((f"{plan.folder}/{array.name}", plan.first_job, plan.end_job, array) for array in arrays)

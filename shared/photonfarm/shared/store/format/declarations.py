@@ -1,6 +1,6 @@
 """What the format declares: its version, and every array with type, shape, unit and convention. Part of the version.
 
-docs/store-format.md tells readers the same; a test compares the two, and every array carries it in its attributes.
+docs/store-format.md repeats it for readers; a test compares the two, and every array carries it in its attributes.
 
 Shape letters: R rows of a plan, H W image, K photon slots, L lit points, G movable groups; of the base: P points,
 V vertices, F triangles, S shapes.
@@ -33,14 +33,14 @@ def new_store_id() -> str:
 
 
 def is_store_id(value: object) -> bool:
-    """Whether a value is written as a store's id."""
+    """Whether a value has the form of a store's id."""
     return isinstance(value, str) and re.fullmatch("[0-9a-f]{32}", value) is not None
 
 
 def check_version(name: object, version: object, where: str, document: str = "photonfarm.json") -> None:
-    """Return for what this program reads and writes; raises StoreError, with what to do, for any other format.
+    """Return for the format that this program reads and writes; raises StoreError, with a remedy, for any other.
 
-    `document` is what states them.
+    `document` is the name of the file that states them.
     """
     if name == FORMAT and type(version) is int and version == VERSION:
         return
@@ -62,7 +62,7 @@ def check_version(name: object, version: object, where: str, document: str = "ph
 
 
 @dataclass(frozen=True, slots=True)
-class Declared:
+class ArrayDeclaration:
     """One array as the format declares it, for scenes of any size."""
 
     name: str
@@ -75,12 +75,12 @@ class Declared:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What the stored array says of itself."""
+        """The attributes of the stored array."""
         return {"unit": self.unit, "convention": self.convention}
 
     @property
     def fill(self) -> float | int:
-        """What is read where nothing is written: NaN, −1, or 0 for what has no sign."""
+        """The value read where nothing is written: NaN, −1, or 0 for unsigned types."""
         return {"f": np.nan, "i": -1, "u": 0}[np.dtype(self.dtype).kind]
 
 
@@ -92,7 +92,7 @@ _BITS = "bit i of byte j, bit 0 the least significant"
 _SEEN = "1: in the image, and hidden by nothing; bits left over: 0"
 
 OUTPUTS = (
-    Declared(
+    ArrayDeclaration(
         "radiance",
         ("sample", "half", "y", "x", "channel"),
         ("R", 2, "H", "W", 3),
@@ -101,7 +101,7 @@ OUTPUTS = (
         f"{_HALVES}; stored × 2^radiance_exponent; all NaN in a row that float16 cannot hold: see radiance_wide",
         compressed=False,
     ),
-    Declared(
+    ArrayDeclaration(
         "radiance_wide",
         ("sample", "half", "y", "x", "channel"),
         ("R", 2, "H", "W", 3),
@@ -110,7 +110,7 @@ OUTPUTS = (
         f"{_HALVES}; rows that float16 cannot hold, stored × 2^radiance_exponent with the exponent 0",
         compressed=False,
     ),
-    Declared(
+    ArrayDeclaration(
         "depth",
         ("view", "y", "x"),
         ("R", "H", "W"),
@@ -118,7 +118,7 @@ OUTPUTS = (
         "scene units",
         "along the camera's forward axis, not along the ray; 0: nothing is met between the near and the far plane",
     ),
-    Declared(
+    ArrayDeclaration(
         "albedo",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -126,7 +126,7 @@ OUTPUTS = (
         "1",
         "diffuse reflectance, linear RGB, mean over the pixel; 0: nothing is met, or it has no diffuse part",
     ),
-    Declared(
+    ArrayDeclaration(
         "normal",
         ("view", "y", "x", "axis"),
         ("R", "H", "W", 3),
@@ -134,7 +134,7 @@ OUTPUTS = (
         "1",
         f"unit shading normal, {_WORLD}, as modelled: not turned to the camera; 0: nothing is met",
     ),
-    Declared(
+    ArrayDeclaration(
         "point_seen",
         ("view", "byte"),
         ("R", "⌈P/8⌉"),
@@ -142,7 +142,7 @@ OUTPUTS = (
         "1",
         f"{_BITS}: whether the view sees point 8j + i of the cloud; {_SEEN}",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_seen",
         ("view", "byte"),
         ("R", "⌈K/8⌉"),
@@ -150,7 +150,7 @@ OUTPUTS = (
         "1",
         f"{_BITS}: whether the view sees the photon in slot 8j + i of its modification; {_SEEN}",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_position",
         ("modification", "slot", "axis"),
         ("R", "K", 3),
@@ -158,7 +158,7 @@ OUTPUTS = (
         "scene units",
         f"where the light arrives, {_WORLD}",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_direction",
         ("modification", "slot", "axis"),
         ("R", "K", 3),
@@ -166,7 +166,7 @@ OUTPUTS = (
         "1",
         f"unit, the way the light travels on arriving, {_WORLD}",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_normal",
         ("modification", "slot", "axis"),
         ("R", "K", 3),
@@ -174,7 +174,7 @@ OUTPUTS = (
         "1",
         f"unit geometric normal, {_WORLD}, as modelled: not turned to the light",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_power",
         ("modification", "slot", "channel"),
         ("R", "K", 3),
@@ -182,7 +182,7 @@ OUTPUTS = (
         _FLUX,
         "linear RGB that arrives, before reflection, over the number of paths: sums do not depend on that number",
     ),
-    Declared(
+    ArrayDeclaration(
         "photon_bounce",
         ("modification", "slot"),
         ("R", "K"),
@@ -191,14 +191,14 @@ OUTPUTS = (
         "surfaces met before: 0 straight from a light; -1: an empty slot, 0 in the other arrays",
     ),
 )
-"""What jobs produce. The first axis names what a row belongs to."""
+"""The arrays that jobs produce. The first axis names what a row belongs to."""
 
 _MEAN = "mean over the pixel"
 _FIRST = "of the first surface"
 _BEYOND = "of the surface that pure mirrors, glass and null surfaces lead to; 0: the first surface is none of these"
 
 GUIDES = (
-    Declared(
+    ArrayDeclaration(
         "emission",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -206,7 +206,7 @@ GUIDES = (
         _RADIANCE,
         f"linear RGB emitted towards the eye, {_MEAN}, also by what mirrors and glass lead to; free of noise",
     ),
-    Declared(
+    ArrayDeclaration(
         "direct",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -215,7 +215,7 @@ GUIDES = (
         f"linear RGB, {_MEAN}: diffuse reflection of light that arrives straight from lights, also at what mirrors and "
         "glass lead to; noisy, by a seed of its own; rounded to 8 significant bits",
     ),
-    Declared(
+    ArrayDeclaration(
         "gloss",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -223,7 +223,7 @@ GUIDES = (
         _RADIANCE,
         f"as direct, reflected by all other lobes, {_MEAN}; may be below 0, as both together are the whole",
     ),
-    Declared(
+    ArrayDeclaration(
         "specular",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -231,7 +231,7 @@ GUIDES = (
         "1",
         f"directional albedo of all lobes {_FIRST} but the diffuse one, at least 0, {_MEAN}",
     ),
-    Declared(
+    ArrayDeclaration(
         "roughness",
         ("view", "y", "x"),
         ("R", "H", "W"),
@@ -239,7 +239,7 @@ GUIDES = (
         "1",
         f"microfacet alpha {_FIRST}, {_MEAN}; 0: mirror, glass, or nothing is met; 1: diffuse",
     ),
-    Declared(
+    ArrayDeclaration(
         "mean_depth",
         ("view", "y", "x"),
         ("R", "H", "W"),
@@ -247,7 +247,7 @@ GUIDES = (
         "scene units",
         f"along the camera's forward axis, {_FIRST}, {_MEAN} of the rays that meet one",
     ),
-    Declared(
+    ArrayDeclaration(
         "mean_normal",
         ("view", "y", "x", "axis"),
         ("R", "H", "W", 3),
@@ -255,7 +255,7 @@ GUIDES = (
         "1",
         f"shading normal {_FIRST} turned to the eye, {_WORLD}, {_MEAN}; not of unit length",
     ),
-    Declared(
+    ArrayDeclaration(
         "throughput",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -264,7 +264,7 @@ GUIDES = (
         "what pure mirrors, glass and null surfaces let through on the way to the surface they lead to, "
         f"{_MEAN}; 0: the first surface is none of these",
     ),
-    Declared(
+    ArrayDeclaration(
         "beyond_albedo",
         ("view", "y", "x", "channel"),
         ("R", "H", "W", 3),
@@ -272,7 +272,7 @@ GUIDES = (
         "1",
         f"diffuse reflectance, {_MEAN}, {_BEYOND}",
     ),
-    Declared(
+    ArrayDeclaration(
         "beyond_normal",
         ("view", "y", "x", "axis"),
         ("R", "H", "W", 3),
@@ -280,7 +280,7 @@ GUIDES = (
         "1",
         f"shading normal turned to where the path comes from, {_WORLD}, {_MEAN}, {_BEYOND}",
     ),
-    Declared(
+    ArrayDeclaration(
         "beyond_depth",
         ("view", "y", "x"),
         ("R", "H", "W"),
@@ -288,7 +288,7 @@ GUIDES = (
         "scene units",
         f"length of the path from the eye, {_MEAN}, {_BEYOND}",
     ),
-    Declared(
+    ArrayDeclaration(
         "point_light",
         ("view", "point", "channel"),
         ("R", "L", 3),
@@ -298,10 +298,10 @@ GUIDES = (
         "normal, by light that arrives straight from lights; noisy and rounded as direct",
     ),
 )
-"""What jobs produce of their new views for a scene that has guides, in groups of their own."""
+"""The arrays that jobs produce for new views in a scene with guides, in groups of their own."""
 
 PLAN_INPUTS = (
-    Declared(
+    ArrayDeclaration(
         "modification",
         ("modification", "group", "component"),
         ("R", "G", 4),
@@ -309,7 +309,7 @@ PLAN_INPUTS = (
         "scene units; the last component: 1",
         "translation from rest along x, y, z, then 1: present or 0: removed; NaN: unused row",
     ),
-    Declared(
+    ArrayDeclaration(
         "view",
         ("view", "component"),
         ("R", 6),
@@ -317,7 +317,7 @@ PLAN_INPUTS = (
         "scene units",
         f"camera position x, y, z, then the point it looks at, {_WORLD}; NaN: unused row",
     ),
-    Declared(
+    ArrayDeclaration(
         "sample_modification",
         ("sample",),
         ("R",),
@@ -325,20 +325,26 @@ PLAN_INPUTS = (
         "row of the scene",
         "the sample's modification; -1: unused row",
     ),
-    Declared("sample_view", ("sample",), ("R",), "<i8", "row of the scene", "the sample's view; -1: unused row"),
-    Declared("sample_pass", ("sample",), ("R",), "<i4", "1", "number of the noisy pass, from 0; -1: unused row"),
-    Declared(
+    ArrayDeclaration(
+        "sample_view", ("sample",), ("R",), "<i8", "row of the scene", "the sample's view; -1: unused row"
+    ),
+    ArrayDeclaration(
+        "sample_pass", ("sample",), ("R",), "<i4", "1", "number of the noisy pass, from 0; -1: unused row"
+    ),
+    ArrayDeclaration(
         "sample_key", ("sample", "byte"), ("R", KEY_BYTES), "|u1", "1", "the sample's content key; zeros: unused row"
     ),
 )
-"""What a plan asks for."""
+"""The arrays of a plan's inputs."""
 
 BASE = {
     "geometry": (
-        Declared("vertices", ("vertex", "axis"), ("V", 3), "<f4", "scene units", f"{_WORLD}, at rest"),
-        Declared("faces", ("triangle", "corner"), ("F", 3), "<u4", "row of vertices", "corners of each triangle"),
-        Declared("face_shape", ("triangle",), ("F",), "<i4", "index of a shape", "ascending: shape by shape"),
-        Declared(
+        ArrayDeclaration("vertices", ("vertex", "axis"), ("V", 3), "<f4", "scene units", f"{_WORLD}, at rest"),
+        ArrayDeclaration(
+            "faces", ("triangle", "corner"), ("F", 3), "<u4", "row of vertices", "corners of each triangle"
+        ),
+        ArrayDeclaration("face_shape", ("triangle",), ("F",), "<i4", "index of a shape", "ascending: shape by shape"),
+        ArrayDeclaration(
             "shape_group",
             ("shape",),
             ("S",),
@@ -348,14 +354,18 @@ BASE = {
         ),
     ),
     "cloud": (
-        Declared("position", ("point", "axis"), ("P", 3), "<f4", "scene units", f"{_WORLD}, at rest"),
-        Declared("normal", ("point", "axis"), ("P", 3), "<f4", "1", f"unit geometric normal, {_WORLD}, as modelled"),
-        Declared("albedo", ("point", "channel"), ("P", 3), "<f4", "1", "diffuse reflectance, linear RGB"),
-        Declared("emission", ("point", "channel"), ("P", 3), "<f4", _RADIANCE, "linear RGB leaving along the normal"),
-        Declared(
+        ArrayDeclaration("position", ("point", "axis"), ("P", 3), "<f4", "scene units", f"{_WORLD}, at rest"),
+        ArrayDeclaration(
+            "normal", ("point", "axis"), ("P", 3), "<f4", "1", f"unit geometric normal, {_WORLD}, as modelled"
+        ),
+        ArrayDeclaration("albedo", ("point", "channel"), ("P", 3), "<f4", "1", "diffuse reflectance, linear RGB"),
+        ArrayDeclaration(
+            "emission", ("point", "channel"), ("P", 3), "<f4", _RADIANCE, "linear RGB leaving along the normal"
+        ),
+        ArrayDeclaration(
             "group", ("point",), ("P",), "<i2", "index of a movable group", "the one it moves with; -1: never moves"
         ),
-        Declared("face", ("point",), ("P",), "<u4", "row of faces", "the triangle that the point lies in"),
+        ArrayDeclaration("face", ("point",), ("P",), "<u4", "row of faces", "the triangle that the point lies in"),
     ),
 }
-"""What is stored once per scene, by group."""
+"""The arrays that are stored once per scene, by group."""

@@ -22,7 +22,7 @@ _ShardName = Annotated[str, Field(pattern=r"^plans/[0-9]{6,}/[a-z0-9_]+/c(\.[0-9
 
 
 class _Stored(BaseModel):
-    """Part of a marker. Keys that it does not know are kept: a later program of this version may have added them."""
+    """A part of a marker. Unknown keys are kept: a later program of this version may have added them."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="allow")
 
@@ -47,14 +47,14 @@ class _Marker(_Stored):
 
 
 def name_of(scene: str, job: int) -> str:
-    """Where a job's marker lies; `scene` is the scene's folder."""
+    """The name of a job's marker; `scene` is the scene's folder."""
     return f"{scene}/{COMMITTED}/{job:0{_DIGITS}d}.json"
 
 
 def place(
     storage: Storage, scene: str, job: int, files: Mapping[str, Mapping[str, Any]], figures: Mapping[str, Any]
 ) -> bool:
-    """Announce a job, whose files have settled; False if it has been announced already."""
+    """Place the marker of a job, whose files have settled; False if it was there already."""
     below = {name.removeprefix(f"{scene}/"): about for name, about in files.items()}
     return put_json(storage, {"job": job, "files": below, "figures": figures}, name_of(scene, job))
 
@@ -62,7 +62,7 @@ def place(
 def read(storage: Storage, scene: str, job: int) -> dict[str, Any]:
     """The marker of a committed job: its files, by path below the scene's folder, and its figures.
 
-    Raises CorruptError, with the file and the broken rule, for one that no job of ours has placed.
+    Raises CorruptError, with the file and the broken rule, for content that no job of ours has written.
     """
     name = name_of(scene, job)
     where = f"{storage.where}/{name}"
@@ -74,7 +74,7 @@ def read(storage: Storage, scene: str, job: int) -> dict[str, Any]:
 
 
 def parse(content: bytes, job: int, where: str) -> dict[str, Any]:
-    """The marker of a job in its bytes, which lie at `where`; raises CorruptError as `read` does."""
+    """The marker in a job's bytes, which are stored at `where`; raises CorruptError as `read` does."""
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -101,7 +101,7 @@ def _checked(document: Any, job: int, where: str) -> dict[str, Any]:
 
 
 def jobs(storage: Storage, scene: str) -> set[int]:
-    """The jobs of a scene that have their marker; costs one listing."""
+    """The jobs of a scene that have a marker; costs one listing."""
     with store_errors("list the markers", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{COMMITTED}")
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.records import LIT_POINTS
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, Declared
+from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
     import zarr
@@ -37,7 +37,7 @@ BLOSC: dict[str, Any] = {
 
 _INDEX_ENTRY, _CRC, _BLOSC_HEADER = 16, 4, 16
 _ROW_OVERHEAD = _BLOSC_HEADER + _CRC
-"""Bytes of a shard beside its values: of each of its rows in the index, of each checksum, and of what is compressed."""
+"""The bytes of a shard beside its values: an index entry and a checksum for each row, and Blosc's header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class ArraySchema:
     kind: Kind
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    fill: float | int  # of rows that are not written; a legal value of written ones in `photon_bounce` and bits only
+    fill: float | int  # of unwritten rows; in `photon_bounce` and bits also a legal value of written ones
     compressed: bool
     dimensions: tuple[str, ...]  # names of the axes after the row
     attributes: dict[str, Any]
@@ -68,7 +68,7 @@ def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     return _arrays(GUIDES, spec)
 
 
-def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySchema]:
+def _arrays(declared: Iterable[ArrayDeclaration], spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
@@ -77,7 +77,7 @@ def _arrays(declared: Iterable[Declared], spec: SceneSpec) -> dict[str, ArraySch
 
 
 def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
-    """Stored bytes of one sample, one view with its guides, and one modification, before compression, with inputs."""
+    """The stored bytes of one sample, one view with its guides, and one modification, with inputs, uncompressed."""
     found: dict[Kind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
@@ -87,18 +87,18 @@ def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
 
 
 def most_guide_bytes(spec: SceneSpec, views: int, jobs: int, shard_rows: int) -> int:
-    """Stored bytes of the guides of so many views, in so many jobs, where nothing of them can be compressed."""
+    """The stored bytes of the guides of so many views, in so many jobs, if nothing can be compressed."""
     arrays = guide_arrays(spec).values()
     rows = sum(int(np.prod(array.shape)) * array.dtype.itemsize + _ROW_OVERHEAD for array in arrays)
     return views * rows + jobs * len(arrays) * (_INDEX_ENTRY * shard_rows + _CRC)
 
 
 def bit_counts(spec: SceneSpec) -> dict[str, int]:
-    """The bits of a row in the arrays that hold bits: one for each point, and one for each photon slot."""
+    """The number of bits in a row of the arrays of bits: one for each point, and one for each photon slot."""
     return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
 
 
-def _resolved(declared: Declared, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
+def _resolved(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
     exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
     scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
     return ArraySchema(
@@ -134,8 +134,8 @@ def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, 
         )
 
 
-def create_input(group: zarr.Group, declared: Declared, data: NDArray[Any]) -> None:
-    """Store one whole array of inputs or of the base, compressed and with checksums; `data` has the declared type."""
+def create_input(group: zarr.Group, declared: ArrayDeclaration, data: NDArray[Any]) -> None:
+    """Store a whole array of inputs or of the base, compressed and with checksums; `data` has the declared type."""
     chunks = (min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:]))
     little = data.astype(declared.dtype, casting="equiv", copy=False)
     array = group.create_array(
@@ -164,10 +164,10 @@ def chunk_names(array: Any) -> Iterator[str]:
 
 
 def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
-    """One whole array of inputs or of the base, which lies in a folder.
+    """Read a whole array of inputs or of the base from its folder.
 
-    Raises CorruptError for a chunk that is missing, which zarr reads as fill values, and ValueError, with the array's
-    name, for others that zarr cannot read.
+    Raises CorruptError for a missing chunk, which zarr would read as fill values, and ValueError, with the array's
+    name, for chunks that zarr cannot read.
     """
     held = set(storage.names(folder))
     for name in chunk_names(array):

@@ -4,9 +4,9 @@ A shard (Zarr v3 `sharding_indexed`, index at the end) is the inner chunks in an
 and length as little-endian uint64 (both 2^64 − 1 for an empty one), then the CRC-32C of that index. Each inner chunk
 is its bytes, compressed or not, then their CRC-32C. zarr-python and tensorstore are the oracles of the tests.
 
-A row is read from the file the first time, and from then on copied out of a map of it, which takes two thirds of the
-time, for as long as the page cache holds it. Where it does not, reading is the faster of the two; and a map whose file
-is cut or whose disk fails ends the process, where reading raises.
+A row is read from the file the first time, and later copied out of a map of it, which takes two thirds of the time, as
+long as the page cache holds it. Otherwise reading is the faster of the two; and a map ends the process if its file is
+cut or its disk fails, where reading raises.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ _EMPTY = 2**64 - 1
 _CRC_BYTES = 4
 _BLOSC_HEADER_BYTES = 16
 _FLUSH_BYTES = 4 << 20
-"""Written before the disk is set to work on it: the sync, which a commit waits for, has little left to do."""
+"""The bytes written before the disk is set to work on them, so that the sync of a commit has little left to do."""
 
 _DAMAGED = (errno.EIO, errno.EBADMSG, errno.EUCLEAN)
-"""Why a file system refuses a file that is there: the disk, or its own checksums."""
+"""The errors by which a file system refuses a file that is there: of the disk, or of its own checksums."""
 
 _PIECE_BYTES = 256 << 10
-"""Copied at once, then checked while a core's own cache still holds it."""
+"""The bytes copied at a time, and then checked while a core's own cache still holds them."""
 
 _NO_WAIT: int | None = getattr(os, "RWF_NOWAIT", None)
-"""Read what the page cache holds, or fail. Linux alone has it; nothing is mapped without."""
+"""Read what the page cache holds, or fail. Only Linux has it; elsewhere nothing is mapped."""
 
 
 def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
-    """The bytes of one row (the array's row shape) as they are stored, but for their checksum."""
+    """The stored bytes of one row (the array's row shape), without their checksum."""
     data: Any = np.ascontiguousarray(values, array.dtype)
     if array.compressed:
         name, level = BLOSC["cname"].encode(), BLOSC["clevel"]
@@ -75,7 +75,7 @@ class ShardWriter:
             self._flushed = self._size
 
     def finish(self) -> dict[str, Any]:
-        """Write the index; the file's size, and one checksum over those of its rows and of the index."""
+        """Write the index; returns the file's size, and one checksum over those of its rows and of the index."""
         index = self._index.tobytes()
         self._write(index + _crc(index))
         self._file.close()
@@ -97,9 +97,9 @@ class Shard:
     """One whole shard, open for reading, its index checked. Safe for several threads at once."""
 
     def __init__(self, path: Path, array: ArraySchema, shard_rows: int) -> None:
-        """Open; raises CorruptError, with the file's name, for a missing, cut or damaged file.
+        """Open a shard; raises CorruptError, with the file's name, for a missing, cut or damaged file.
 
-        Whether one cannot be opened for want of rights or descriptors says nothing of it: that is a plain OSError.
+        A file that cannot be opened for want of rights or descriptors may be whole: that raises a plain OSError.
         """
         self.path = path
         try:
@@ -140,7 +140,7 @@ class Shard:
         return self._index[row][0] != _EMPTY
 
     def read(self, row: int) -> NDArray[Any] | None:
-        """A row, of the array's row shape and type; None if it is not written. Raises CorruptError."""
+        """Read a row, of the array's row shape and type; None if it is not written. Raises CorruptError."""
         if row not in self:
             return None
         values = np.empty(self._array.shape, self._array.dtype)
@@ -148,9 +148,9 @@ class Shard:
         return values
 
     def read_into(self, row: int, values: NDArray[Any]) -> None:
-        """A written row into an array of its shape and type, contiguous.
+        """Read a written row into a contiguous array of its shape and type.
 
-        Every byte has been checked; raises CorruptError, with the file's name, if one is not what was written.
+        Every byte is checked; raises CorruptError, with the file's name, if one is not what was written.
         """
         memory = np.frombuffer(values.data.cast("B"), np.uint8)
         if self._array.compressed:
@@ -161,7 +161,7 @@ class Shard:
     def _checked(self, row: int, memory: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
         """The stored bytes of a row without their checksum, in `memory` if that is given.
 
-        What is checked is what is returned: the copy in memory, not the file that it was made of.
+        The check is on what is returned: the copy in memory, not the file that it was read from.
         """
         offset, length = self._index[row]
         end, crc = offset + length - _CRC_BYTES, bytearray(_CRC_BYTES)
@@ -179,7 +179,7 @@ class Shard:
         return content
 
     def _read_at(self, offset: int, *memory: memoryview | bytearray) -> int:
-        """Read into some memory from an offset on; how many bytes came. Raises CorruptError where the disk fails."""
+        """Read into some memory from an offset; returns how many bytes came. Raises CorruptError if the disk fails."""
         try:
             return os.preadv(self._descriptor, memory, offset)
         except OSError as error:
@@ -188,7 +188,7 @@ class Shard:
     def _mapped(self, row: int, end: int, crc: bytearray) -> NDArray[np.uint8] | None:
         """The file in memory, if the row should be taken from there, with the row's checksum read into `crc`.
 
-        That it can be read at once tells that the row is in the page cache, and that the file has not been cut.
+        If the checksum can be read without waiting, the row is in the page cache and the file has not been cut.
         """
         if not self._read_before[row] or _NO_WAIT is None:
             self._read_before[row] = True
@@ -203,14 +203,14 @@ class Shard:
         return self._map
 
     def _decompress(self, content: NDArray[np.uint8], row: int, memory: NDArray[np.uint8]) -> None:
-        """Blosc's header states both sizes; it writes no less, and reads no more, where they are right."""
+        """Decompress a row. If the sizes in Blosc's header are right, it writes no less and reads no more."""
         sizes = content[4:_BLOSC_HEADER_BYTES].tobytes()
         expected = len(memory).to_bytes(4, "little"), len(content).to_bytes(4, "little")
         if (sizes[:4], sizes[8:]) != expected:
             raise self._damaged(f"row {row} of the shard")
         try:
             numcodecs.blosc.decompress(content, memory)
-        except (RuntimeError, ValueError) as error:  # whole, and yet not of this array
+        except (RuntimeError, ValueError) as error:  # a whole row of another array
             raise self._damaged(f"row {row} of the shard") from error
 
     def _refused(self, error: OSError) -> CorruptError:
@@ -220,7 +220,7 @@ class Shard:
         return CorruptError(f"{self.path}: {what} fails its CRC-32C; the stored bytes are not what was committed")
 
     def summary(self) -> dict[str, Any]:
-        """Size and checksum as `ShardWriter.finish` gave them, from the checksums that are stored."""
+        """The size and checksum as `ShardWriter.finish` returned them, from the stored checksums."""
         ends = [offset + length for offset, length in self._index if offset != _EMPTY]
         crcs = [bytearray(_CRC_BYTES) for _ in ends]
         for end, crc in zip(ends, crcs, strict=True):
@@ -230,7 +230,7 @@ class Shard:
 
 
 def _copy(content: NDArray[np.uint8], memory: NDArray[np.uint8]) -> bytes:
-    """Copy bytes, and the CRC-32C of what has arrived."""
+    """Copy bytes; returns the CRC-32C of the copy."""
     checksum = 0
     for start in range(0, len(memory), _PIECE_BYTES):
         piece = memory[start : start + _PIECE_BYTES]

@@ -30,7 +30,7 @@ class LocalStorage:
     """`storage.Storage` in a folder, which need not exist yet."""
 
     def __init__(self, root: Path, mark: str | None = None) -> None:
-        """Name the folder, and the file of it without which it is taken for gone; None for one that may be made."""
+        """Take the folder, and the name of a file in it without which it counts as gone; None: it may be made."""
         self.root = root
         self._mark = mark
         self._is_founding = mark is None
@@ -51,11 +51,11 @@ class LocalStorage:
         return (self.root / name).read_bytes()
 
     def exists(self, name: str) -> bool:
-        """Whether a name has bytes."""
+        """Whether there is a file of this name."""
         return (self.root / name).is_file()
 
     def size(self, name: str) -> int:
-        """How many bytes a name has; raises FileNotFoundError."""
+        """The size of a file in bytes; raises FileNotFoundError."""
         return (self.root / name).stat().st_size
 
     def names(self, folder: str) -> list[str]:
@@ -63,12 +63,12 @@ class LocalStorage:
         try:
             return [path.name for path in (self.root / folder).iterdir()]
         except FileNotFoundError:
-            if folder:  # else it is asked whether there is anything at all
+            if folder:  # the root is listed to see whether anything is there
                 self.require()
             return []
 
     def zarr(self, folder: str) -> LocalStore:
-        """A folder as zarr-python reads it."""
+        """A folder in the form that zarr-python reads."""
         from zarr.storage import LocalStore
 
         return LocalStore(self.root / folder, read_only=True)
@@ -76,16 +76,16 @@ class LocalStorage:
     # ---------------------------------------------------------------------------------------------------------- writing
 
     def part(self) -> Path:
-        """A new path in `tmp` that says whose it is: host, process space, process, number, time."""
+        """A new path in `tmp` whose name states its owner: host, process space, process, number, time."""
         tmp = self.root / TMP
-        if not tmp.is_dir():  # of a store that is gone, which is asked again before anything is adopted
+        if not tmp.is_dir():  # the store may be gone, which is checked again before anything is adopted
             self.require()
             self._make_folder(self.root)
             tmp.mkdir(exist_ok=True)
         return tmp / f"{process_space()}-{os.getpid()}-{next(_counter)}-{time.time_ns():x}.partial"
 
     def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
-        """Sync a part and link it to its name; False if that was taken."""
+        """Sync a part and link it to its name; False if the name was taken."""
         self.require()
         final = self.root / name
         self._make_folder(final.parent)
@@ -107,7 +107,7 @@ class LocalStorage:
         _sync_tree(part)
         self._make_folder(final.parent)
         try:
-            part.rename(final)  # fails on a folder that is there, since none of ours is ever empty
+            part.rename(final)  # fails if the folder exists, since a folder of ours is never empty
         except OSError:
             if not final.is_dir():
                 raise
@@ -134,7 +134,7 @@ class LocalStorage:
             sync(folder)
 
     def _make_folder(self, folder: Path) -> None:
-        """Make a folder, durably, if it is not there, with those above it; never the root of a store that is gone."""
+        """Make a missing folder durably, with its parents; never the root of a store that is gone."""
         if folder.is_dir():
             return
         if folder == self.root and not self._is_founding:
@@ -147,7 +147,7 @@ class LocalStorage:
 
     @contextlib.contextmanager
     def founding(self) -> Iterator[None]:
-        """Make the folder, and write to it without the mark."""
+        """Make the folder, and allow writing before it has its mark."""
         was, self._is_founding = self._is_founding, True
         try:
             yield
@@ -168,15 +168,15 @@ class LocalStorage:
     # --------------------------------------------------------------------------------------------------------- sweeping
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
-        """Remove parts that dead writers left; how many. Those of others, which cannot be removed, are left alone."""
+        """Remove parts that dead writers left; returns how many. Parts that belong to other users stay."""
         if not (names := self.names(TMP)):
             return 0
         tmp, swept = self.root / TMP, 0
-        os.utime(tmp)  # stamped as the parts are, by a file server's clock, say, from which ours may be far
+        os.utime(tmp)  # its time is set as the parts' are, perhaps by a file server's clock far from ours
         now_s = tmp.stat().st_mtime
         for name in names:
             path = tmp / name
-            with contextlib.suppress(OSError):  # another sweeper was faster, or it is for its owner to remove
+            with contextlib.suppress(OSError):  # another sweep was faster, or only its owner may remove it
                 age_s = now_s - path.stat().st_mtime
                 if age_s > FOREIGN_AGE_S or (age_s >= stray_age_s and _is_of_the_dead(name)):
                     _remove(path)

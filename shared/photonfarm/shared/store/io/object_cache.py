@@ -1,6 +1,6 @@
-"""Copies of a bucket's objects on this machine: as many as fit, those used last.
+"""Copies of a bucket's objects on this machine: the most recently used ones, up to a limit.
 
-A copy's name tells the version of its object, so a stale one is never used. Copies appear whole, by rename, and any
+A copy's name contains the version of its object, so a stale one is never used. Copies appear whole, by rename, and any
 number of processes share them.
 """
 
@@ -19,14 +19,14 @@ from photonfarm.shared.store.io.local import LocalStorage, sync
 from photonfarm.shared.store.io.storage import discard
 
 FOLDER_VARIABLE = "PHOTONFARM_CACHE"
-"""Where copies and unfinished files lie; ~/.cache/photonfarm by default."""
+"""The variable with the folder of copies and unfinished files; by default ~/.cache/photonfarm."""
 
 LIMIT_VARIABLE = "PHOTONFARM_CACHE_GB"
 LIMIT_GB = 20.0
-"""For the copies of one store, by default."""
+"""The default limit for the copies of one store."""
 
 KEPT_S = 60.0
-"""A copy used so lately is kept whatever the limit: its reader may be about to open it."""
+"""A copy used so recently is kept whatever the limit: its reader may be about to open it."""
 
 FILES = "files"
 
@@ -39,11 +39,11 @@ class ObjectCache:
         self._files = folder / FILES
         self._parts = LocalStorage(folder)
         self._limit_bytes = limit_bytes
-        self._added_bytes = limit_bytes  # by this process since it last looked; so that it looks the first time
+        self._added_bytes = limit_bytes  # by this process since it last looked; at first so many that it looks
 
     @classmethod
     def of(cls, url: str) -> Self:
-        """The cache of a store, where and as large as the variables say; raises StoreError for one that is wrong."""
+        """The cache of a store, with folder and limit from the variables; raises StoreError for an invalid one."""
         named = os.environ.get(FOLDER_VARIABLE)
         root = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "photonfarm"
         told = os.environ.get(LIMIT_VARIABLE) or LIMIT_GB
@@ -54,11 +54,11 @@ class ObjectCache:
         return cls(root / "objects" / hashlib.sha256(url.encode()).hexdigest()[:16], limit_gb * 1e9)
 
     def path(self, name: str, version: str | None) -> Path:
-        """Where the copy of an object's version lies, or would lie; nothing lies at that of no version."""
+        """The path of the copy of an object's version; without a version, a path where there is never a file."""
         return self._files / (name if version is None else f"{name}@{version}")
 
     def has(self, copy: Path, size: int) -> bool:
-        """Whether a copy of so many bytes is there; if so, it has been used now."""
+        """Whether there is a copy of so many bytes; if so, it now counts as just used."""
         try:
             os.utime(copy)
             return copy.stat().st_size == size
@@ -67,7 +67,7 @@ class ObjectCache:
 
     @contextlib.contextmanager
     def filling(self, copy: Path) -> Iterator[BinaryIO]:
-        """A file to write a copy to; it is there, whole, after the block, unless that raises."""
+        """A file to write a copy to; after the block the copy is there, whole, unless the block raised."""
         part = self.part()
         try:
             with part.open("xb") as file:
@@ -84,11 +84,11 @@ class ObjectCache:
         return self._parts.part()
 
     def sweep(self, *, stray_age_s: float) -> int:
-        """Remove parts that dead processes left; how many."""
+        """Remove parts that dead processes left; returns how many."""
         return self._parts.sweep(stray_age_s=stray_age_s)
 
     def _make_room(self, size: int) -> None:
-        """Remove the copies that were used longest ago, if need be; looks once per sixteenth of the limit."""
+        """Remove the least recently used copies if there are too many; looks once per sixteenth of the limit."""
         self._added_bytes += size
         if self._added_bytes < self._limit_bytes / 16:
             return

@@ -1,4 +1,4 @@
-"""How a bucket is asked: connected to, with patience, and with errors as those of a file system."""
+"""Requests to a bucket: connecting, trying again, and turning errors into those of a file system."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from obstore.store import from_url
 from photonfarm.shared.core.errors import StoreError
 
 PATIENCE_S = 60.0
-"""How long a server that fails, or cannot be reached, is asked again: it may be restarted meanwhile."""
+"""How long a failing or unreachable server is tried again: it may be restarting."""
 
 PAUSES_S = (0.3, 1.0, 3.0, 5.0)
-"""Before each new attempt of ours, the last one again and again; the library has its own, within an attempt."""
+"""The pauses before our new attempts, the last one repeated; the library has its own within an attempt."""
 
 RETRIES = 1000
-"""Of the library within a request; PATIENCE_S ends them. It leaves out what may have worked already, and what breaks
-off in the middle of an answer."""
+"""The library's attempts within a request; PATIENCE_S ends them.
+
+It repeats neither what may have worked already, nor an answer that breaks off in the middle.
+"""
 
 LONGEST_PAUSE_S = 5.0
 
@@ -32,7 +34,7 @@ T = TypeVar("T")
 
 
 def connect(url: str, timeout_s: float) -> Any:
-    """The library's store; nothing is sent yet."""
+    """Make the library's store; nothing is sent yet."""
     try:
         return from_url(
             url,
@@ -55,10 +57,10 @@ def connect(url: str, timeout_s: float) -> Any:
 
 
 def patiently(action: Callable[[], T], *passing: type[Exception], times: int = 1) -> T:
-    """What an action returns, tried again for PATIENCE_S while the server fails, or with one of the `passing` errors.
+    """The result of an action, tried again for PATIENCE_S while the server fails, or with one of the `passing` errors.
 
-    At least `times` times, however long each takes: a transfer may break off after minutes. Whether a put that failed
-    has worked is not known; whoever tries it must find out.
+    It is tried at least `times` times, however long each takes, as a transfer may break off after minutes. A put that
+    failed may yet have worked; the action must find that out when it is tried again.
     """
     failures: tuple[type[Exception], ...] = (GenericError, *passing)
     deadline = time.monotonic() + PATIENCE_S
@@ -73,7 +75,7 @@ def patiently(action: Callable[[], T], *passing: type[Exception], times: int = 1
 
 
 def _is_refusal(error: Exception) -> bool:
-    """Whether the server has refused, as it will the next time (all but "too slow" and "too many requests")."""
+    """Whether the server has refused for good (any 4xx but "too slow" and "too many requests")."""
     return isinstance(error, GenericError) and re.search(r"\b4(?!08|29)\d\d [A-Z]", _first_line(error)) is not None
 
 
@@ -83,19 +85,19 @@ def os_errors(name: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        if "<Code>NoSuchBucket</Code>" in str(error):  # else what is not there would be looked for in it
+        if "<Code>NoSuchBucket</Code>" in str(error):  # else the caller would look for a missing object
             raise OSError(errno.EIO, "the bucket does not exist", name) from error
         raise FileNotFoundError(errno.ENOENT, "no such object, or no such bucket", name) from error
     except (PermissionDeniedError, UnauthenticatedError) as error:
         raise PermissionError(errno.EACCES, _reason(error), name) from error
     except BaseError as error:
-        if "404 Not Found" in _first_line(error):  # how the library tells that a bucket cannot be listed
+        if "404 Not Found" in _first_line(error):  # the library's error for a bucket that cannot be listed
             raise FileNotFoundError(errno.ENOENT, "no such bucket", name) from error
         raise OSError(errno.EIO, _reason(error), name) from error
 
 
 def _reason(error: Exception) -> str:
-    """What the library says, and code and message of the server's answer instead of its XML, in a line."""
+    """The library's error in one line, with code and message of the server's answer instead of its XML."""
     said = re.split(r"<\?xml|<Error>", _first_line(error))[0].rstrip(": ")
     answer = str(error).partition("\n\nDebug source:")[0]
     told = [match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))]
@@ -103,5 +105,5 @@ def _reason(error: Exception) -> str:
 
 
 def _first_line(error: Exception) -> str:
-    """What the library says, without what is meant for its developers."""
+    """The library's error without the part for its developers."""
     return str(error).partition("\n")[0]

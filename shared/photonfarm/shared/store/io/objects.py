@@ -2,17 +2,17 @@
 
 An object appears whole or not at all. A name is given by a conditional put, so the first one stays. A put whose
 response was lost is tried again, and may then be refused because of itself; so every object carries the id of the put
-that made it, and what carries ours is ours. A refused put of a name that has no object (S3 answers so while another
-put is under way, which may yet fail) is tried again as well. There is nothing to settle: a put that has been answered
-is durable. All puts are single ones (at most 5 GB on S3), so no half of an upload is ever left in the bucket.
+that made it, by which a writer recognises its own. A refused put of a name without an object (S3 answers so while
+another put is under way, which may yet fail) is tried again as well. `settle` has nothing to do: an answered put is
+durable. All puts are single ones (at most 5 GB on S3), so no half of an upload is ever left in the bucket.
 
 A folder (a plan, the base) cannot be renamed, and is claimed instead. `FOLDER.claim` is one object, a zip of all the
 folder's files, placed by a conditional put: from then on what the folder will hold is decided, for good. Then the files
-are put under their names, `zarr.json` of the folder last, which is what readers look for. Whoever finds a folder
-claimed, and not complete, completes it from the claim before he goes on. So two submitters never mix their
-files; one that dies after its claim is completed by the next one; and one that sleeps for however long finds on waking
-that every file of its is there already, with the very bytes it would have put. Claims stay, to decide against sleepers
-that have not claimed yet.
+are put under their names, `zarr.json` of the folder last, which is what readers look for. A process that finds a folder
+claimed but not complete first completes it from the claim. So two submitters never mix their files; if one dies after
+its claim, the next one completes it; and if one sleeps for however long, it finds on waking that all of its files are
+there already, with the same bytes. Claims stay, so that a
+process that has slept cannot claim later.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
 
 SMALL_BYTES = 4 << 20
 TIMEOUT_S = 30.0
-"""For a request and its answer, up to SMALL_BYTES…"""
+"""The time limit for a request and its answer, up to SMALL_BYTES…"""
 TRANSFER_TIMEOUT_S = 300.0
 """…and for larger ones: a shard of 256 MB at 1 MB/s."""
 
 PUTS_AT_ONCE = 8
-"""Of the files of a folder: they are many and small, and each would wait for its answer."""
+"""The puts under way at once for the files of a folder: they are many and small, and each waits for an answer."""
 
 TRANSFER_TIMES = 2
 REPLACED_TIMES = 4
-"""An object that is replaced while it is fetched is fetched again."""
+"""The attempts to fetch an object that is replaced meanwhile."""
 
 WRITER = "writer"
 """The metadata field with a put's id; letters alone, as not every service takes more."""
@@ -65,7 +65,7 @@ class ObjectStorage:
     """`storage.Storage` in a bucket, below a prefix. Endpoint and credentials come from the usual variables."""
 
     def __init__(self, url: str) -> None:
-        """Name the bucket; nothing is asked of it yet. Raises StoreError for a URL that cannot be one."""
+        """Take the bucket, without a request. Raises StoreError for an invalid URL."""
         self._url = url.rstrip("/")
         self._objects = connect(self._url, TIMEOUT_S)
         self._transfers = connect(self._url, TRANSFER_TIMEOUT_S)
@@ -80,11 +80,11 @@ class ObjectStorage:
     # ---------------------------------------------------------------------------------------------------------- reading
 
     def local(self, name: str) -> Path:
-        """A copy on this machine, made if there is none of the object as it is now; costs a request in any case."""
+        """A copy on this machine, fetched if there is none of the object's current version; always costs a request."""
         return self._copy(name)
 
     def renew(self, name: str) -> None:
-        """Fetch an object once more: what this machine holds of it is not what the bucket does, or may not be."""
+        """Fetch an object again: this machine's copy of it is or may be damaged."""
         self._copy(name, anew=True)
 
     def _copy(self, name: str, *, anew: bool = False) -> Path:
@@ -119,7 +119,7 @@ class ObjectStorage:
             return patiently(lambda: bytes(obstore.get(self._objects, name).bytes()))
 
     def exists(self, name: str) -> bool:
-        """Whether a name has bytes."""
+        """Whether there is an object of this name."""
         try:
             self.size(name)
         except FileNotFoundError:
@@ -127,14 +127,14 @@ class ObjectStorage:
         return True
 
     def size(self, name: str) -> int:
-        """How many bytes a name has; raises FileNotFoundError."""
+        """The size of an object in bytes; raises FileNotFoundError."""
         with os_errors(name):
             return patiently(lambda: obstore.head(self._objects, name)["size"])
 
     def names(self, folder: str) -> list[str]:
-        """The names right below a folder; none if it does not exist. A request per thousand of them.
+        """The names right below a folder; none if it does not exist. Costs a request per thousand names.
 
-        Raises StoreError if the store is gone, which costs one more where there are none.
+        Raises StoreError if the store is gone; an empty answer costs a request more to check that.
         """
         try:
             with os_errors(folder):
@@ -142,12 +142,12 @@ class ObjectStorage:
         except FileNotFoundError:  # not even a bucket
             found = {"common_prefixes": [], "objects": []}
         paths = [*found["common_prefixes"], *(about["path"] for about in found["objects"])]
-        if folder and not paths:  # else it is asked whether there is anything at all
+        if folder and not paths:  # the root is listed to see whether anything is there
             self.require()
         return [path.rpartition("/")[2] for path in paths]
 
     def zarr(self, folder: str) -> ObjectStore[Any]:
-        """A folder as zarr-python reads it."""
+        """A folder in the form that zarr-python reads."""
         return _Group(connect(f"{self._url}/{folder}", TIMEOUT_S), read_only=True)
 
     # ---------------------------------------------------------------------------------------------------------- writing
@@ -157,7 +157,7 @@ class ObjectStorage:
         return self._cache.part()
 
     def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
-        """Put a part under its name; False if that was taken."""
+        """Put a part under its name; False if the name was taken."""
         self.check()
         if not self._put(part, name, replace=replace):
             return False
@@ -165,7 +165,7 @@ class ObjectStorage:
         return True
 
     def adopt_folder(self, part: Path, folder: str) -> bool:
-        """Claim a folder's name and complete it; False if the name was taken, after completing what took it."""
+        """Claim a folder's name and complete it; False if another claim has taken the name, which is then completed."""
         self.check()
         self.require()
         if self.exists(f"{folder}/{ROOT}"):
@@ -176,13 +176,13 @@ class ObjectStorage:
             if ours := self._put(packed, claim_of(folder)):
                 self._complete(folder, packed)
             else:
-                self._complete(folder, self._copy(claim_of(folder), anew=True))  # for good: not of a damaged copy
+                self._complete(folder, self._copy(claim_of(folder), anew=True))  # it decides for good: no damaged copy
         finally:
             discard(packed)
         return ours
 
     def _complete(self, folder: str, packed: Path) -> None:
-        """Put the files of a claim that are not there yet; any number of machines may do so at once."""
+        """Put the files of a claim that are missing; any number of machines may do so at once."""
         try:
             with zipfile.ZipFile(packed) as claim:
                 names = claim.namelist()
@@ -195,7 +195,7 @@ class ObjectStorage:
             raise CorruptError(f"{self._url}/{claim_of(folder)}: is not a readable claim: {error}") from error
 
     def move(self, name: str, new_name: str) -> None:
-        """Copy an object, within the bucket, and delete the first one; raises FileNotFoundError."""
+        """Copy an object within the bucket, and delete the original; raises FileNotFoundError."""
         if self.exists(new_name):
             raise FileExistsError(errno.EEXIST, "is there already", new_name)
         with os_errors(name):
@@ -205,8 +205,8 @@ class ObjectStorage:
     def move_folder(self, folder: str, new_folder: str) -> None:
         """Move all objects below a folder, its own `zarr.json` first, and its claim last, so that it can be claimed.
 
-        Not at once: a folder that is completed from its claim by others meanwhile may lack what was moved after they
-        had found it there.
+        This is not atomic: if other processes complete the folder from its claim meanwhile, it may lack objects that
+        were moved after they had seen them.
         """
         self.move(f"{folder}/{ROOT}", f"{new_folder}/{ROOT}")
         with os_errors(folder):
@@ -222,9 +222,9 @@ class ObjectStorage:
         """Return at once: what has been put is durable."""
 
     def check(self) -> None:
-        """Raise StoreError for a server that overwrites when asked not to: workers would undo each other's commits.
+        """Raise StoreError for a server that ignores conditional puts: workers would undo each other's commits.
 
-        Raises OSError for one that cannot be written. Asks once, before the first put.
+        Raises OSError if the server cannot be written to. Sends a request once, before the first put.
         """
         if not self._is_conditional:
             if self._put(b"", PROBE) and self._put(b"", PROBE):
@@ -232,10 +232,10 @@ class ObjectStorage:
             self._is_conditional = True
 
     def _put(self, content: Path | bytes, name: str, *, replace: bool = False) -> bool:
-        """Put an object where there is none, or with `replace` where the one is that is there; False if it is refused.
+        """Put an object if there is none, or with `replace` in place of the current one; False if that is refused.
 
-        Tried for PATIENCE_S while the server fails, or refuses for another put that may fail. The replaced one is named
-        by its tag, so that a put that arrives late cannot undo what came after it.
+        It is tried for PATIENCE_S while the server fails, or refuses for another put that may fail. The replaced object
+        is identified by its tag, so that a put that arrives late cannot undo a later one.
         """
         writer = uuid.uuid4().hex
         size = content.stat().st_size if isinstance(content, Path) else len(content)
@@ -259,7 +259,7 @@ class ObjectStorage:
             return patiently(attempt, AlreadyExistsError, PreconditionError, times=times)
 
     def _mode(self, name: str) -> PutMode:
-        """The put mode that replaces what is there now."""
+        """The put mode that replaces the current object."""
         try:
             about = obstore.head(self._objects, name)
         except FileNotFoundError:
@@ -278,19 +278,19 @@ class ObjectStorage:
     # --------------------------------------------------------------------------------------------------------- sweeping
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
-        """Remove parts that dead writers left on this machine; how many. In the bucket there are none."""
+        """Remove parts that dead writers left on this machine; returns how many. The bucket holds none."""
         return self._cache.sweep(stray_age_s=stray_age_s)
 
     # -------------------------------------------------------------------------------------------------------- its root
 
     def founding(self) -> contextlib.AbstractContextManager[None]:
-        """Nothing: a bucket is there, or refuses every put."""
+        """Do nothing: a bucket is there, or refuses every put."""
         return contextlib.nullcontext()
 
     def require(self) -> None:
-        """Raise StoreError if the format file is not there: a bucket, or all below its prefix, that was deleted.
+        """Raise StoreError if the format file is missing: the bucket, or all below its prefix, was deleted.
 
-        Costs a request. So of what is put only a folder asks for it, and a commit once for all of its files.
+        It costs a request. So puts do not check it, but folders do, and a commit does once for all of its files.
         """
         if not self.exists(FORMAT_FILE):
             raise StoreError(
@@ -312,7 +312,7 @@ class _Group(ObjectStore[Any]):
 
 
 def claim_of(folder: str) -> str:
-    """The name of the object that decides what a folder holds."""
+    """The name of the object that decides a folder's content."""
     return f"{folder}.claim"
 
 
@@ -326,6 +326,6 @@ def _pack(folder: Path, packed: Path) -> None:
 
 
 def _version(about: ObjectMeta) -> str:
-    """A word that changes with an object's bytes."""
+    """A text that changes with an object's bytes."""
     told = about["e_tag"] or f"{about['last_modified']} {about['size']}"
     return hashlib.sha256(told.encode()).hexdigest()[:16]

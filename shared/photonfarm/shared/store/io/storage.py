@@ -1,8 +1,8 @@
-"""Where the files of a store lie: names with bytes, each written once, whole, and by whoever comes first.
+"""Where the files of a store lie: names with bytes, each written once, whole, and by whichever process comes first.
 
-A name is a path below the store, with / between its parts. What is to be stored is written to a `part` on this machine
-and adopted under its name; after `settle` it stays, whatever happens to the machine. `local` has the folder on a POSIX
-file system; `objects` the bucket.
+A name is a path below the store, with / between its parts. New content is written to a `part` on this machine and
+adopted under its name; after `settle` it survives a failure of the machine. `local` keeps a store in a folder on a
+POSIX file system; `objects` in a bucket.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     import zarr.abc.store
 
 FORMAT_FILE = "photonfarm.json"
-"""What a store has at its root, and nothing else has."""
+"""The file at the root of every store, by which it is recognised."""
 
 TMP = "tmp"
-"""The folder of what is not adopted yet."""
+"""The folder of parts that are not adopted yet."""
 
 STRAY_AGE_S = 60.0
-"""Parts of a dead process of this machine are swept at this age…"""
+"""Parts of a dead process of this machine are removed at this age…"""
 
 FOREIGN_AGE_S = 86400.0
-"""…and those of other machines, whose processes cannot be asked after, at this one."""
+"""…and those of other machines, whose processes cannot be checked, at this one."""
 
 
 class Storage(Protocol):
@@ -39,43 +39,43 @@ class Storage(Protocol):
         """The store's folder or URL, for messages."""
 
     def local(self, name: str) -> Path:
-        """A file of this machine with the bytes of a name; it need not exist for a name that does not."""
+        """A file of this machine with the bytes of a name; it may be missing if the name is."""
 
     def read(self, name: str) -> bytes:
         """The bytes of a name; raises FileNotFoundError."""
 
     def exists(self, name: str) -> bool:
-        """Whether a name has bytes."""
+        """Whether there are bytes under a name."""
 
     def size(self, name: str) -> int:
-        """How many bytes a name has; raises FileNotFoundError."""
+        """The number of bytes under a name; raises FileNotFoundError."""
 
     def names(self, folder: str) -> list[str]:
         """The last parts of the names and folders right below a folder, in no order; none if it does not exist."""
 
     def zarr(self, folder: str) -> zarr.abc.store.Store:
-        """A folder as zarr-python reads it."""
+        """A folder in the form that zarr-python reads."""
 
     def part(self) -> Path:
-        """A new path on this machine, to write a file or folder to before it is adopted, or removed."""
+        """A new path on this machine for a file or folder that will be adopted or removed."""
 
     def adopt(self, part: Path, name: str, *, replace: bool = False) -> bool:
-        """Give a part its name; False if the name was taken, which keeps what is there, and the part.
+        """Give a part its name; False if the name was taken, which leaves both as they are.
 
-        With `replace` it takes the place of what is there, at once.
+        With `replace` it takes the place of what is there, atomically.
         """
 
     def adopt_folder(self, part: Path, folder: str) -> bool:
-        """Give a folder that is a Zarr group its name, at once; False if the name was taken, which keeps the part."""
+        """Give a folder that is a Zarr group its name, atomically; False if it was taken, which keeps the part."""
 
     def move(self, name: str, new_name: str) -> None:
-        """Give the bytes of a name another one, which nothing has; raises FileNotFoundError.
+        """Rename; the new name must be free. Raises FileNotFoundError.
 
         The bytes are never without a name; in between they may have both.
         """
 
     def move_folder(self, folder: str, new_folder: str) -> None:
-        """Give all names below a folder that is a Zarr group to another folder, which does not exist.
+        """Rename all names below a folder that is a Zarr group into another folder, which must not exist.
 
         The group's own zarr.json goes first, if not all go at once. Raises FileNotFoundError if there is none.
         """
@@ -84,25 +84,25 @@ class Storage(Protocol):
         """Return once these names are as durable as their bytes."""
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
-        """Remove parts that dead writers left; how many."""
+        """Remove parts that dead writers left; returns how many."""
 
     def founding(self) -> contextlib.AbstractContextManager[None]:
-        """While a store is being made here: without its format file nothing is written otherwise."""
+        """Allow writing while a store is being made: otherwise nothing is written without its format file."""
 
     def require(self) -> None:
-        """Raise StoreError if the store's place is there no more, so that nothing in it is taken for missing."""
+        """Raise StoreError if the store is gone, so that its files are not taken for missing."""
 
 
 @runtime_checkable
 class Copying(Protocol):
-    """A storage whose `local` files are copies, which may rot on this machine while the store is whole."""
+    """A storage whose `local` files are copies, which may be damaged while the store is whole."""
 
     def renew(self, name: str) -> None:
-        """Make the copy of a name anew, as `local` made it."""
+        """Make the copy of a name again, as `local` made it."""
 
 
 def renew_copy(storage: Storage, name: str) -> bool:
-    """Make this machine's copy of a name anew, whose bytes are not what was committed; False if it is no copy."""
+    """Make this machine's damaged copy of a name again; False if the storage has no copies."""
     if not isinstance(storage, Copying):
         return False
     storage.renew(name)
@@ -110,11 +110,11 @@ def renew_copy(storage: Storage, name: str) -> bool:
 
 
 SCHEMES = ("s3", "gs", "az")
-"""Of the URLs of buckets."""
+"""The schemes of bucket URLs."""
 
 
 def is_url(root: str | Path) -> bool:
-    """Whether a store's place is meant as a URL."""
+    """Whether a store's place is written as a URL."""
     return isinstance(root, str) and "://" in root
 
 
@@ -136,14 +136,14 @@ def open_storage(root: str | Path) -> Storage:
 
 
 def is_vacant(root: str | Path) -> bool:
-    """Whether nothing lies where a store could be, so that one may be made there; raises StoreError."""
+    """Whether the place of a store is empty, so that one may be made there; raises StoreError."""
     storage = open_storage(root)
     with store_errors("look into the store", storage.where):
         return set(storage.names("")) <= {TMP}
 
 
 def read_or_none(storage: Storage, name: str) -> bytes | None:
-    """The bytes of a name; None if it has none."""
+    """The bytes of a name; None if there are none."""
     try:
         return storage.read(name)
     except FileNotFoundError:
@@ -151,17 +151,16 @@ def read_or_none(storage: Storage, name: str) -> bytes | None:
 
 
 def discard(part: Path) -> None:
-    """Remove a part's file if it is still there; where the disk refuses that, a sweep does it later.
+    """Remove a part if it is still there; if the disk refuses, a sweep removes it later.
 
-    So that what is told is the error that is under way, and a name that has been given is not taken for one that is
-    not.
+    A refusal is not raised: it would hide the error under way, or make a completed adoption look failed.
     """
     with contextlib.suppress(OSError):
         part.unlink(missing_ok=True)
 
 
 def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
-    """Store a JSON document durably under a new name; False if the name was taken, which keeps what is there."""
+    """Store a JSON document durably under a new name; False if the name was taken, which keeps the old document."""
     part = storage.part()
     try:
         part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Memory for a batch of samples, as they are stored: read into again and again, without a copy or conversion.
+"""Memory for a batch of samples in their stored types, reused for every batch, without a copy or conversion.
 
 Shape letters: B batch, H W image, P points, K photon slots.
 """
@@ -18,7 +18,7 @@ from photonfarm.shared.store.format import schema
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Samples in the types that they are stored in; what `SceneReader.read_batch` fills."""
+    """Samples in their stored types; `SceneReader.read_batch` fills it."""
 
     radiance_exponent: int
     radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 2^radiance_exponent, halves A and B; NaN: see `wide`
@@ -33,7 +33,7 @@ class Batch:
 
     @classmethod
     def empty(cls, spec: SceneSpec, size: int, *, buffers: bool = True, guides: bool = False) -> Batch:
-        """Memory for `size` samples of a scene; without that for buffers, what their views show is not read."""
+        """Memory for `size` samples of a scene; without memory for buffers, neither they nor visibility are read."""
         arrays = schema.output_arrays(spec)
         names = [name for name, array in arrays.items() if array.kind == "view" and buffers]
         memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
@@ -46,11 +46,11 @@ class Batch:
         return cls(spec.radiance_exponent, radiance, memory, seen, bits, rows[0], rows[1], rows[2], of_guides)
 
     def __len__(self) -> int:
-        """How many samples it holds, or has memory for."""
+        """The number of samples that it holds, or has memory for."""
         return len(self.rows)
 
     def first(self, count: int) -> Batch:
-        """The first samples of the same memory."""
+        """The first samples, in the same memory."""
         if count == len(self):
             return self
         rows = {name: getattr(self, name)[:count] for name in ("rows", "view_rows", "modification_rows")}

@@ -15,15 +15,15 @@ __all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_na
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """What was found."""
+    """The result of a search."""
 
     count: int
     samples: tuple[FoundSample, ...]  # the nearest, then by scene and row
-    nearest: float | None  # distance of the nearest sample, also of one too far; None if there is none at all
+    nearest: float | None  # distance of the nearest sample, even if too far; None if there are no samples
 
 
 def scene_named(store: Store, text: str) -> str:
-    """The id of a scene by its id, the beginning of its id, or its name; StoreError if that is none or several."""
+    """The id of a scene, given its id, the beginning of its id, or its name; StoreError unless exactly one fits."""
     ids = store.scene_ids()
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
     found = found or [each for each in ids if _has_name(store, each, text)]
@@ -41,9 +41,9 @@ def _has_name(store: Store, scene_id: str, name: str) -> bool:
 
 
 def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
-    """The samples of some scenes that a query fits, described for the first `limit` of them.
+    """The samples of some scenes that match a query, described for the first `limit` of them.
 
-    A scene with another number of movable groups than the vector asked for fits nothing. Raises StoreError.
+    A scene whose number of movable groups differs from the query's vector has no match. Raises StoreError.
     """
     found = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
     order = sorted(

@@ -10,7 +10,7 @@ numbers add exactly, in any order: merged sums are equal bit for bit, and no val
 has reached are not there: of an ordinary image there are two for the sums and three or four for the squares, of any
 image at most ten and nineteen, of 8 bytes a value each.
 
-Only what is read off is rounded, once: with n estimates, S₁ = Σ x and S₂ = Σ x², the mean S₁ / n and M2 = Σ (x − mean)²
+Only the results are rounded, once: with n estimates, S₁ = Σ x and S₂ = Σ x², the mean S₁ / n and M2 = Σ (x − mean)²
 = (n S₂ − S₁²) / n are quotients of whole numbers, and Python's division rounds these correctly.
 """
 
@@ -36,19 +36,19 @@ from photonfarm.shared.store.write.scene_store import SceneStore
 F64 = NDArray[np.float64]
 
 MAX_PASSES = 1 << 30
-"""Of two halves each: what a limb has room for."""
+"""The most passes, of two halves each, for which a limb has room."""
 
 _BITS = 32
 _LOWEST = -10
 """The limb of 2^-320, below which no square of a float32 reaches."""
 
 _AT_ONCE = 1 << 15
-"""Pixels divided at a time: Python's whole numbers take some 100 bytes each."""
+"""The number of pixels divided at a time: Python's whole numbers take some 100 bytes each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Merged:
-    """One view, estimated by all of its passes that were merged; linear radiance, unscaled."""
+class MergedView:
+    """One view, estimated from all of its merged passes; linear radiance, unscaled."""
 
     passes: int
     mean: F64  # (H, W, 3) of all 2 · passes halves
@@ -58,19 +58,18 @@ class Merged:
 
     @property
     def count(self) -> int:
-        """How many independent estimates `mean` is made of."""
+        """The number of independent estimates in `mean`."""
         return 2 * self.passes
 
     @property
     def standard_error(self) -> F64:
-        """Of `mean`, (H, W, 3): √(M2 / (n (n − 1))); itself an estimate, rough from few passes."""
+        """The standard error of `mean`, (H, W, 3): √(M2 / (n (n − 1))); itself an estimate, rough from few passes."""
         return np.sqrt(self.m2 / (self.count * (self.count - 1)))
 
     def write(self, file: str | Path) -> None:
         """Store it as a NumPy archive of its fields, with `standard_error`, whole or not at all; make its folder too.
 
-        Raises ValueError for a name without .npz, which NumPy would add to any other, and StoreError where the disk
-        refuses.
+        Raises ValueError for a name without .npz, which NumPy would append, and StoreError if the disk refuses.
         """
         if (path := Path(file)).suffix != ".npz":
             raise ValueError(f"{file}: a merged view is written as a NumPy archive; give it a name that ends in .npz")
@@ -78,7 +77,7 @@ class Merged:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """What `write` has stored; raises StoreError for anything else."""
+        """Read what `write` stored; raises StoreError for anything else."""
         with stored_arrays(file, "merged view", "store merge") as stored:
             images = (np.asarray(stored[name]) for name in ("mean", "m2", "half_a", "half_b"))
             return cls(int(stored["passes"]), *images)
@@ -88,13 +87,13 @@ class Moments:
     """Exact sums over passes of one view. Merge those of several workers with `update`, in any order."""
 
     def __init__(self) -> None:
-        """Of no pass yet."""
+        """Begin without passes."""
         self.passes = 0
         self._sums = _ExactSum()  # (2, H, W, 3), by half
         self._squares = _ExactSum()  # (H, W, 3)
 
     def add(self, halves: F32) -> None:
-        """Take in one pass, (2, H, W, 3); raises ValueError for a value that is not finite."""
+        """Add one pass, (2, H, W, 3); raises ValueError for a value that is not finite."""
         if not np.isfinite(halves).all():
             raise ValueError("a pass holds values that are not finite; it has no exact sum")
         exact = halves.astype(np.float64)
@@ -104,7 +103,7 @@ class Moments:
             self._squares.add(half * half)
 
     def update(self, other: Moments) -> None:
-        """Take in the passes of other sums, none of which may be among these."""
+        """Add the passes of other sums; the two must have no pass in common."""
         self._claim(other.passes)
         self._sums.update(other._sums)
         self._squares.update(other._squares)
@@ -114,8 +113,8 @@ class Moments:
             raise ValueError(f"{self.passes + passes} passes are more than the {MAX_PASSES} that are summed exactly")
         self.passes += passes
 
-    def merged(self) -> Merged:
-        """The image; raises ValueError where there is no pass."""
+    def merged(self) -> MergedView:
+        """The image; raises ValueError without passes."""
         if not self.passes:
             raise ValueError("no pass to merge")
         shape = self._sums.shape[1:]
@@ -124,7 +123,7 @@ class Moments:
             at = slice(start, start + _AT_ONCE)
             images[:, at] = self._quotients(at)
         mean, m2, half_a, half_b = images.reshape(4, *shape)
-        return Merged(self.passes, mean, m2, half_a, half_b)
+        return MergedView(self.passes, mean, m2, half_a, half_b)
 
     def _quotients(self, at: slice) -> list[list[float]]:
         """Mean, M2, A and B of some values: `whole` numbers are multiples of 2^(32 · _LOWEST)."""
@@ -176,7 +175,7 @@ class _ExactSum:
             self._limbs[limb] = counts.copy()
 
     def whole(self, at: tuple[int | slice, ...]) -> NDArray[Any]:
-        """Some of the sums as Python's whole numbers, multiples of 2^(32 · _LOWEST); the image is one axis here."""
+        """A part of the sums as Python's whole numbers, multiples of 2^(32 · _LOWEST); the image is one axis here."""
         flat = (*self.shape[: len(at) - 1], -1)
         total: Any = np.zeros(np.empty(self.shape, np.bool_).reshape(flat)[at].shape, object)
         for limb, counts in self._limbs.items():
@@ -201,10 +200,10 @@ def merge_rows(reader: SceneReader, rows: Iterable[int]) -> Moments:
     return moments
 
 
-def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, Merged]]:
-    """The views that some complete sample of a query shows: their content keys, and all complete passes of each.
+def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, MergedView]]:
+    """The views of the samples that match a query: their content keys, and all complete passes of each.
 
-    Views with less than `least` complete passes are left out.
+    A view needs one complete sample that matches, and at least `least` complete passes.
     """
     reader = SceneReader(scene.storage.where, scene.scene_id)
     complete = set(reader.refresh().tolist())
@@ -216,7 +215,7 @@ def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tup
         yield reader.view_key(row).hex(), merge_view(reader, view_row)
 
 
-def merge_view(reader: SceneReader, view_row: int) -> Merged:
+def merge_view(reader: SceneReader, view_row: int) -> MergedView:
     """All passes of a view that were complete at the reader's last refresh; raises StoreError if there is none."""
     rows = reader.rows_of_view(view_row).tolist()
     if not rows:

@@ -1,4 +1,4 @@
-"""What to look samples up by."""
+"""Queries for samples."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _KEY = re.compile(r"[0-9a-fA-F]{32}")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Query:
-    """What samples must be; None: anything."""
+    """The conditions on samples; None stands for any value."""
 
     modification: F32 | Key | None = None  # a vector (4·G,) or (G, 4), or a content key
-    view: F32 | Key | None = None  # a vector (6,), or a content key, which tells the modification too
+    view: F32 | Key | None = None  # a vector (6,), or a content key, which implies the modification
     sample: Key | None = None
     row: int | None = None
     job: int | None = None
@@ -36,7 +36,7 @@ class Query:
         job: int | None = None,
         tolerance: float = 1e-3,
     ) -> Query:
-        """The query of the options of the command line; raises SpecError for what is neither key nor vector."""
+        """The query of the command line's options; raises SpecError for text that is neither key nor vector."""
         if sample is not None and not _KEY.fullmatch(sample):
             raise SpecError(f"--sample {sample!r}: a key of 32 hexadecimal digits is required")
         return cls(

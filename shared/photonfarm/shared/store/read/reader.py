@@ -1,4 +1,4 @@
-"""The store as the trainer sees it: complete samples, while more of them arrive.
+"""The trainer's access to the store: complete samples, while more of them arrive.
 
 Shape letters: B batch, R rows of the scene, H W image.
 
@@ -37,8 +37,8 @@ from photonfarm.shared.store.write.store import check_format
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """One complete sample, as it is trained on."""
+class StoredSample:
+    """One complete sample, as the trainer uses it."""
 
     row: int
     modification: Modification
@@ -53,14 +53,14 @@ class Sample:
 GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
 
 OPEN_SHARDS = 400
-"""Shards kept open by a reader, with one file descriptor each, two once it is mapped; a process has 1024 as a rule."""
+"""The most shards that a reader keeps open, with a file descriptor each, two once mapped; a usual limit is 1024."""
 
 
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
     def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
-        """Name what to follow; store, scene and plans may appear later. With `guides` as after `follow_guides`."""
+        """Take the scene to follow; store, scene and plans may appear later. `guides` works as `follow_guides` does."""
         self._with_guides = guides
         self._guides: GuideStore | None = None
         self._guided: set[int] = set()  # jobs whose guides are there
@@ -70,10 +70,10 @@ class SceneReader:
         self._spec: SceneSpec | None = None
         self._arrays: dict[str, schema.ArraySchema] = {}
         self._plans: list[StoredPlan] = []
-        self.plan_requests: list[dict[str, Any]] = []  # what was asked for with each: all that its rows follow from
+        self.plan_requests: list[dict[str, Any]] = []  # the requests of the plans, from which all rows follow
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
-        self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found complete no longer: a repair
+        self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found incomplete again, after a repair
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards = _OpenShards()
 
@@ -90,7 +90,7 @@ class SceneReader:
         return self._spec
 
     def follow_guides(self) -> None:
-        """Read guides too, from the next refresh on: a sample is complete only if its view has them.
+        """Read guides too, from the next refresh on: then a sample is complete only if its view has them.
 
         Raises StoreError while the scene is not there, and SpecError for a scene without guides.
         """
@@ -120,7 +120,7 @@ class SceneReader:
         return sum(plan.samples for plan in self._plans)
 
     def refresh(self) -> NDArray[np.int64]:
-        """The rows of the samples that have become complete since the last refresh; none while nothing is there.
+        """Look for new samples; returns the rows of those completed since the last refresh, none without a scene.
 
         Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
         """
@@ -140,7 +140,7 @@ class SceneReader:
         complete = plans.complete_rows(self._plans, committed)
         if self._with_guides:
             complete[complete] = has_guides(self._plans, guided)[self._view_row[complete]]
-        if (self._committed - committed) | (self._guided - guided):  # taken back by a repair
+        if (self._committed - committed) | (self._guided - guided):  # markers removed by a repair
             self._shards.clear()
         self._guided = guided
         before = np.zeros(len(complete), np.bool_)
@@ -164,10 +164,10 @@ class SceneReader:
     # ---------------------------------------------------------------------------------------------------------- samples
 
     def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
-        """Complete samples in the order of `rows`, in the types they are stored in; every byte has been checked.
+        """Read complete samples in the order of `rows`, in their stored types; every byte is checked.
 
-        They are read into the first places of `out`, and what is returned is these; without, into new memory. Raises
-        CorruptError if their bytes are not what was committed; what `out` holds is then undefined.
+        They are read into the first places of `out`, which are returned; without it, into new memory. Raises
+        CorruptError if bytes are not what was committed; the content of `out` is then undefined.
         """
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)
@@ -187,15 +187,15 @@ class SceneReader:
                     self._read_into(name, row, memory[place])
         return batch
 
-    def read(self, row: int) -> Sample:
-        """One complete sample; raises CorruptError if its bytes are not what was committed."""
+    def read(self, row: int) -> StoredSample:
+        """Read one complete sample; raises CorruptError if its bytes are not what was committed."""
         batch = self.read_batch([row])
         buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
         modification, view, pass_ = self.inputs(row)
         known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
         guides = Guides(**known) if known else None
         seen = ViewBuffers(**buffers), batch.visibility(0)
-        sample = Sample(row, modification, view, batch.linear(0), *seen, pass_, guides)
+        sample = StoredSample(row, modification, view, batch.linear(0), *seen, pass_, guides)
         if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
             raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
         return sample
@@ -206,7 +206,7 @@ class SceneReader:
         return modification, plans.view_at(self._plans, int(self._view_row[row])), int(self._pass[row])
 
     def read_photons(self, row: int) -> Photons:
-        """The photons of a sample's modification; raises StoreError for a scene without photons."""
+        """Read the photons of a sample's modification; raises StoreError for a scene without photons."""
         if not self.spec.photons.paths:
             raise StoreError(f"scene {self._scene_id} has photons.paths = 0; no photons are stored")
         modification_row = self.modification_row(row)
@@ -219,7 +219,7 @@ class SceneReader:
         return Photons(**read, bounce=bounce)
 
     def rows_of_view(self, view_row: int) -> NDArray[np.int64]:
-        """The complete samples that show the view in a row, ascending: its passes."""
+        """The rows of the complete samples of the view in a row, ascending: its passes."""
         rows = np.flatnonzero(self._view_row == view_row)
         rows = rows[rows < len(self._complete)]  # a plan may be younger than the last marker
         return rows[self._complete[rows]]
@@ -283,7 +283,7 @@ class SceneReader:
         if shard is not None and within in shard:
             self._read_from(shard, "radiance", row, batch.radiance[place])
             return
-        batch.radiance[place] = np.nan  # whoever forgets `wide` shall see it
+        batch.radiance[place] = np.nan  # so that a caller that ignores `wide` notices
         batch.wide[place] = self._read("radiance_wide", row)
 
     def _read(self, name: str, row: int) -> NDArray[Any]:
@@ -301,9 +301,9 @@ class SceneReader:
         self._read_from(shard, name, row, values)
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
-        """A row of an open shard; of the file that is there now, where that fails: it may have been repaired since.
+        """Read a row of an open shard; if that fails, of the present file, which may have been repaired since.
 
-        Of a bucket's, of a new copy: this machine's may be damaged.
+        In a bucket, a new copy is fetched: this machine's may be damaged.
         """
         job, within = divmod(row, self._plans[0].shard_rows)
         try:
@@ -322,7 +322,7 @@ class SceneReader:
         return plan.shard(name, self._arrays[name], job)
 
     def _shard(self, name: str, row: int, *, anew: bool = False) -> tuple[Shard | None, int]:
-        """The shard of a row, and which of its rows it is; None if there is none, which may be of radiance alone."""
+        """The shard of a row, and its place in it; None if there is no shard, which is possible for radiance alone."""
         job, within = divmod(row, self._plans[0].shard_rows)
         shard = None if anew else self._shards.get((name, job))
         if shard is None:
@@ -334,7 +334,7 @@ class SceneReader:
         return shard, within
 
     def _open(self, file: str, array: schema.ArraySchema) -> Shard:
-        """A file of the store; of a new copy, if it is a copy and damaged."""
+        """Open a file of the store; if it is a damaged local copy, a new copy."""
         shard_rows = self._plans[0].shard_rows
         try:
             return Shard(self._storage.local(file), array, shard_rows)
@@ -346,7 +346,7 @@ class SceneReader:
 
 
 class _OpenShards:
-    """The shards used last, by array and job; one that is dropped is closed once nobody reads it any more."""
+    """The most recently used shards, by array and job; a dropped one is closed once its last reader is done."""
 
     def __init__(self) -> None:
         self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()

@@ -1,4 +1,4 @@
-"""The samples of one scene that a query fits, found over the plans' inputs at once.
+"""The samples of one scene that match a query, found over all inputs of the plans at once.
 
 Shape letters: R rows of a scene, N rows that match, G movable groups.
 """
@@ -31,7 +31,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a row of an array lies."""
+    """The place of a row of an array in the store."""
 
     array: str
     file: str  # its name in the store
@@ -42,7 +42,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class FoundSample:
-    """A sample and all that is known of it without reading it."""
+    """A sample and everything known of it without reading its arrays."""
 
     scene_id: str
     scene_name: str
@@ -55,11 +55,11 @@ class FoundSample:
     view_row: int
     view_key: str
     view: tuple[float, ...]  # camera position, look-at point
-    distance: float  # of the positions asked for, the farthest, in scene units
+    distance: float  # of the queried positions, the farthest, in scene units
     plan: int
     jobs: tuple[int, ...]  # of its own row, its view's and its modification's
     committed: tuple[bool, ...]  # these jobs
-    guided: bool | None  # whether its view has guides, by its job's marker; None: the scene is to have none
+    guided: bool | None  # whether its view has guides, by its job's marker; None: the scene is without guides
     places: tuple[Place, ...]
 
     @property
@@ -69,17 +69,17 @@ class FoundSample:
 
 
 class SceneMatch:
-    """The samples of one scene that a query fits: their rows (N,), nearest first, and their distances (N,)."""
+    """The samples of one scene that match a query: their rows (N,), nearest first, and their distances (N,)."""
 
     rows: NDArray[np.int64]
     distance: F64
 
     def __init__(self, scene: SceneStore, query: Query) -> None:
-        """Look; over the plans' inputs at once."""
+        """Search all inputs of the plans at once."""
         self._scene = scene
         self._plans = scene.plans()
         self._committed: set[int] | None = None
-        self.nearest: float | None = None  # distance, also where it is too far
+        self.nearest: float | None = None  # distance of the nearest, even if too far
         self.rows, self.distance = np.zeros(0, np.int64), np.zeros(0)
         if self._plans:
             self._look(query)
@@ -109,7 +109,7 @@ class SceneMatch:
         self.rows, self.distance = rows[fits][order], distance[fits][order]
 
     def _from_modification(self, rows: NDArray[np.int64], wanted: F32 | Key, *_: NDArray[np.int64]) -> F64:
-        """How far the modifications in some rows are from the one asked for; infinite if they are not alike."""
+        """The distances of the modifications in some rows from the wanted one; infinite if other groups are present."""
         vectors = _inputs(self._plans, "modification")[rows]
         if isinstance(wanted, bytes):
             return _unless_equal(modification_keys(self._scene.spec, vectors), wanted)
@@ -122,7 +122,7 @@ class SceneMatch:
     def _from_view(
         self, rows: NDArray[np.int64], wanted: F32 | Key, modification: NDArray[np.int64], view: NDArray[np.int64]
     ) -> F64:
-        """How far the views in some rows are from the one asked for, by the farther of position and look-at point."""
+        """The distances of the views in some rows from the wanted one: the larger of position and look-at point."""
         vectors = _inputs(self._plans, "view")[rows]
         if not isinstance(wanted, bytes):
             apart = (vectors.astype(np.float64) - wanted).reshape(-1, 2, 3)
@@ -135,7 +135,7 @@ class SceneMatch:
     # ------------------------------------------------------------------------------------------------------- describing
 
     def describe(self, row: int, distance: float) -> FoundSample:
-        """All that is known of the sample in a row."""
+        """Everything known of the sample in a row."""
         sample = plans.sample_at(self._plans, row)
         if sample is None:
             raise StoreError(f"row {row} of scene {self._scene.scene_id} is not used")
@@ -176,14 +176,14 @@ class SceneMatch:
         for name, array in schema.output_arrays(self._scene.spec).items():
             row = rows[array.kind]
             place = self._place(plans.plan_of(self._plans, row), name, array, row)
-            if place.there or name != "radiance_wide":  # which few samples need
+            if place.there or name != "radiance_wide":  # few samples need that one
                 found.append(place)
-        if any(place.array == "radiance_wide" for place in found):  # and those have nothing in the other
+        if any(place.array == "radiance_wide" for place in found):  # and those have nothing in `radiance`
             found = [place for place in found if place.array != "radiance" or place.there]
         return found
 
     def _guide_places(self, view_row: int) -> list[Place]:
-        """Those of the guides of a view; none if the scene is to have none."""
+        """The places of a view's guides; none if the scene is without guides."""
         if self._scene.guides.settings() is None:
             return []
         plan = beside(plans.plan_of(self._plans, view_row), self._scene.guides.name)

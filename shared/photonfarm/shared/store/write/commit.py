@@ -1,6 +1,6 @@
 """One job's outputs on their way into the store: row by row while it is rendered, and then all at once.
 
-Rows are written by a thread of their own, so that rendering does not wait for the disk, to parts that nobody sees; the
+A thread of its own writes rows to parts that readers do not see, so that rendering does not wait for the disk; the
 commit names them, makes them durable, and announces them by the job's marker.
 """
 
@@ -30,18 +30,18 @@ from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
 
 WAITING_ROWS = 8
-"""Rows rendered and not yet written: more would only hide for a while that the disk is slower than the renderer."""
+"""The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""
 
 
 T = TypeVar("T")
 
 ATTEMPTS = 3
-"""At a commit among others that change the job's files; a second one takes two of them at once."""
+"""The attempts to commit while other processes change the job's files; a second such change takes two attempts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What a job cost and how it went; kept in its marker."""
+    """The cost of a job, and its worker; kept in its marker."""
 
     core_s: float  # processor time, all threads
     wall_s: float
@@ -57,16 +57,16 @@ def _utc_now() -> datetime:
     return datetime.now(UTC)
 
 
-class Committed(Protocol):
-    """What files are committed to: a scene, or its guides."""
+class CommitTarget(Protocol):
+    """The target of a commit: a scene, or its guides."""
 
     @property
     def storage(self) -> Storage:
-        """Where it lies."""
+        """The storage of its files."""
 
     @property
     def name(self) -> str:
-        """Of its folder, which has plans and markers."""
+        """The name of its folder, which has plans and markers."""
 
     @property
     def scene_id(self) -> str:
@@ -81,17 +81,17 @@ class Committed(Protocol):
 
 
 class RowWriter(ABC):
-    """Takes rows of a job's arrays in any order, and commits them once all are there: into a `Committed`.
+    """Takes rows of a job's arrays in any order, and commits them to a `CommitTarget` once all are there.
 
-    A context manager: leaving it without `commit` leaves nothing behind. Arrays that are given must not be changed
-    afterwards. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
+    A context manager: leaving it without `commit` leaves nothing behind. Arrays must not be changed after they are
+    passed. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
     StoreError once the disk has refused something.
     """
 
     def __init__(
-        self, scene: Committed, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
+        self, scene: CommitTarget, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
     ) -> None:
-        """Begin; `plan` tells in which folder the arrays lie."""
+        """Begin; `plan` determines the folder of the arrays."""
         self._scene = scene
         self._rows = rows
         self._plan = plan
@@ -111,10 +111,10 @@ class RowWriter(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the thread and remove what has not been committed, if the disk lets us: a sweep does it otherwise."""
+        """End the thread and remove what is not committed; if the disk refuses, a sweep removes it later."""
         self._join()
         for shard in self._shards.values():
-            with contextlib.suppress(OSError):  # why a disk refuses is told by the error that is under way
+            with contextlib.suppress(OSError):  # the error under way states why a disk refuses
                 shard.close()
             discard(shard.part)
 
@@ -135,7 +135,7 @@ class RowWriter(ABC):
         self._raise_error()
 
     def _write(self) -> None:
-        """The thread: after an error it only empties the queue, so that nobody waits for it."""
+        """The thread's loop: after an error it only empties the queue, so that callers do not block."""
         while (taken := self._waiting.get()) is not None:
             if self._error is not None:
                 continue
@@ -165,18 +165,19 @@ class RowWriter(ABC):
     def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
         """Make the rows part of the store, all or nothing; False if another worker's commit came first.
 
-        False too if a repair has set aside files that we had named already, with a commit that relied on them, say; the
-        job is missing then, and rendered again.
+        It is also False if a repair has set aside files that were already named here, with another commit that relied
+        on them, say; then the job is missing, and rendered again.
 
-        Files that another writer left are kept where every row of the job can be read from them and ours, and are
-        replaced by ours otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError
-        if others go on changing the files meanwhile. `clock` tells when a marker of other files is set aside.
+        Files that another writer left are kept if every row of the job can be read from them and from the new ones, and
+        are replaced otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError if
+        other processes keep changing the files. `clock` gives the time at which a marker of other files is set aside.
 
-        Who meets files of others may meet those at work too: a repair, which has taken the marker back, and goes on to
-        move the files, and a writer that replaces what it cannot read. Each acts first and looks then, so that one of
-        two sees the other: a repair looks for a new marker once it has moved the files, and we compare marker and files
-        once the marker is placed. Who meets nobody compares nothing, and only looks whether the files are still there:
-        however long ago they were named, others may have committed them since, and a repair may have moved them.
+        Another writer's files may belong to a process still at work: a repair, which has removed the marker and is
+        about to move the files, or a writer that replaces what it cannot read. Each of them acts first and checks
+        afterwards, so that one of the two sees the other: a repair looks for a new marker after moving the files, and
+        this method compares marker and files after placing the marker. If it met no foreign file, it compares nothing,
+        and only checks that the files are still there: since they were named, another worker may have committed them,
+        and a repair may have moved them.
         """
         self._check_complete()
         self._join()
@@ -202,11 +203,11 @@ class RowWriter(ABC):
             )
 
     def _adopt_all(self) -> bool | None:
-        """Have every row of the job lie under its names; whether all files are ours.
+        """Give every row of the job its name; returns whether all files are new ones.
 
-        None if the job is committed, or files of ours are set aside.
+        None if the job is committed, or if files named here were set aside.
         """
-        self._storage.require()  # a store that is gone has none of our parts either, and they are not adopted
+        self._storage.require()  # a store that is gone has lost the parts too, which would look like a failed adoption
         left = [name for name, shard in self._shards.items() if shard.part.exists()]
         kept = [name for name in left if not self._adopt(name)]
         others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
@@ -225,7 +226,7 @@ class RowWriter(ABC):
         return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
 
     def _is_set_aside(self) -> bool:
-        """Whether a file that we have named is gone: only a repair moves one."""
+        """Whether a file named here is gone: only a repair moves one."""
         self._storage.require()
         named = [name for name, shard in self._shards.items() if not shard.part.exists()]
         return not self._are_there(named)
@@ -234,7 +235,7 @@ class RowWriter(ABC):
         return all(self._storage.exists(self._file(name)) for name in names)
 
     def _summaries(self) -> dict[str, dict[str, Any]]:
-        """Size and checksum of the files that are there, by array; none of those that cannot be read."""
+        """The size and checksum of each file that is there, by array; unreadable ones are left out."""
         found = {}
         for name in self._arrays:
             if self._storage.exists(self._file(name)):
@@ -247,21 +248,21 @@ class RowWriter(ABC):
         return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
 
     def _is_marker_right(self, clock: Clock) -> bool:
-        """Whether the job's marker, ours or not, tells the files that are there; one that does not is set aside.
+        """Whether the job's marker, ours or not, matches the files that are there; one that does not is set aside.
 
-        A file that it does not name takes nothing from those that it does: a writer that was late, and whose render
-        needs float32, has added it. Only `radiance` would be read instead of `radiance_wide`.
+        A file that the marker does not name does no harm: it is from a late writer whose render needed float32. Of the
+        two arrays only `radiance` would then be read instead of `radiance_wide`.
         """
         name = markers.name_of(self._scene.name, self._rows.job)
         try:
             marker = self._storage.read(name)
-        except FileNotFoundError:  # a repair has seen it first
+        except FileNotFoundError:  # a repair was faster
             return False
-        told = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
-        wrong = self._told_wrong(told)
+        named = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
+        wrong = self._mismatched(named)
         renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
         if any(renewed):
-            wrong = self._told_wrong(told)
+            wrong = self._mismatched(named)
         if not wrong:
             return True
         detail = "files were moved or replaced while the job was committed; those that are there stay"
@@ -270,18 +271,18 @@ class RowWriter(ABC):
         Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
         return False
 
-    def _told_wrong(self, told: Mapping[str, Mapping[str, Any]]) -> list[str]:
-        """The arrays whose files are not what a marker tells of them."""
+    def _mismatched(self, named: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        """The arrays whose files differ from the marker."""
         there = self._summaries()
-        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in told]
-        return [name for name in relevant if not _is_told(told.get(self._plan_file(name)), there.get(name))]
+        relevant = [name for name in self._arrays if name == "radiance" or self._plan_file(name) in named]
+        return [name for name in relevant if not _matches(named.get(self._plan_file(name)), there.get(name))]
 
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
     @abstractmethod
     def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
-        """What must be given of each kind of rows: what it is called, and the rows."""
+        """The rows required of each kind, with the name of the kind in messages."""
 
     def _check_complete(self) -> None:
         for kind, (what, rows) in self._expected().items():
@@ -295,7 +296,7 @@ class RowWriter(ABC):
         return Shard(self._storage.local(self._file(name)), self._arrays[name], self._plan.shard_rows)
 
     def _look(self, name: str, look: Callable[[Shard], T]) -> T:
-        """What a look at an array's file gives; of a bucket's, at a new copy where this machine's is damaged."""
+        """Apply `look` to an array's file; in a bucket, to a new copy if this machine's is damaged."""
         try:
             return look(self._shard(name))
         except CorruptError:
@@ -315,7 +316,7 @@ class RowWriter(ABC):
         """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
 
     def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
-        """The rows that one shard does not hold, if that may be; raises CorruptError otherwise."""
+        """Check the rows of one shard; returns the missing ones if they may be missing, else raises CorruptError."""
         if not wanted:
             return set()
         rows = self._plan.shard_rows
@@ -326,19 +327,19 @@ class RowWriter(ABC):
 
 
 class JobWriter(RowWriter):
-    """Takes what a job renders: radiance of its samples, what its new views show, photons of new modifications."""
+    """Takes a job's outputs: radiance of its samples, buffers of new views, photons of new modifications."""
 
-    def __init__(self, scene: Committed, rows: JobRows, plan: StoredPlan) -> None:
+    def __init__(self, scene: CommitTarget, rows: JobRows, plan: StoredPlan) -> None:
         """Begin; `SceneStore.job_writer` calls this."""
         super().__init__(scene, rows, plan, schema.output_arrays(scene.spec))
 
     def radiance(self, row: int, halves: F32) -> None:
-        """The half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
+        """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
         self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
         self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
 
     def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
-        """What a new view row shows: its buffers, and which points and photons it sees."""
+        """Add a new view row: its buffers, and which points and photons it sees."""
         self._claim("view", row, "view", self._rows.new_views)
         for name, values in arrays_of(buffers).items():
             self._put(row, name, values)
@@ -346,7 +347,7 @@ class JobWriter(RowWriter):
         self._put_bits(row, "photon_seen", visibility.photons)
 
     def photons(self, row: int, photons: Photons) -> None:
-        """The photons of a new modification row."""
+        """Add the photons of a new modification row."""
         self._claim("modification", row, "photons", self._photon_rows())
         for name, values in arrays_of(photons).items():
             self._put(row, f"photon_{name}", values)
@@ -380,13 +381,13 @@ class JobWriter(RowWriter):
         self._check_rows("radiance_wide", samples)
 
 
-def _is_told(told: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
-    """Whether a marker says of a file what it is: size and checksum, or that there is none."""
-    return told == there if told is None or there is None else all(told[key] == there[key] for key in there)
+def _matches(named: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
+    """Whether a marker's entry matches a file: the same size and checksum, or neither exists."""
+    return named == there if named is None or there is None else all(named[key] == there[key] for key in there)
 
 
 def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
-    """Which array takes a sample, and what it is given: scaled, or as it is where float16 cannot hold that."""
+    """The array that a sample goes to, and its values: scaled, or unscaled if float16 cannot hold them."""
     with np.errstate(over="ignore", under="ignore"):
         scaled = radiance * np.float32(2.0**exponent)
     return ("radiance", scaled) if _stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)

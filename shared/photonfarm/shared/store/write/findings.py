@@ -1,4 +1,4 @@
-"""What `photonfarm store check` can find, and what it has found: grouped by cause, the first of each kept by name."""
+"""What `photonfarm store check` can find, and its findings: grouped by cause, the first of each kept by name."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from enum import Enum
 
 NAMED = 5
-"""Findings of one cause that a report names; the rest is counted."""
+"""The findings of one cause that a report lists; the rest is counted."""
 
 REASONS = 20
-"""Findings of one job that its quarantine record tells."""
+"""The findings of one job that its quarantine record lists."""
 
 
 JobPart = tuple[bool, int]
-"""What is set aside as one: whether it is a job's guides and not its samples, and the job."""
+"""The unit that is set aside: whether it is a job's guides or its samples, and the job."""
 
 
 class Remedy(Enum):
-    """What helps against a cause."""
+    """The remedies for causes."""
 
     RENDER = "render again"  # the job is set aside, and workers find it missing
     BASE = "write the base again"  # it is set aside, and the next job writes it
@@ -31,7 +31,7 @@ class Remedy(Enum):
 
 
 class Cause(Enum):
-    """Why something is found: its name in JSON, the sentence for it, and what helps."""
+    """The causes of findings: the name in JSON, the sentence, and the remedy."""
 
     MARKER = "marker", "a marker that cannot be read, or does not tell its job's files", Remedy.RENDER
     NO_PLAN = "no-plan", "a marker of a job that no plan has", Remedy.RENDER
@@ -116,19 +116,19 @@ class Cause(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing found."""
+    """One finding of a check."""
 
     cause: Cause
     detail: str
     scene_id: str | None = None
     job: int | None = None
-    row: int | None = None  # of the scene
+    row: int | None = None  # in the scene
     file: str | None = None  # its name in the store
-    guides: bool = False  # of a job's guides, not of its samples
+    guides: bool = False  # True: about a job's guides; False: about its samples
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class FindingGroup:
     """All findings of one cause."""
 
     cause: Cause
@@ -137,15 +137,15 @@ class Group:
 
 
 class Findings:
-    """Takes findings in, in memory that does not grow with their number but with that of the jobs they concern."""
+    """Collects findings; its memory grows with the number of jobs concerned, not with that of findings."""
 
     def __init__(self) -> None:
         self._count: Counter[Cause] = Counter()
         self._first: dict[Cause, list[Finding]] = {}
-        self.jobs: dict[JobPart, list[Finding]] = {}  # what is to be rendered again, each with its first reasons
+        self.jobs: dict[JobPart, list[Finding]] = {}  # to be rendered again, each with its first reasons
 
     def add(self, found: Iterable[Finding]) -> None:
-        """Take more findings in."""
+        """Add findings."""
         for finding in found:
             self._count[finding.cause] += 1
             _keep(self._first.setdefault(finding.cause, []), finding, NAMED)
@@ -156,9 +156,11 @@ class Findings:
         """The first findings of a cause."""
         return self._first.get(cause, [])
 
-    def groups(self) -> tuple[Group, ...]:
-        """Everything found, by cause."""
-        return tuple(Group(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause])
+    def groups(self) -> tuple[FindingGroup, ...]:
+        """All findings, by cause."""
+        return tuple(
+            FindingGroup(cause, self._count[cause], tuple(self.of(cause))) for cause in Cause if self._count[cause]
+        )
 
 
 def _keep(kept: list[Finding], finding: Finding, most: int) -> None:

@@ -1,8 +1,8 @@
-"""A scene's guides: what is known of each view before anything is learned, in a folder of its own below the scene's.
+"""A scene's guides, which are known of each view before any learning, in a folder of their own below the scene's.
 
-    SCENE/guides/settings.json                  what they are rendered with; the scene has guides once it is there
-    SCENE/guides/plans/000000/                  a Zarr group with the guides' arrays, beside the plan of that number
-    SCENE/guides/committed/000000000000.json    a marker for each job whose new views have their guides
+SCENE/guides/settings.json                  the settings they are rendered with; its presence gives the scene guides
+SCENE/guides/plans/000000/                  a Zarr group with the guides' arrays, beside the plan of that number
+SCENE/guides/committed/000000000000.json    a marker for each job whose new views have their guides
 
 Rows, jobs, shards and markers are those of the scene's plans, so that guides can be added to a scene at any time: the
 jobs that lack them are missing until workers have rendered them, and no radiance is rendered again.
@@ -31,22 +31,22 @@ from photonfarm.shared.store.write.commit import RowWriter
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 GUIDES = "guides"
-"""The folder of a scene's guides, in the scene's."""
+"""The folder of a scene's guides, below the scene's."""
 
 SETTINGS = "settings.json"
 
 NOISY = ("direct", "gloss", "point_light")
-"""The guides that are sampled, by seeds of their own; they are rounded."""
+"""The guides that are sampled, with seeds of their own; they are rounded."""
 
 RESTORE = "`photonfarm store check --repair` sets it aside, and `photonfarm store upgrade` writes it anew"
-"""What helps settings that are damaged."""
+"""The remedy for damaged settings."""
 
 
 class GuideStore:
-    """The guides of one scene, whether it has some or not."""
+    """The guides of one scene, which may have none."""
 
     def __init__(self, storage: Storage, scene: str, spec: SceneSpec) -> None:
-        """Those of the scene in a folder; nothing is looked at."""
+        """Take the scene's folder; nothing is read yet."""
         self.storage = storage
         self.spec = spec
         self.scene_id = spec.scene_id
@@ -54,15 +54,15 @@ class GuideStore:
         self._settings: GuideSpec | None = None
 
     def settings(self) -> GuideSpec | None:
-        """What they are rendered with; None if the scene has none. Raises CorruptError."""
+        """The settings that they are rendered with; None if the scene has no guides. Raises CorruptError."""
         if self._settings is None:
             self._settings = _read_settings(self.storage, self.name)
         return self._settings
 
     def want(self, wanted: GuideSpec) -> bool:
-        """Have guides rendered for all views, of plans that are there and to come; False if that is so already.
+        """Request guides for all views of present and future plans; False if that was done before.
 
-        Raises SpecError where the scene has guides that are rendered with other settings.
+        Raises SpecError if the scene has guides with other settings.
         """
         new = self.ask(wanted)
         found = self.settings()
@@ -74,7 +74,7 @@ class GuideStore:
         return new
 
     def ask(self, wanted: GuideSpec) -> bool:
-        """Have guides rendered for all views as `want` does; False if they are already, with whatever settings."""
+        """Request guides for all views as `want` does; False if that was done before, with whatever settings."""
         with store_errors("ask for guides", self.storage.where):
             return put_json(self.storage, wanted.model_dump(mode="json"), f"{self.name}/{SETTINGS}")
 
@@ -91,11 +91,11 @@ class GuideStore:
         return markers.read(self.storage, self.name, job)
 
     def lacks(self, found: Sequence[StoredPlan]) -> list[int]:
-        """The jobs of these plans that have new views without guides, in order; none if the scene has no guides."""
+        """The jobs of these plans with new views that still lack guides, in order; none if the scene has no guides."""
         return self.without(found) if self.settings() is not None else []
 
     def without(self, found: Sequence[StoredPlan]) -> list[int]:
-        """The jobs of these plans that have new views without guides, in order, whether the scene has guides or not."""
+        """The jobs of these plans with new views without guides, in order, even if the scene has no guides."""
         done = self.committed_jobs()
         return [job for plan in found for job in jobs_with_views(plan) if job not in done]
 
@@ -104,13 +104,13 @@ class GuideStore:
         return bool(rows.new_views) and self.settings() is not None and not self.is_committed(rows.job)
 
     def writer(self, rows: JobRows, plan: StoredPlan) -> GuideWriter:
-        """What takes the guides of a job's new views and commits them; their arrays are declared first."""
+        """A writer that takes the guides of a job's new views and commits them; it declares their arrays first."""
         own = beside(plan, self.name)
         self._declare(own)
         return GuideWriter(self, rows, own)
 
     def _declare(self, plan: StoredPlan) -> None:
-        """Declare the arrays of the guides of a plan, unless they are."""
+        """Declare the arrays of a plan's guides, unless they are declared."""
         if self.storage.exists(f"{plan.folder}/zarr.json"):
             return
         with store_errors("declare the guides of a plan", self.storage.where):
@@ -148,7 +148,7 @@ def jobs_with_views(plan: StoredPlan) -> list[int]:
 
 
 def has_guides(found: Sequence[StoredPlan], done: Set[int]) -> NDArray[np.bool_]:
-    """Whether the view in each row of the scene has guides, (rows of all plans,), where these jobs' are there."""
+    """Whether the view in each row of the scene has guides, (rows of all plans,), given the jobs that have them."""
     if not found:
         return np.zeros(0, np.bool_)
     jobs = np.zeros(found[-1].end_job, np.bool_)
@@ -169,7 +169,7 @@ def _read_settings(storage: Storage, guides: str) -> GuideSpec | None:
             return None
         content = storage.read(name)
     try:
-        return GuideSpec.model_validate(json.loads(content), extra="ignore")  # of a later program
+        return GuideSpec.model_validate(json.loads(content), extra="ignore")  # a later program may add keys
     except ValidationError as error:
         raise CorruptError(f"{where}: {'; '.join(sentences(error))}; {RESTORE}") from error
     except (ValueError, RecursionError) as error:
@@ -184,7 +184,7 @@ class GuideWriter(RowWriter):
         super().__init__(guides, rows, plan, schema.guide_arrays(guides.spec))
 
     def guides(self, row: int, guides: Guides) -> None:
-        """The guides of a new view row."""
+        """Add the guides of a new view row."""
         self._claim("view", row, "guides", self._rows.new_views)
         for name, values in arrays_of(guides).items():
             self._put(row, name, rounded(values) if name in NOISY else values)
@@ -198,9 +198,9 @@ class GuideWriter(RowWriter):
 
 
 def rounded(values: NDArray[Any]) -> F32:
-    """Numbers rounded to 8 significant bits, to nearest with ties to even; what is noisy needs no more.
+    """Numbers rounded to 8 significant bits, to nearest with ties to even; noisy values need no more.
 
-    The two lower bytes are 0 then and take no room once compressed. Finite values may not be within 0.4 % of the
+    The two lower bytes are then 0 and take no room once compressed. Finite values must not be within 0.4 % of the
     largest float32.
     """
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)

@@ -1,4 +1,4 @@
-"""Plans as they lie in the store: written once aside and renamed into place, then only read.
+"""Plans in the store: written once under another name and renamed into place, then only read.
 
 Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job r // J.
 """
@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from photonfarm.shared.core.errors import CorruptError, store_errors
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import UNUSED, Expansion, Known, PlannedRows, Request, expand
+from photonfarm.shared.plan.request import UNUSED, Expansion, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec, sentences
@@ -32,13 +32,13 @@ MISSING = (
     "the plan is missing, or its zarr.json is; it says what the rows of its jobs are, and cannot be made anew: put the "
     "folder back from a copy of the store"
 )
-"""Of a plan."""
+"""The message about a missing plan."""
 
 RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a copy of the store"
-"""What helps a plan whose request cannot be read."""
+"""The remedy for a plan whose request cannot be read."""
 
 REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
-"""What helps against most damage of a plan."""
+"""The remedy for most damage of a plan."""
 
 _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
@@ -57,22 +57,22 @@ class StoredPlan:
 
     @property
     def end_job(self) -> int:
-        """Number of the job after its last."""
+        """The number of the job after its last."""
         return self.first_job + self.jobs
 
     @property
     def first_row(self) -> int:
-        """Number of its first row, in the scene."""
+        """The number of its first row, in the scene."""
         return self.first_job * self.shard_rows
 
     @property
     def end_row(self) -> int:
-        """Number of the row after its last."""
+        """The number of the row after its last."""
         return self.end_job * self.shard_rows
 
     @property
     def samples(self) -> int:
-        """How many samples it holds; the rest of its last job's rows is unused."""
+        """The number of samples that it holds; the rest of its last job's rows is unused."""
         return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
 
     def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
@@ -81,8 +81,8 @@ class StoredPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
-    """What the attributes of a plan's group tell."""
+class PlanAttributes:
+    """The attributes of a plan's group."""
 
     request: Request | TopUp
     first_job: int
@@ -124,8 +124,8 @@ def folder(scene: str, number: int) -> str:
 def expanded(
     spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
-    """The rows of a request that the plans before it do not have: a function of these, the same each time."""
-    known = Known((plan.first_row, plan.rows) for plan in before)
+    """The rows of a request that the earlier plans do not have: a function of these, the same each time."""
+    known = PlannedContent((plan.first_row, plan.rows) for plan in before)
     if isinstance(request, TopUp):
         return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
@@ -156,10 +156,10 @@ def build(
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
-    """The plans of a scene in order, those already loaded taken over; all, or those before number `until`.
+    """The plans of a scene in order, keeping those already loaded; all, or those before number `until`.
 
-    Raises CorruptError if one of them is missing or is not as it was written: later rows refer to its rows, and a plan
-    that is left out would be planned again without end.
+    Raises CorruptError if one is missing or is not as it was written: later rows refer to its rows, and its samples
+    would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
         end = count(storage, scene, len(loaded)) if until is None else until
@@ -167,10 +167,10 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
 
 
 def count(storage: Storage, scene: str, loaded: int = 0) -> int:
-    """How many plans a scene must have, by the last one's number; the first `loaded` are known to be there.
+    """The number of plans that a scene must have, by the last one's number; the first `loaded` are known to be there.
 
-    The last one does not count yet while it is being written, which can be seen in a bucket alone: it is claimed there,
-    and its zarr.json comes last.
+    A last plan that is still being written does not count. This shows only in a bucket, where the folder is claimed
+    first, and its zarr.json comes last.
     """
     names = [name for name in storage.names(f"{scene}/{PLANS}") if name.isascii() and name.isdecimal()]
     found = max((int(name) + 1 for name in names if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
@@ -200,21 +200,21 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
 
 
 def reason(error: Exception) -> str:
-    """One line of why a plan cannot be read."""
+    """The reason why a plan cannot be read, in one line."""
     if isinstance(error, ValidationError):
         return "; ".join(sentences(error))
     return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
 
 
 def check_version(attributes: Mapping[str, Any], where: str) -> None:
-    """Return for the attributes of a plan of this program's version; raises StoreError, with a sentence."""
+    """Return if a plan's attributes are of this program's version; else raises StoreError, with a sentence."""
     declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
 
 
-def about_plan(attributes: dict[str, Any]) -> About:
-    """The attributes of a plan's group; raises ValueError or KeyError."""
-    request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # of a later program
-    return About(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
+def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
+    """Read the attributes of a plan's group; raises ValueError or KeyError."""
+    request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
+    return PlanAttributes(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
@@ -263,7 +263,7 @@ def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
 
 
 def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
-    """Everything that one job needs; raises IndexError for a job of no plan."""
+    """The inputs and outputs of one job; raises IndexError for a job of no plan."""
     for plan in plans:
         if plan.first_job <= job < plan.first_job + plan.jobs:
             break
@@ -287,7 +287,7 @@ def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
 def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:
     """Whether each row of the scene holds a complete sample, (rows of all plans,).
 
-    That is one whose own job, whose view's job and whose modification's job are committed.
+    A sample is complete if its own job, its view's job and its modification's job are committed.
     """
     if not plans:
         return np.zeros(0, np.bool_)

@@ -1,14 +1,14 @@
-"""What is damaged is set aside, never deleted: moved to a folder of its own, with a record of what and why.
+"""Damaged files are set aside, never deleted: moved to a folder of its own, with a record of what and why.
 
-    STORE/quarantine/000000/repair.json                  a repair: when; its number is claimed by placing this file
-    STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job and why; base-…, spec-…, plan-…
-                                                         alike; of guides, …-<scene id>-guides-…
-    STORE/quarantine/000000/scenes/<scene id>/…          the files, under the names that they had
+STORE/quarantine/000000/repair.json                  a repair: when; its number is claimed by placing this file
+STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job and why; base-…, spec-…, plan-…
+alike; of guides, …-<scene id>-guides-…
+STORE/quarantine/000000/scenes/<scene id>/…          the files, under the names that they had
 
-The marker goes first: from then on readers do not see the job and workers find it missing, and what has become of its
-files meanwhile does not matter. So a repair may be killed at any point: the record is there before anything moves, what
-has not been moved yet is data without a marker, which the next commit of the job keeps if it is whole and replaces
-otherwise, and the next check finds whatever is still wrong.
+The marker goes first: from then on readers do not see the job and workers find it missing, and what becomes of its
+files meanwhile does not matter. So a repair may be killed at any point: the record is there before anything moves;
+files not yet moved are data without a marker, which the next commit of the job keeps if they are whole and replaces
+otherwise; and the next check finds whatever is still wrong.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _DIGITS = 6
 
 
 class Quarantine:
-    """One repair: what it sets aside. Nothing is written before there is something."""
+    """One repair, which sets files aside. Nothing is written before there is one to set aside."""
 
     def __init__(self, storage: Storage, when: str) -> None:
-        """Begin; `when` is told in the records."""
+        """Begin; `when` goes into the records."""
         self._storage = storage
         self._when = when
         self.folder: str | None = None  # its name in the store, once claimed
@@ -38,7 +38,7 @@ class Quarantine:
     def job(self, scene: str, job: int, marker: bytes, files: Iterable[str], why: Sequence[Finding]) -> bool:
         """Set a committed job aside: its marker, then its files; `scene` is the scene's folder, or that of its guides.
 
-        False if its marker is not `marker` any more: somebody else has repaired it. Raises StoreError.
+        False if its marker is not `marker` any more, as another repair was faster. Raises StoreError.
         """
         with store_errors(f"set job {job} aside", self._storage.where):
             name = markers.name_of(scene, job)
@@ -51,7 +51,7 @@ class Quarantine:
             self._move(there)
         again = read_or_none(self._storage, name)
         if again is not None and not self._has_files(again, scene, job):
-            # a worker that had found our files in its way has announced them just before we moved them
+            # a worker that had found our files in its way has just announced them
             return Quarantine(self._storage, self._when).job(scene, job, again, there, why)
         return True
 
@@ -75,7 +75,7 @@ class Quarantine:
         return self._document(f"{scene}/spec.json", f"spec-{_id(scene)}", why, then)
 
     def settings(self, guides: str, why: Sequence[Finding]) -> bool:
-        """Set the settings of the guides in a folder aside, so that they are asked for anew; False without any."""
+        """Set the settings in a folder of guides aside, so that they can be requested anew; False without any."""
         then = "`photonfarm store upgrade` writes it"
         return self._document(f"{guides}/settings.json", f"settings-{_id(guides)}", why, then)
 
@@ -87,9 +87,9 @@ class Quarantine:
             return bool(self._move([name]))
 
     def rewrite(self, scene: str, plan: int, files: Mapping[str, Path], why: Sequence[Finding]) -> None:
-        """Put new files (parts) in the place of damaged ones of a plan, of which copies are set aside first.
+        """Replace damaged files of a plan by new ones (parts); copies of the damaged ones are set aside first.
 
-        No name is ever without bytes, so that nobody who reads the plan meanwhile takes it for another one.
+        No name is ever without bytes, so that no reader of the plan takes it for another one meanwhile.
         """
         with store_errors(f"write plan {plan} again", self._storage.where):
             held = {name: read_or_none(self._storage, name) for name in files}
@@ -115,7 +115,7 @@ class Quarantine:
             discard(part)
 
     def _claimed(self) -> str:
-        """The folder of this repair; two repairs at once get two."""
+        """The folder of this repair; concurrent repairs get different ones."""
         number = 0
         while self.folder is None:
             number = max([number, *(int(name) + 1 for name in self._storage.names(QUARANTINE) if name.isdecimal())])
@@ -135,7 +135,7 @@ class Quarantine:
         put_json(self._storage, document, f"{self._claimed()}/{name}.json")
 
     def _move(self, names: Sequence[str]) -> list[str]:
-        """Move what is there, durably; what was."""
+        """Move the files that are there, durably; returns their names."""
         moved = []
         for name in names:
             try:
@@ -156,7 +156,7 @@ class Quarantine:
 def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool:
     """Whether a repair has moved a job's marker and all of its files away, and these were the same as they are now.
 
-    Then the job has been rendered since, and has come out the same. Raises CorruptError for a marker that is none.
+    If so, the job has been rendered again with the same result. Raises CorruptError for an invalid marker.
     """
     name, now = markers.name_of(scene, job), markers.files(marker, scene, job)
     for number in storage.names(QUARANTINE):
@@ -171,5 +171,5 @@ def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool
 
 
 def _id(scene: str) -> str:
-    """What tells a scene's folder from others in names of records, and that of its guides from the scene's."""
+    """The name by which records identify a scene's folder, or that of its guides."""
     return "-".join(scene.split("/")[1:])

@@ -1,4 +1,4 @@
-"""One scene of a store as those see it who plan and render: its spec, plans, jobs, base and markers.
+"""One scene of a store, for planning and rendering: its spec, plans, jobs, base and markers.
 
 Plans and markers are the truth. Nothing here needs a lock: a name appears once, and the first one stays.
 """
@@ -35,23 +35,23 @@ _SCENE_ID = re.compile("[0-9a-f]{32}")
 
 @dataclass(frozen=True, slots=True)
 class PlanResult:
-    """What became of a request."""
+    """The outcome of a request."""
 
     scene_id: str
     plan: int | None  # number of the new plan; None if nothing was new, or nothing was written
     new: int  # samples planned now
     known: int  # samples of the request that older plans hold
     jobs: int  # jobs of the new plan
-    extent: Extent  # as of `Expansion`
+    extent: Extent  # as in `Expansion`
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a scene is, in samples."""
+    """The progress of a scene, in samples."""
 
     planned_samples: int
     committed_samples: int  # complete ones
-    usable_samples: int  # of these, those whose view lacks no guides, where the scene is to have some
+    usable_samples: int  # of these, those whose view lacks no guides, if the scene has guides
     planned_passes: int  # of the planned samples, further passes: those that top-ups planned
     committed_passes: int  # of these, the complete ones
 
@@ -81,9 +81,9 @@ class SceneStore:
         return self._plans
 
     def plan(self, request: Request | TopUp, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
-        """Plan what is new of a request; racing submitters try again, each against the other's plan.
+        """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
-        Raises SpecError for a request or a number of rows that cannot be, and CorruptError if a plan is missing.
+        Raises SpecError for an invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
             last = {name: max(markers.jobs(self.storage, name), default=-1) for name in (self.name, self.guides.name)}
@@ -125,23 +125,23 @@ class SceneStore:
     # ------------------------------------------------------------------------------------------------------------- jobs
 
     def job_rows(self, job: int) -> JobRows:
-        """What a job must produce, with its inputs; raises IndexError for a job of no plan."""
+        """The inputs and outputs of a job; raises IndexError for a job of no plan."""
         if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
             self.plans()
         return plans.job_rows(self._plans, job)
 
     def job_writer(self, job: int) -> JobWriter:
-        """What takes a job's outputs and commits them; raises IndexError for a job of no plan."""
+        """A writer that takes a job's outputs and commits them; raises IndexError for a job of no plan."""
         rows = self.job_rows(job)
         return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
 
     def guide_writer(self, job: int) -> GuideWriter:
-        """What takes the guides of a job's new views and commits them; raises IndexError for a job of no plan."""
+        """A writer that takes and commits the guides of a job's new views; raises IndexError for a job of no plan."""
         rows = self.job_rows(job)
         return self.guides.writer(rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
 
     def jobs(self) -> int:
-        """How many jobs are planned; they are numbered from 0."""
+        """The number of planned jobs; they are numbered from 0."""
         found = self.plans()
         return found[-1].end_job if found else 0
 
@@ -168,7 +168,7 @@ class SceneStore:
         return markers.read(self.storage, self.name, job)
 
     def progress(self) -> Progress:
-        """How far the scene is; costs one listing of the markers, and of those of guides."""
+        """The scene's progress; costs one listing of the markers, and of those of guides."""
         committed, guided = self.committed_jobs(), self.guides.committed_jobs()
         found = self.plans()
         complete = plans.complete_rows(found, committed)
@@ -209,12 +209,12 @@ class SceneStore:
 
 
 def scene_ids(storage: Storage) -> list[str]:
-    """The scenes that are there, in order of their ids; what else lies among them is somebody else's."""
+    """The scenes that are there, in order of their ids; foreign folders among them are ignored."""
     return sorted(name for name in storage.names(SCENES) if is_there(storage, name))
 
 
 def is_there(storage: Storage, scene_id: str) -> bool:
-    """Whether a scene is there: its spec, which is written first, or plans or markers that have lost it."""
+    """Whether a scene is there: its spec, which is written first, or plans or markers whose spec is lost."""
     if not _SCENE_ID.fullmatch(scene_id):
         return False
     name = f"{SCENES}/{scene_id}"
@@ -226,7 +226,7 @@ def is_there(storage: Storage, scene_id: str) -> bool:
 
 
 def are_there(storage: Storage) -> bool:
-    """Whether a place that may be no store has folders of scenes; raises StoreError if it cannot be read."""
+    """Whether a place that may not be a store has folders of scenes; raises StoreError if it cannot be read."""
     with store_errors("look for scenes", storage.where):
         return SCENES in storage.names("") and any(map(_SCENE_ID.fullmatch, storage.names(SCENES)))
 

@@ -1,7 +1,7 @@
-"""A Zarr group on its way, written by zarr-python to a part: once it is whole or has failed, nothing is written to it.
+"""A Zarr group that zarr-python writes to a part: once it is whole or has failed, nothing more is written to it.
 
-Where the disk refuses one of several files, zarr-python raises at once and goes on with the others. They would make the
-part's folder again after it has been removed.
+If the disk refuses one of several files, zarr-python raises at once and goes on with the others. They would make the
+part's folder again after its removal.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from zarr.storage import LocalStore, WrapperStore
 
 @contextlib.contextmanager
 def group_in(part: Path) -> Iterator[Store]:
-    """What zarr-python writes a group to; after the block it writes nothing more, however that ends."""
+    """A store for zarr-python to write a group to; after the block nothing more is written, however it ends."""
     store = _Part(LocalStore(part))
     try:
         yield store
@@ -45,7 +45,7 @@ class _Part(WrapperStore[LocalStore]):
             await super().set_if_not_exists(key, value)
 
     def end(self) -> None:
-        """Refuse what has not begun, and wait for the rest."""
+        """Refuse new writes, and wait for those under way."""
         with self._changed:
             self._has_ended = True
             self._changed.wait_for(lambda: not self._at_work)

@@ -1,4 +1,4 @@
-"""How far a store is."""
+"""The progress of a store."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from photonfarm.shared.store.write.store import Store, check_format
 
 @dataclass(frozen=True, slots=True)
 class SceneStatus:
-    """Planned and done, of one scene."""
+    """The planned and the committed amounts of one scene."""
 
     scene_id: str
     name: str
@@ -32,25 +32,25 @@ class SceneStatus:
     markers_unreadable: int  # of committed jobs whose bytes, time and redrawn renders are not counted
     marker_error: str | None  # why the first of these cannot be read
     markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
-    error: str | None = None  # why nothing is known of it; all numbers are 0 then
+    error: str | None = None  # why the scene cannot be read; all numbers are 0 then
     views_planned: int = 0
-    views_guided: int | None = None  # that have guides; None: the scene has none, nor has been asked for any
+    views_guided: int | None = None  # the views with guides; None: the scene has no guides, and none are requested
     guide_jobs: int = 0  # whose guides are committed
     guide_bytes: int = 0  # of their guides, out of `size_bytes`
 
 
 _READERS = 8
-"""Markers read at a time: a bucket answers after milliseconds, whoever asks."""
+"""The number of markers read at a time: a bucket takes milliseconds for each answer."""
 
 _BLOCK = 256
-"""Markers that a reader takes at a time, and forgets once they are summed up."""
+"""The number of markers that a reader takes at a time, and forgets once they are summed up."""
 
 
 def store_status(store: Store) -> list[SceneStatus]:
     """The status of every scene; reads every marker, and holds few of them at a time.
 
-    A scene that cannot be read says why, by its `error`, and markers that cannot be are counted by themselves. Raises
-    StoreError if the store cannot be read.
+    A scene that cannot be read has an `error`, and unreadable markers are counted by themselves. Raises StoreError if
+    the store cannot be read.
     """
     known, failed = store.each(scene_status)
     for scene_id, error in failed.items():
@@ -101,7 +101,7 @@ def scene_status(scene: SceneStore) -> SceneStatus:
 
 @dataclass(slots=True)
 class _Sums:
-    """What the markers of some committed jobs tell."""
+    """Sums over the markers of some committed jobs."""
 
     size_bytes: int = 0
     core_s: float = 0.0
@@ -110,18 +110,18 @@ class _Sums:
     error: StoreError | None = None  # of the first of these
 
     def add(self, other: _Sums) -> None:
-        """Take in what other markers tell."""
+        """Add the sums over other markers."""
         for name in ("size_bytes", "core_s", "redrawn", "unreadable"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.error = self.error or other.error
 
 
 Read = Callable[[int], dict[str, Any]]
-"""Gives the marker of a job."""
+"""A function that reads the marker of a job."""
 
 
 def _summed(read: Read, committed: list[int]) -> _Sums:
-    """What the markers of many jobs tell, read several at a time."""
+    """Sums over the markers of many jobs, read several at a time."""
     blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
     sums = _Sums()
     with ThreadPoolExecutor(_READERS) as readers:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
-from photonfarm.shared.plan.request import SHARD_ROWS, Known, Request, expand
+from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations
 from photonfarm.shared.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
@@ -21,7 +21,7 @@ class Store:
     """A sample store in a folder or bucket; holds any number of scenes."""
 
     def __init__(self, root: str | Path, *, create: bool = False) -> None:
-        """Open a store, or make one where there is none; raises StoreError if that cannot be."""
+        """Open a store, or make one if there is none; raises StoreError if that is impossible."""
         self.root = root
         self.storage = open_storage(root)
         self._opened: dict[str, SceneStore] = {}
@@ -34,15 +34,15 @@ class Store:
             if self.storage.exists(FORMAT_FILE):
                 return
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
-            if foreign and not self.storage.exists(FORMAT_FILE):  # nobody made one in the meantime
+            if foreign and not self.storage.exists(FORMAT_FILE):  # no other process made one in the meantime
                 raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
             if are_there(self.storage):
-                return  # a store that has lost its document: a new one would have another id
+                return  # the store has lost its document: a new one would have another id
             with self.storage.founding():
                 put_json(self.storage, _new_document(), FORMAT_FILE)
 
     def check(self) -> None:
-        """Return if the store is still there; raises StoreError if it is gone, or another one lies in its place."""
+        """Check that the store is still there; raises StoreError if it is gone, or replaced by another one."""
         store_id = check_format(self.storage)
         if store_id != self.store_id:
             raise StoreError(
@@ -50,7 +50,7 @@ class Store:
             )
 
     def scene_ids(self) -> list[str]:
-        """The scenes that are there, damaged ones with them, in order of their ids."""
+        """The scenes that are there, including damaged ones, in order of their ids."""
         with store_errors("list the scenes", self.storage.where):
             return scene_ids(self.storage)
 
@@ -66,13 +66,13 @@ class Store:
         return self._opened[scene_id]
 
     def scenes(self, only: str | None = None) -> list[SceneStore]:
-        """Every scene of the store, or the one that is named; raises StoreError if that is not there."""
+        """Every scene of the store, or the named one; raises StoreError if that is not there."""
         return [self.scene(scene_id) for scene_id in (self.scene_ids() if only is None else [only])]
 
     def each(self, what: Callable[[SceneStore], T]) -> tuple[dict[str, T], dict[str, StoreError]]:
-        """What a function gives of every scene, and why it gives nothing of some: damage of one concerns no other.
+        """The result of a function for every scene, and the errors of those that fail: damage of one affects no other.
 
-        Raises StoreError if it is the store that cannot be read.
+        Raises StoreError if the store itself cannot be read.
         """
         given: dict[str, T] = {}
         failed: dict[str, StoreError] = {}
@@ -96,26 +96,26 @@ class Store:
     def plan(
         self, spec: SceneSpec, request: Request, *, shard_rows: int | None = None, dry_run: bool = False
     ) -> PlanResult:
-        """Plan what is new of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
+        """Plan the new samples of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
         if dry_run and not self.has_scene(spec.scene_id):
-            expansion = expand(spec, request, Known(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
+            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
         return scene.plan(request, shard_rows=shard_rows, dry_run=dry_run)
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
-        """Remove temporary files that dead writers left; how many."""
+        """Remove temporary files that dead writers left; returns how many."""
         with store_errors("sweep temporary files", self.storage.where):
             return self.storage.sweep(stray_age_s=stray_age_s)
 
 
 def _new_document() -> dict[str, Any]:
-    """What a store made now says of itself."""
+    """The document of a store made now."""
     return {**declarations.stamp(), "id": declarations.new_store_id()}
 
 
 def _put_back() -> str:
-    """What helps a store that has lost its document."""
+    """The remedy for a store that has lost its document."""
     return (
         f"put it back from a copy. A new store's would be {json.dumps(_new_document())}: without a copy, write that, "
         "if a photonfarm of this version made the store"

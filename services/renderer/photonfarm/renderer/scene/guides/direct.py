@@ -1,4 +1,4 @@
-"""What lights send straight to points, and to surfaces that reflect it.
+"""Light that arrives straight from lights, at points and at surfaces that reflect it.
 
 Shape letters: L lit points, N rays.
 """
@@ -17,8 +17,8 @@ from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, Points, pattern_of, shifted
-from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, PatternSampler, pattern_of, shifted
+from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.shared.core.keys import Key, Stream
 from photonfarm.shared.core.records import F32
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 def point_light(
     scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec, recorder: Recorder | None = None
 ) -> F32:
-    """Irradiance (L, 3) of points on the side of their normals by what lights send directly; 0 without light samples.
+    """Direct irradiance (L, 3) of points, on the side of their normals; 0 without light samples.
 
-    By one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
-    `recorder` of `irradiance` Python runs but once.
+    It takes one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
+    `recorder` of `irradiance` Python runs only once.
     """
     if not wanted.light_samples or not scene.emitters():
         return np.zeros_like(position)
@@ -49,12 +49,12 @@ def point_light(
 
 
 def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u: list[Any]) -> Any:
-    """What one sample of the lights brings to each point, on the side of its normal (Color3f)."""
+    """The irradiance of each point by one sample of the lights, on the side of its normal (Color3f)."""
     count = dr.width(position)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
     si.sh_frame = mi.Frame3f(si.n)
-    light = sample_direct(lights, si, Points(u), dr.full(mi.Bool, True, count))
+    light = sample_direct(lights, si, PatternSampler(u), dr.full(mi.Bool, True, count))
     cosine = dr.dot(si.n, light.d)
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
     lit = light.valid & (cosine > 0)
@@ -68,12 +68,12 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """How rays came to a surface."""
+class RayArrival:
+    """How rays reached a surface."""
 
-    met: Any  # Bool: there is one
+    met: Any  # Bool: there is a surface
     direction: Any  # Vector3f: of the ray that meets it
-    followed: Any  # UInt32: surfaces left behind
+    followed: Any  # UInt32: surfaces passed on the way
 
 
 @dataclass(slots=True)
@@ -86,19 +86,19 @@ class _Sum:
 
 
 @dataclass(slots=True)
-class Arrives:
+class ReflectedLight:
     """Reflected direct light."""
 
     diffuse: Any  # Color3f: by a white diffuse surface
     whole: Any  # Color3f: by the surface as it is
 
-    def __add__(self, more: Arrives) -> Arrives:
-        return Arrives(self.diffuse + more.diffuse, self.whole + more.whole)
+    def __add__(self, more: ReflectedLight) -> ReflectedLight:
+        return ReflectedLight(self.diffuse + more.diffuse, self.whole + more.whole)
 
 
 @dataclass(frozen=True, slots=True)
 class _Surface:
-    """Where direct light is asked for."""
+    """A surface that reflects direct light."""
 
     scene: Any
     lights: Lights
@@ -107,14 +107,14 @@ class _Surface:
     direction: Any  # Vector3f: of that ray
     diffuse: Any  # Bool: its diffuse lobe reflects
     other: Any  # Bool: it has other lobes
-    settings: Settings
+    settings: GuideSettings
 
 
 def lit(
-    scene: Any, lights: Lights | None, si: Any, seen: Seen, pattern: Any, shift: Any, settings: Settings
-) -> Arrives:
-    """What lights send straight to a surface and it reflects: as a white diffuse one, and by all of its lobes."""
-    nothing = Arrives(mi.Color3f(0), mi.Color3f(0))
+    scene: Any, lights: Lights | None, si: Any, seen: RayArrival, pattern: Any, shift: Any, settings: GuideSettings
+) -> ReflectedLight:
+    """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
+    nothing = ReflectedLight(mi.Color3f(0), mi.Color3f(0))
     if lights is None or not settings.light_samples:
         return nothing
     flags = si.bsdf().flags()
@@ -127,13 +127,13 @@ def lit(
     return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
 
 
-def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
-    """The mean over shadow rays to points of lights; of other lobes the share that the balance heuristic leaves."""
+def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
+    """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
     count = at.settings.light_samples
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(at.lights, si, Points(shifted(pattern, shift, s.index)), at.diffuse | at.other)
+        light = sample_direct(at.lights, si, PatternSampler(shifted(pattern, shift, s.index)), at.diffuse | at.other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
         lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
         cosine = dr.dot(at.normal, light.d)
@@ -153,11 +153,11 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     )
     diffuse = sums.diffuse / count
     of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
-    return Arrives(diffuse, sums.whole / count + of_diffuse)
+    return ReflectedLight(diffuse, sums.whole / count + of_diffuse)
 
 
-def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
-    """What one ray along a sample of the BSDF meets of lights, with the share that shadow rays leave of it."""
+def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
+    """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
     u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
     ray = at.si.spawn_ray(at.si.to_world(bs.wo))
@@ -167,7 +167,7 @@ def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> Arrives:
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
     emitted = emitter.eval(found, at.other)
-    return Arrives(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+    return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
 
 
 def turned(normal: Any, direction: Any) -> Any:

@@ -15,7 +15,7 @@ from photonfarm.renderer.bdpt.emission import read_lights
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import GRID, RAYS
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, pattern_of
-from photonfarm.renderer.scene.guides.settings import FOLLOWED, NO_LIMIT, Settings
+from photonfarm.renderer.scene.guides.settings import FOLLOWED, NO_LIMIT, GuideSettings
 from photonfarm.renderer.scene.guides.specular_paths import trace
 from photonfarm.renderer.scene.materials import Materials
 from photonfarm.shared.core.keys import Key, Stream
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
 
 PURPOSE = "direct"
-"""Of the seed of direct light, which follows from the view's key."""
+"""The purpose of the seed of direct light, which is derived from the view's key."""
 
 
 def view_guides(
@@ -36,7 +36,7 @@ def view_guides(
 ) -> Guides:  # fmt: skip
     """The guides of a view in the scene's present configuration; `key` is the view's.
 
-    `arrives` is what `point_light` gives. With a `recorder` of `trace` Python runs but once for all views.
+    `arrives` is the result of `point_light`. With a `recorder` of `trace` Python runs only once for all views.
     """
     camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
     pixels = camera.height * camera.width
@@ -65,7 +65,7 @@ def _traced(
     near, far = spec.view.near / along, spec.view.far / along
     rays = points(camera.origin + directions * near[:, None]), mi.Vector3f(points(directions)), floats(far - near)
     lights = read_lights(scene) if scene.emitters() else None
-    settings = Settings(
+    settings = GuideSettings(
         spec.guides.light_samples if lights is not None else 0,
         FOLLOWED if materials.has_pure_deltas else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
@@ -86,7 +86,7 @@ def _rows(column: Any) -> NDArray[np.float64]:
 
 
 def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:
-    """The guides of the sums over each pixel's rays."""
+    """The guides, given the sums over each pixel's rays."""
 
     def image(values: NDArray[np.float64]) -> F32:
         shaped = values.reshape(camera.height, camera.width, -1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The points that guides are sampled by: one low-discrepancy set in each pixel, and its shift."""
+"""The sample points of guides: one low-discrepancy set in each pixel, and its shift."""
 
 from __future__ import annotations
 
@@ -14,34 +14,37 @@ from photonfarm.shared.core.records import F32
 SUB_PIXELS = GRID * GRID
 
 STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
-"""Of the additive recurrence R₃, n · steps modulo 1: the powers of 1 / 1.2207…, the root of x⁴ = x + 1 [Roberts, The
-unreasonable effectiveness of quasirandom sequences, 2018]."""
+"""The steps of the additive recurrence R₃, n · steps modulo 1.
+
+They are the powers of 1 / 1.2207…, the root of x⁴ = x + 1 [Roberts, The unreasonable effectiveness of quasirandom
+sequences, 2018].
+"""
 
 
 def pattern_of(light_samples: int) -> F32:
-    """The points of a pixel's samples before they are shifted: of each light sample, then of the BSDF, (…, 3)."""
+    """The points of a pixel's samples before the shift: for each light sample, then for the BSDF, (…, 3)."""
     number = np.arange((light_samples + 1) * SUB_PIXELS)[:, None]
     return (number * np.array(STEPS) % 1).astype(np.float32)
 
 
 def shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
-    """The three numbers of a sample of each ray."""
+    """The three numbers of a sample, for each ray."""
     within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
     place = sample * SUB_PIXELS + within
     u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
     return [x - dr.floor(x) for x in u]
 
 
-class Points:
-    """Three numbers in the place of the integrator's sampler: one to choose a light, two for a point of it."""
+class PatternSampler:
+    """Three numbers in place of the integrator's sampler: one chooses a light, two a point on it."""
 
     def __init__(self, u: list[Any]) -> None:
         self._u = u
 
     def next_1d(self) -> Any:
-        """The first."""
+        """The first number."""
         return self._u[0]
 
     def next_2d(self) -> Any:
-        """The other two."""
+        """The other two numbers."""
         return mi.Point2f(self._u[1], self._u[2])

@@ -1,22 +1,22 @@
-"""The numbers that guides are traced with."""
+"""The settings of the guides' kernels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 FOLLOWED = 8
-"""Mirrors and panes of glass that are followed at most."""
+"""The most mirrors and panes of glass that are followed."""
 
 NO_LIMIT = 1 << 20
-"""Edges of a path where the spec sets no limit."""
+"""The edges of a path if the spec sets no limit."""
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """The numbers that a kernel is made for."""
+class GuideSettings:
+    """The numbers that a kernel is compiled for."""
 
     light_samples: int  # of each ray
-    followed: int  # mirrors and panes at most
-    max_depth: int  # edges of a path of the images
+    followed: int  # the most mirrors and panes
+    max_depth: int  # the most edges of a path
     near: float  # distance of the near plane
     glossy: bool  # whether any surface has lobes that are neither diffuse nor followed

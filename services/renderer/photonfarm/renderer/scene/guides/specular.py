@@ -1,7 +1,7 @@
-"""How much of the light a surface reflects, or lets through, by other lobes than the diffuse one.
+"""The share of light that a surface reflects or transmits by lobes other than the diffuse one.
 
-A BSDF is asked for these lobes alone, by the context's `type_mask`. To take the diffuse reflectance off the total would
-not do: the coat of a plastic leaves its base less light, so that the difference is too small, and often below 0.
+The BSDF evaluates these lobes alone, by the context's `type_mask`. Subtracting the diffuse reflectance from the total
+would not work: the coat of a plastic leaves its base less light, so the difference is too small, and often below 0.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.guides.pattern import STEPS, SUB_PIXELS
 
 BSDF_SAMPLES = 2
-"""Of each ray, for the directional albedo."""
+"""The samples of each ray, for the directional albedo."""
 
 
 def specular_of(bsdf: Any, si: Any, hit: Any, diffuse_kept: Any) -> Any:
-    """Directional albedo of all lobes but the diffuse one, 0 where there are none; may be below 0 for `principled`.
+    """The directional albedo of all lobes but the diffuse one, 0 if there are none; it may be below 0 for `principled`.
 
-    `diffuse_kept` is that of `Materials`. Of the light's power: radiance in glass is larger by the square of the
-    refractive index.
+    `diffuse_kept` is that of `Materials`. The albedo is a share of the light's power: radiance in glass is larger by
+    the square of the refractive index.
     """
     flags, context = bsdf.flags(), mi.BSDFContext(mi.TransportMode.Importance)
     context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)

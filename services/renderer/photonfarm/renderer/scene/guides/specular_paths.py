@@ -1,4 +1,4 @@
-"""Rays followed through mirrors and glass, and what they find on the way and at the end."""
+"""Rays followed through mirrors and glass, and the surfaces on the way and at the end."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.guides.direct import Seen, lit, turned
-from photonfarm.renderer.scene.guides.settings import Settings
+from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned
+from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.guides.specular import specular_of
 from photonfarm.renderer.scene.materials import is_pure_delta
 
 
 def trace(
     scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
-    settings: Settings,
+    settings: GuideSettings,
 ) -> dict[str, Any]:  # fmt: skip
-    """What `images` makes means of, by name, of each ray; zeros where there is nothing.
+    """The quantities that `images` averages, by name, for each ray; zeros where there is nothing.
 
     `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
     plane, whose distance from the eye is `settings.near` / `along`.
@@ -34,7 +34,7 @@ def trace(
     path, last = _followed(scene, ray, first, before, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = diffuse_reflectance(last, met)
-    arrives = lit(scene, lights, last, Seen(met, path.ray.d, path.followed), pattern, shift, settings)
+    arrives = lit(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
     found = {
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),
@@ -61,12 +61,12 @@ class _Path:
     active: Any  # Bool: the ray has not been traced yet
     ray: Any  # Ray3f
     throughput: Any  # Color3f
-    emission: Any  # Color3f: of all that was met
+    emission: Any  # Color3f: of all surfaces on the way
     length: Any  # Float: from the eye to the ray's origin
-    followed: Any  # UInt32: surfaces left behind
+    followed: Any  # UInt32: surfaces passed on the way
 
 
-def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings) -> tuple[_Path, Any]:
+def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
     """The path of each ray, which meets `first`, to a surface that is no pure mirror, glass or null; that surface."""
     active = dr.full(mi.Bool, True, dr.width(ray))
     start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
@@ -84,10 +84,10 @@ def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: Settings)
     return path, dr.select(led_on, scene.ray_intersect(path.ray, active=led_on), first)
 
 
-def _follow(scene: Any, s: _Path, si: Any, settings: Settings) -> _Path:
-    """One surface `si` on the way: what it emits, and the ray that leaves it if it has delta lobes alone.
+def _follow(scene: Any, s: _Path, si: Any, settings: GuideSettings) -> _Path:
+    """Process one surface `si` on the way: its emission, and the ray that leaves it if it has delta lobes alone.
 
-    Sampled at 1/2, glass gives the lobe that takes more than half, with its probability, which is what it takes.
+    Sampled at 1/2, glass gives the lobe that takes more than half of the light, with a probability equal to its share.
     """
     emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
     bsdf = si.bsdf()

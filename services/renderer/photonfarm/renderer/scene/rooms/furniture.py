@@ -1,6 +1,6 @@
 """Pieces of furniture about the origin, standing on y = 0, facing +z; metres.
 
-A piece is the parts it is made of: one shape per material, by the last part of its id.
+A piece is a dictionary of its parts: one shape per material, named by the last part of its id.
 """
 
 from __future__ import annotations

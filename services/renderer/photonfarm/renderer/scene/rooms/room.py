@@ -1,7 +1,7 @@
 """The room `room`: a furnished room, 5.2 × 2.6 × 4.2 m, closed, with nine movable pieces and two ceiling lights.
 
-x runs right, y up, z towards the front; the origin lies in the middle of the floor. Floor and ceiling reach 5 cm beyond
-the walls, so that what is parked at the corner of the bounding box stands outside.
+x runs right, y up, z towards the front; the origin is in the middle of the floor. Floor and ceiling reach 5 cm beyond
+the walls, so that groups parked at the corner of the bounding box are outside.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PLACES: dict[str, tuple[Point, float]] = {
     "mirror": ((0.75, 0, -1.75), -0.25),
     "vase": ((1.55, 0, 1.65), 0.0),
 }
-"""Where each piece stands, and its turn about y in radians."""
+"""The place of each piece, and its rotation about y in radians."""
 
 CREAM, TERRACOTTA, TEAL = (0.76, 0.72, 0.64), (0.62, 0.27, 0.17), (0.16, 0.34, 0.36)
 OAK, WALNUT = (0.48, 0.30, 0.16), (0.26, 0.14, 0.075)
@@ -102,7 +102,7 @@ def _furniture() -> dict[str, Any]:
 
 
 def _pieces() -> dict[str, tuple[furniture.Parts, dict[str, dict[str, Any]]]]:
-    """Each piece's parts, and what they are made of."""
+    """The parts of each piece, and their materials."""
     chair = {"wood": diffuse(WALNUT), "cushion": diffuse((0.66, 0.46, 0.12))}
     sofa = {"fabric": diffuse((0.33, 0.36, 0.40)), "pillows": diffuse(TERRACOTTA), "feet": metal("Cr", 0.2)}
     books = {"red": (0.45, 0.07, 0.05), "blue": (0.06, 0.14, 0.32), "cream": CREAM}

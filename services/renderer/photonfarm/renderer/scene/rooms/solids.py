@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Point = tuple[float, float, float]
 
 _GRID = (-1.0, -0.4, -1e-3, 1e-3, 0.4, 1.0)
-"""Places of a rounded box's vertices on a face of the unit cube: the inner pair bounds the flat part."""
+"""The coordinates of a rounded box's vertices on a face of the unit cube: the inner pair bounds the flat part."""
 
 
 def box(size: Point, centre: Point) -> Any:
@@ -73,7 +73,7 @@ def quad(corner: Point, u: Point, v: Point) -> Any:
 
 
 def joined(*meshes: Any) -> Any:
-    """One mesh of several."""
+    """One mesh made of several."""
     return trimesh.util.concatenate(list(meshes))
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from photonfarm.renderer.strategy.candidate import Candidate
-from photonfarm.renderer.strategy.choices import Offer, best
+from photonfarm.renderer.strategy.choices import CandidateAtCost, best
 from photonfarm.renderer.strategy.comparison import CLEAR, WORTHWHILE, saving
 from photonfarm.renderer.strategy.measurement import present
 from photonfarm.renderer.strategy.output.table import legend, table
-from photonfarm.renderer.strategy.plan import Plan
+from photonfarm.renderer.strategy.plan import TransportPlan
 from photonfarm.renderer.strategy.reasons import BLACK, plus_minus, reasons_for
 
 
-def lines(plan: Plan) -> list[str]:
-    """The verdict, what is modelled, what is left out, why, what that saves, and the measurement it rests on."""
+def lines(plan: TransportPlan) -> list[str]:
+    """The verdict, the modelled content, what is left out, the reasons, the saving, and the measurement."""
     m = plan.measurement
     origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
     return [
@@ -37,7 +37,7 @@ def lines(plan: Plan) -> list[str]:
     ]
 
 
-def _verdict(plan: Plan) -> str:
+def _verdict(plan: TransportPlan) -> str:
     now = present(plan.spec)
     if not plan.offers:
         return "nothing was measured: every view is black"
@@ -53,11 +53,11 @@ def _verdict(plan: Plan) -> str:
 _NO_GAIN = "no significant gain over the spec's settings"
 
 
-def _fitting(plan: Plan) -> dict[Candidate, Offer]:
+def _fitting(plan: TransportPlan) -> dict[Candidate, CandidateAtCost]:
     return {c: offer for c, offer in plan.offers.items() if offer.fits}
 
 
-def _halves(plan: Plan) -> list[str]:
+def _halves(plan: TransportPlan) -> list[str]:
     if plan.halves_overhead is None:
         return []
     return [
@@ -66,8 +66,8 @@ def _halves(plan: Plan) -> list[str]:
     ]
 
 
-def _unchosen(plan: Plan) -> list[str]:
-    """Of light paths and connections, those that the plan does without though they were measured."""
+def _unchosen(plan: TransportPlan) -> list[str]:
+    """The techniques, of light paths and connections, that were measured and are not in the plan."""
     if plan.measurement.left_out or not plan.offers:
         return []
     if not plan.candidate.light_ratio:
@@ -77,7 +77,7 @@ def _unchosen(plan: Plan) -> list[str]:
     return []
 
 
-def _not_better(plan: Plan, has: Callable[[Candidate], bool]) -> str:
+def _not_better(plan: TransportPlan, has: Callable[[Candidate], bool]) -> str:
     chosen = plan.offers[plan.candidate]
     others = [offer for offer in plan.offers.values() if has(offer.candidate)]
     if all(saving(chosen, offer).deviations >= CLEAR for offer in others):
@@ -88,7 +88,7 @@ def _not_better(plan: Plan, has: Callable[[Candidate], bool]) -> str:
 # --------------------------------------------------------------------------------------------------------------- why
 
 
-def _why(plan: Plan) -> list[str]:
+def _why(plan: TransportPlan) -> list[str]:
     if not plan.offers:
         return [BLACK]
     rows = list(plan.offers.values())
@@ -99,8 +99,8 @@ def _why(plan: Plan) -> list[str]:
     return reasons
 
 
-def _not_taken(plan: Plan) -> list[str]:
-    """Why the best measured is not what the plan says, where it is not."""
+def _not_taken(plan: TransportPlan) -> list[str]:
+    """Why the plan does not have the best measured settings, if it does not."""
     reasons = []
     chosen, fitting, any_cost = plan.offers[plan.candidate], best(_fitting(plan)), best(dict(plan.offers))
     if fitting.candidate != plan.candidate:
@@ -120,7 +120,7 @@ def _not_taken(plan: Plan) -> list[str]:
     return reasons
 
 
-def _savings(plan: Plan) -> Sequence[str]:
+def _savings(plan: TransportPlan) -> Sequence[str]:
     now = present(plan.spec)
     if plan.savings:
         return [
@@ -131,8 +131,8 @@ def _savings(plan: Plan) -> Sequence[str]:
     return ["none: the spec has these settings already" if plan.candidate == now else "none: nothing to compare with"]
 
 
-def _measured(plan: Plan) -> list[str]:
-    """The table, its legend and an empty line each; nothing where nothing was measured."""
+def _measured(plan: TransportPlan) -> list[str]:
+    """The table, its legend and an empty line each; nothing without a measurement."""
     if not plan.offers:
         return []
     return [*table(list(plan.offers.values()), plan.candidate), "", *legend(plan.spec), ""]

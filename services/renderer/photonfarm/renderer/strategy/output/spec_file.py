@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import cast
+
+import tomlkit
+import tomlkit.items
+from tomlkit.exceptions import TOMLKitError
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene import spec as scene
@@ -34,10 +36,7 @@ def writable(name: str) -> Path:
 
 
 def write(file: Path, settings: Settings) -> None:
-    """Put settings into a TOML file; it changes at once or not at all.
-
-    Raises SpecError where the file writes a table in a way that leaves no place for them.
-    """
+    """Put settings into a TOML file; it changes at once or not at all. Raises SpecError for a file that is no TOML."""
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
     aside = file.with_name(f".{file.name}.{os.getpid()}.part")
@@ -50,55 +49,22 @@ def write(file: Path, settings: Settings) -> None:
 
 
 def put(text: str, settings: Settings, *, where: str) -> str:
-    """A TOML document with other numbers in some of its tables; SpecError if it cannot be edited safely."""
-    body = text.removeprefix(BYTE_ORDER_MARK)
-    mark = text[: len(text) - len(body)]
+    """A TOML document with other numbers in some of its tables; everything else stays. SpecError for no valid TOML."""
+    plain = text.removeprefix(BYTE_ORDER_MARK)
+    mark = text[: len(text) - len(plain)]
     try:
-        wanted = _merged(tomllib.loads(body), settings)
-    except tomllib.TOMLDecodeError as error:
+        document = tomlkit.parse(plain)
+    except TOMLKitError as error:
         raise SpecError(f"{where}: is not valid TOML: {error}") from error
-    for table, entries in settings.items():
-        body = _put_table(body, table, entries)
-    try:
-        safe = _canonical(tomllib.loads(body)) == _canonical(wanted)
-    except tomllib.TOMLDecodeError:
-        safe = False
-    if not safe:
-        tables = " and ".join(f"[{table}]" for table in settings)
-        raise SpecError(f"{where}: write {tables} as tables with a line per key, so that they can be edited in place")
-    return mark + body
-
-
-def _canonical(document: dict[str, Any]) -> str:
-    """Text to compare by: a NaN equals itself in it."""
-    return json.dumps(document, sort_keys=True, default=repr)
-
-
-def _merged(document: dict[str, Any], settings: Settings) -> dict[str, Any]:
-    return document | {table: document.get(table, {}) | dict(entries) for table, entries in settings.items()}
-
-
-def _put_table(text: str, table: str, entries: Mapping[str, int | float]) -> str:
-    newline = "\r\n" if "\r\n" in text else "\n"
-    header = re.search(rf"^[ \t]*\[[ \t]*{table}[ \t]*\][^\n]*(?:\n|\Z)", text, re.MULTILINE)
-    if header is None:
-        lead = "" if not text or text.endswith("\n") else newline
-        body = "".join(f"{key} = {value!r}{newline}" for key, value in entries.items())
-        return f"{text}{lead}{newline}[{table}]{newline}{body}"
-    following = re.compile(r"^[ \t]*\[", re.MULTILINE).search(text, header.end())
-    end = following.start() if following else len(text)
-    body = text[header.end() : end]
-    for key, value in entries.items():
-        body = _put_key(body, key, value, newline)
-    head = text[: header.end()]
-    return head + ("" if head.endswith("\n") else newline) + body + text[end:]
-
-
-def _put_key(body: str, key: str, value: int | float, newline: str) -> str:
-    present = re.compile(rf"^([ \t]*{key}[ \t]*=[ \t]*)[^\s#]+", re.MULTILINE)
-    if present.search(body):
-        return present.sub(lambda found: f"{found[1]}{value!r}", body, count=1)
-    keys = re.finditer(r"^[ \t]*[A-Za-z0-9_.\"'-]+[ \t]*=[^\n]*(?:\n|\Z)", body, re.MULTILINE)
-    place = max((found.end() for found in keys), default=0)
-    lead = "" if place == 0 or body[:place].endswith("\n") else newline
-    return f"{body[:place]}{lead}{key} = {value!r}{newline}{body[place:]}"
+    for name, entries in settings.items():
+        if name not in document:
+            document[name] = tomlkit.table()
+        table = cast(tomlkit.items.AbstractTable, document[name])
+        body = table.value.body  # new keys go before the comments at its end, which belong to what follows
+        place = max((i + 1 for i, (key, _) in enumerate(body) if key is not None), default=0)
+        comments, body[place:] = body[place:], []
+        for key, value in entries.items():
+            table[key] = value
+        body += comments
+    changed = tomlkit.dumps(document)
+    return mark + (re.sub(r"(?<!\r)\n", "\r\n", changed) if "\r\n" in plain else changed)

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 
 from photonfarm.renderer.strategy.candidate import Candidate
-from photonfarm.renderer.strategy.choices import Offer
+from photonfarm.renderer.strategy.choices import CandidateAtCost
 from photonfarm.renderer.strategy.measurement import present
 from photonfarm.renderer.strategy.reasons import rounded
 from photonfarm.shared.scene.spec import SceneSpec
 
 
-def table(offered: Sequence[Offer], chosen: Candidate) -> list[str]:
+def table(offered: Sequence[CandidateAtCost], chosen: Candidate) -> list[str]:
     """A line of heads and one for each candidate."""
     costs = [rounded(offer.relative_cost, offer.spread) for offer in offered]
     means, spreads = (_aligned(part) for part in zip(*costs, strict=True))
@@ -33,14 +33,14 @@ def table(offered: Sequence[Offer], chosen: Candidate) -> list[str]:
     return ["  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _remark(offer: Offer, chosen: Candidate) -> str:
+def _remark(offer: CandidateAtCost, chosen: Candidate) -> str:
     if offer.candidate == chosen:
         return "chosen"
     return "" if offer.fits else "too costly"
 
 
 def legend(spec: SceneSpec) -> list[str]:
-    """What the columns are."""
+    """The meaning of the columns."""
     film, now = spec.film, spec.transport.half_spp
     return [
         "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "

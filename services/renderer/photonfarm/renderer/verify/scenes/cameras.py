@@ -30,7 +30,7 @@ def seen_by(**changes: Any) -> Callable[[int], Scene]:
 
 
 def camera_in_light(size: int) -> Scene:
-    """The camera lies in the plane of the light, within it, and looks the way it shines."""
+    """The camera lies in the plane of the light, within it, and looks in the direction of its light."""
     return {**lit_room(size), "sensor": camera(size, [0.1, 0.05, 1.95], [0.1, 0.3, 0], 60)}
 
 
@@ -78,8 +78,11 @@ def cropped(size: int) -> Scene:
 
 
 LENGTH = 100.0
-"""Half width of the room at scale 1. Mitsuba moves the origins of rays by 9e-5 units wherever |p| < 1, so a room of a
-few millimetres changes by itself: the cove at half width 1e-3 is brighter by 2.7 % with `path`, too."""
+"""The half width of the room at scale 1.
+
+Mitsuba moves the origins of rays by 9e-5 units wherever |p| < 1, so a room of a few millimetres changes by itself: the
+cove at half width 1e-3 is brighter by 2.7 % with `path`, too.
+"""
 
 
 def scaled(factor: float) -> Callable[[int], Scene]:
@@ -115,7 +118,7 @@ REFUSALS = (
             allowed=EYE_ALONE[0]),
     Refusal(None, "medium", _fog, "bounds a participating medium"),
 )  # fmt: skip
-"""Row 30, and what else `bdpt` does not render."""
+"""Row 30, and the other scenes that `bdpt` refuses."""
 
 # ------------------------------------------------ Rows ------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""What a hard scene is: how it is built, what its image must be, and how much work it takes to tell.
+"""Hard scenes: their description, their truth, and the effort to compare both.
 
 Shape letters: K renders, H W image.
 """
@@ -19,7 +19,7 @@ Images = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class BdptSettings:
     """Technique counts of `bdpt`."""
 
     connections: int
@@ -29,19 +29,19 @@ class Settings:
         return f"{self.connections},{self.light_ratio:g}"
 
 
-FIRST = Settings(1, 1.0)
-"""What the quick version tries."""
-ALL = (FIRST, Settings(0, 0.0), Settings(0, 1.0), Settings(4, 0.25), Settings(1, 1.5))
-"""What the long version tries; each is complete where paths from the eye find everything."""
-EYE_ALONE = (Settings(0, 0.0),)
-"""A path tracer: what is left where nothing can be done from the light side."""
+FIRST = BdptSettings(1, 1.0)
+"""The settings of the quick version."""
+ALL = (FIRST, BdptSettings(0, 0.0), BdptSettings(0, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.5))
+"""The settings of the long version; each is complete if paths from the eye find everything."""
+EYE_ALONE = (BdptSettings(0, 0.0),)
+"""A path tracer, for scenes in which nothing can be done from the light side."""
 WITH_LIGHT_PATHS = tuple(settings for settings in ALL if settings.light_ratio > 0)
-"""Complete also where light must be followed from its source."""
+"""The settings that are complete also if light must be followed from its source."""
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is rendered, and how sharp the answer must be."""
+    """The amount of rendering, and the required precision."""
 
     size: int  # pixels, square
     blocks: int  # the image is compared in blocks × blocks
@@ -57,10 +57,10 @@ LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=384, resolution=0.
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What an image is compared with."""
+    """The reference of an image."""
 
-    said: str  # in words, for the table
-    images: Callable[[HardScene, Effort, int], Images]  # of a scene, an effort and a seed
+    name: str  # in words, for the table
+    images: Callable[[HardScene, Effort, int], Images]  # function of a scene, an effort and a seed
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +70,12 @@ class HardScene:
     row: int  # number in the table of hard scenes, 1 … 36
     name: str
     hard: str  # what is hard about it
-    build: Callable[[int], Scene]  # of the image size
+    build: Callable[[int], Scene]  # function of the image size
     truth: Truth
     max_depth: int = 6
     rr_depth: int = 5
-    settings: tuple[Settings, ...] = ALL
-    quick_settings: tuple[Settings, ...] = (FIRST,)  # some of them
+    settings: tuple[BdptSettings, ...] = ALL
+    quick_settings: tuple[BdptSettings, ...] = (FIRST,)  # some of them
     quick: Effort | None = QUICK  # None: the long version only
     long: Effort = LONG
     edit: Callable[[Any], None] | None = None  # changes the loaded scene in place before it is rendered
@@ -89,14 +89,14 @@ class HardScene:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Something that would be rendered wrongly, and is refused instead."""
+    """A scene that would be rendered wrongly, and is refused instead."""
 
     row: int | None  # number in the table of hard scenes, None where it has none
     name: str
     build: Callable[[int], Scene]
-    sentence: str  # what the message must contain
-    settings: Settings = FIRST
-    allowed: Settings | None = None  # settings with which it is rendered all the same
+    sentence: str  # a part of the required message
+    settings: BdptSettings = FIRST
+    allowed: BdptSettings | None = None  # settings with which it is rendered nevertheless
 
     @property
     def label(self) -> str:

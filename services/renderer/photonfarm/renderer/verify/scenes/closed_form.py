@@ -1,4 +1,4 @@
-"""Rows whose image is known in closed form; the derivation stands above each."""
+"""Rows whose image is known in closed form; the derivation is stated with each."""
 
 from __future__ import annotations
 
@@ -174,11 +174,11 @@ def spot_radiance(p: Points) -> Values:
 
 def _depth(k: int) -> HardScene:
     # Le = ½, ρ = ½: L = Le·(1 + ρ + ρ² + …) = 1 − ½ᵏ with paths of k edges, 1 unbounded
-    answer, said = (1.0, "1") if k < 0 else (1 - 0.5**k, f"1 − ½^{k}")
+    answer, truth = (1.0, "1") if k < 0 else (1 - 0.5**k, f"1 − ½^{k}")
     name = f"shining-sphere-depth-{k}" if k > 0 else "shining-sphere"
     hard = "every path ends on the light it came from, by every technique at once"
     return HardScene(
-        1, name, hard, shining_sphere, known(answer, said), max_depth=k, quick=QUICK if k in (3, -1) else None
+        1, name, hard, shining_sphere, known(answer, truth), max_depth=k, quick=QUICK if k in (3, -1) else None
     )
 
 

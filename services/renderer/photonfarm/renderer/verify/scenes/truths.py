@@ -11,11 +11,11 @@ import numpy as np
 from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Scene, Truth
 
 LANES = 1 << 20
-"""Most samples of one launch: bounds the memory of Mitsuba's own integrators."""
+"""The most samples of one launch: bounds the memory of Mitsuba's own integrators."""
 TRUTH_SEEDS = 1_000_000
-"""Seeds of truths begin here, above those of bdpt."""
+"""The first seed of truths, above those of bdpt."""
 GRID = 24
-"""Points per pixel and axis at which a known image is averaged over each pixel."""
+"""The points per pixel and axis over which a known image is averaged."""
 
 
 def render(scene: Any, integrator: dict[str, Any], spp: int, seeds: range) -> Images:
@@ -51,7 +51,7 @@ def _truth_seeds(effort: Effort, seed: int) -> range:
 # ------------------------------------------------ Renders ------------------------------------------------
 
 
-def rendered(integrator: str, said: str, build: Callable[[int], Scene] | None = None, **parameters: Any) -> Truth:
+def rendered(integrator: str, name: str, build: Callable[[int], Scene] | None = None, **parameters: Any) -> Truth:
     """Images by one of Mitsuba's integrators, of the scene itself or of the one that ``build`` describes instead.
 
     Depth and roulette are the scene's own unless given.
@@ -62,7 +62,7 @@ def rendered(integrator: str, said: str, build: Callable[[int], Scene] | None = 
         loaded = load((build or scene.build)(effort.size))
         return render(loaded, {"type": integrator, **settings}, effort.truth_spp, _truth_seeds(effort, seed))
 
-    return Truth(said, images)
+    return Truth(name, images)
 
 
 PATH = rendered("path", "`path`")
@@ -83,29 +83,29 @@ def _scaled(part: slice, unit: int) -> slice:
     return slice(part.start * unit, part.stop * unit)
 
 
-def same_by_bdpt(build: Callable[[int], Scene], said: str) -> Truth:
+def same_by_bdpt(build: Callable[[int], Scene], name: str) -> Truth:
     """Images by `bdpt` itself, of a scene that must look the same."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:
         integrator = {"type": "bdpt", "max_depth": scene.max_depth, "rr_depth": scene.rr_depth}
         return render(load(build(effort.size)), integrator, effort.spp, _truth_seeds(effort, seed))
 
-    return Truth(said, images)
+    return Truth(name, images)
 
 
 # ------------------------------------------------ Closed forms ------------------------------------------------
 
 
-def known(value: float, said: str) -> Truth:
+def known(value: float, name: str) -> Truth:
     """One number for all pixels and channels."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001 - the face of all truths
         return np.full((1, effort.size, effort.size, 3), value)
 
-    return Truth(said, images)
+    return Truth(name, images)
 
 
-def known_on_plane(radiance: Callable[[Any], Any], said: str) -> Truth:
+def known_on_plane(radiance: Callable[[Any], Any], name: str) -> Truth:
     """The plane z = 0, seen by the scene's camera: ``radiance`` of points [N, 3] on it is [N]."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001
@@ -119,4 +119,4 @@ def known_on_plane(radiance: Callable[[Any], Any], said: str) -> Truth:
         pixels = values.reshape(effort.size, GRID, effort.size, GRID).mean(axis=(1, 3))
         return np.repeat(pixels[None, :, :, None], 3, axis=-1)
 
-    return Truth(said, images)
+    return Truth(name, images)

@@ -1,7 +1,7 @@
-"""Real paths through a scene with their vertices stored, and the weights that the integrator's functions give them.
+"""Real paths through a scene with their vertices stored, and their weights by the integrator's functions.
 
 Eye paths walk as the integrator's do, each vertex is joined to a light by next event estimation, and each such path is
-then looked at as any technique would have made it: the sums of `bdpt.weights` are run from the lens towards the light
+then treated as made by any of the techniques: the sums of `bdpt.weights` are run from the lens towards the light
 and from the light towards the lens, in the order of the integrator's loops, with densities from the integrator
 (`emission`, `selection`, `camera`) and from Mitsuba.
 
@@ -31,7 +31,7 @@ from photonfarm.renderer.bdpt.emission import (
     sample_direct,
 )
 from photonfarm.renderer.bdpt.light_paths import start_weights
-from photonfarm.renderer.verify.weights.oracle import F64, Paths
+from photonfarm.renderer.verify.weights.oracle import F64, OraclePaths
 
 _FOUND = 1e-3  # a ray to a sampled point of a light must end this near to it, relative to the scene's size
 
@@ -47,7 +47,7 @@ class Bounce:
 
 
 @dataclass(slots=True)
-class Joined:
+class JoinedPaths:
     """N paths of k edges."""
 
     bounces: list[Bounce]  # v₁ … v₍ₖ₋₁₎, from the light's end
@@ -60,7 +60,7 @@ class Joined:
     complete: Any  # Bool: lanes that have such a path
 
 
-def walk(scene: Any, lights: Lights, *, paths: int, edges: int, seed: int) -> Iterator[Joined]:
+def walk(scene: Any, lights: Lights, *, paths: int, edges: int, seed: int) -> Iterator[JoinedPaths]:
     """Paths of 2, 3, … ``edges`` edges from ``paths`` primary rays."""
     sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
@@ -88,13 +88,13 @@ def walk(scene: Any, lights: Lights, *, paths: int, edges: int, seed: int) -> It
 
 
 def _choice(lights: Lights, si: Any, rng: randomness.Sampler) -> Any:
-    """Number of the light that next event estimation chooses with the same numbers."""
+    """The number of the light that next event estimation chooses with the same random numbers."""
     return dr.zeros(mi.UInt32) if lights.selection is None else lights.selection.choose(si.p, rng.next_1d())[0]
 
 
 def _joined(
     scene: Any, lights: Lights, bounces: list[Bounce], light: DirectSample, index: Any, start: EyeStart
-) -> Joined:
+) -> JoinedPaths:
     si = bounces[0].si
     hit = scene.ray_intersect(si.spawn_ray(light.d), light.valid)
     blocked = scene.ray_test(si.spawn_ray_to(light.p), light.valid & ~light.at_infinity)
@@ -105,7 +105,7 @@ def _joined(
     seen = dr.select(light.at_infinity, ~hit.is_valid(), dr.select(is_area, arrived, ~blocked))
     value = bounces[0].bsdf.eval(mi.BSDFContext(), si, si.to_local(light.d), light.valid)
     hit.p = light.p  # the very point: a ray starts a little off its surface, and so it arrives beside it
-    joined = Joined(bounces, light, emitter, index, hit, is_area, start, light.valid & seen & (dr.max(value) > 0))
+    joined = JoinedPaths(bounces, light, emitter, index, hit, is_area, start, light.valid & seen & (dr.max(value) > 0))
     dr.eval(joined)
     return joined
 
@@ -123,7 +123,7 @@ class Pinhole:
 
     @classmethod
     def of(cls, scene: Any) -> Pinhole:
-        """That of a scene's first sensor."""
+        """The pinhole of a scene's first sensor."""
         parameters = mi.traverse(scene.sensors()[0])
         frame = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
         half = np.tan(np.deg2rad(float(parameters["x_fov"][0])) / 2)
@@ -141,7 +141,7 @@ class Steps:
     to_eye: list[Any]  # the other way round
 
 
-def steps(joined: Joined, lens: Pinhole) -> Steps:
+def steps(joined: JoinedPaths, lens: Pinhole) -> Steps:
     """The steps between the stored vertices."""
     sis = [bounce.si for bounce in joined.bounces]
     points = [joined.light.p, *(si.p for si in sis), mi.Point3f(*lens.position.tolist())]
@@ -175,7 +175,7 @@ class TechniqueCounts:
     light_ratio: float
 
 
-def weights_of(scene: Any, lights: Lights, joined: Joined, lens: Pinhole, settings: TechniqueCounts) -> F64:
+def weights_of(scene: Any, lights: Lights, joined: JoinedPaths, lens: Pinhole, settings: TechniqueCounts) -> F64:
     """[N, k + 1]: weight of each technique by the integrator's functions; 0 for those that cannot make the path."""
     k = len(joined.bounces) + 1
     st = steps(joined, lens)
@@ -206,8 +206,8 @@ def weights_of(scene: Any, lights: Lights, joined: Joined, lens: Pinhole, settin
     return np.stack([np.array(dr.select(joined.complete, w, 0), np.float64) for w in found], axis=1)
 
 
-def _eye_sums(joined: Joined, st: Steps, settings: TechniqueCounts) -> tuple[dict[int, tuple[Any, Any]], Any]:
-    """((dVCM, dVC) on arriving at v₁ … v₍ₖ₋₁₎, the same as they left v₁)."""
+def _eye_sums(joined: JoinedPaths, st: Steps, settings: TechniqueCounts) -> tuple[dict[int, tuple[Any, Any]], Any]:
+    """((dVCM, dVC) on arriving at v₁ … v₍ₖ₋₁₎, the same on leaving v₁)."""
     k = len(joined.bounces) + 1
     dvcm, dvc = weights.eye_start(mi.Float(settings.light_ratio), joined.start.density), mi.Float(0)
     arrived = {}
@@ -222,13 +222,13 @@ def _eye_sums(joined: Joined, st: Steps, settings: TechniqueCounts) -> tuple[dic
 def _scattered(
     bounce: Bounce, arrived: tuple[Any, Any], count: float, cos_out: Any, p: Any, p_reverse: Any
 ) -> tuple[Any, Any]:
-    """(dVCM, dVC) as they leave a vertex."""
+    """(dVCM, dVC) on leaving a vertex."""
     vcm, vc = weights.scatter(*arrived, count, cos_out, p, p_reverse)
     delta_vcm, delta_vc = weights.scatter_delta(arrived[1], cos_out)
     return dr.select(bounce.delta, delta_vcm, vcm), dr.select(bounce.delta, delta_vc, vc)
 
 
-def _hit_weight(scene: Any, lights: Lights, joined: Joined, st: Steps, before: Any) -> Any:
+def _hit_weight(scene: Any, lights: Lights, joined: JoinedPaths, st: Steps, before: Any) -> Any:
     origin = joined.bounces[0].si.p
     si = mi.SurfaceInteraction3f(joined.on_light)
     si.wi = dr.select(si.is_valid(), si.wi, -joined.light.d)
@@ -238,7 +238,9 @@ def _hit_weight(scene: Any, lights: Lights, joined: Joined, st: Steps, before: A
     return dr.select(joined.light.delta, 0, w)
 
 
-def _light_sums(lights: Lights, joined: Joined, st: Steps, settings: TechniqueCounts) -> dict[int, tuple[Any, Any]]:
+def _light_sums(
+    lights: Lights, joined: JoinedPaths, st: Steps, settings: TechniqueCounts
+) -> dict[int, tuple[Any, Any]]:
     """(dVCM, dVC) of light paths on arriving at v₁ … v₍ₖ₋₁₎."""
     k = len(joined.bounces) + 1
     first = mi.SurfaceInteraction3f(joined.bounces[0].si)
@@ -266,8 +268,8 @@ def _light_sums(lights: Lights, joined: Joined, st: Steps, settings: TechniqueCo
     return arrived
 
 
-def _direction_density(lights: Lights, joined: Joined) -> Any:
-    """Density of a light path's direction from a light at infinity; 1 of those that have only one."""
+def _direction_density(lights: Lights, joined: JoinedPaths) -> Any:
+    """The density of a light path's direction from a light at infinity; 1 for lights with a single direction."""
     reference = dr.zeros(mi.Interaction3f)
     reference.p = lights.centre
     ds = dr.zeros(mi.DirectionSample3f)
@@ -277,7 +279,7 @@ def _direction_density(lights: Lights, joined: Joined) -> Any:
 
 
 def _light_tracing_weight(
-    scene: Any, joined: Joined, st: Steps, sums: tuple[Any, Any], settings: TechniqueCounts
+    scene: Any, joined: JoinedPaths, st: Steps, sums: tuple[Any, Any], settings: TechniqueCounts
 ) -> Any:
     if not settings.light_ratio:
         return mi.Float(0)
@@ -291,10 +293,10 @@ def _light_tracing_weight(
 # ------------------------------------------------ As the oracle sees them ------------------------------------------
 
 
-def stored(lights: Lights, joined: Joined, lens: Pinhole) -> Paths:
-    """The complete paths for the oracle: positions, normals and densities of Mitsuba's, the rest from first principles.
+def stored(lights: Lights, joined: JoinedPaths, lens: Pinhole) -> OraclePaths:
+    """The complete paths for the oracle: positions, normals and densities of Mitsuba, the rest from first principles.
 
-    That is: densities of light paths' starts from areas, cones and the scene's radius, the camera's from its field of
+    The rest: densities of light paths' starts from areas, cones and the scene's radius, the camera's from its field of
     view, the choice of lights from the table and the point's cell.
     """
     st, kept = steps(joined, lens), np.array(joined.complete)
@@ -308,7 +310,7 @@ def stored(lights: Lights, joined: Joined, lens: Pinhole) -> Paths:
     infinite = _column(kept, joined.light.at_infinity)
     index = _column(kept, joined.index)
     next_event, emission = _light_densities(lights, joined, kept, index, position, normal)
-    return Paths(
+    return OraclePaths(
         position=position,
         normal=normal,
         to_light=_columns(kept, [*st.to_light, nothing]),
@@ -326,7 +328,7 @@ def stored(lights: Lights, joined: Joined, lens: Pinhole) -> Paths:
 
 
 def _light_densities(
-    lights: Lights, joined: Joined, kept: Any, index: Any, position: F64, normal: F64
+    lights: Lights, joined: JoinedPaths, kept: Any, index: Any, position: F64, normal: F64
 ) -> tuple[F64, F64]:
     """(density of v₀ under next event estimation from v₁, of a light path's start per area and direction)."""
     chosen, started = _selection(lights, index, position[:, 1])
@@ -368,7 +370,7 @@ def _columns(kept: Any, values: list[Any]) -> Any:
 
 
 def _column(kept: Any, value: Any) -> Any:
-    """[N] or [N, 3] of the kept lanes, float64 unless of another kind."""
+    """The values of the kept lanes, [N] or [N, 3], float64 unless of another kind."""
     array = np.array(value)
     array = array.T if array.ndim == 2 else array
     array = np.broadcast_to(array, (len(kept), *array.shape[1:])) if len(array) == 1 else array

@@ -26,10 +26,10 @@ Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paths:
+class OraclePaths:
     """N paths of k edges, as they lie in the scene, and the densities of single steps.
 
-    Columns of ends that have none of it (the lens has no normal, a point light neither) are not read.
+    Columns of ends without a value (the lens and a point light have no normal) are not read.
     """
 
     position: F64  # [N, k + 1, 3]
@@ -37,7 +37,7 @@ class Paths:
     to_light: F64  # [N, k + 1]: solid-angle density of the BSDF's sampling from the eye's side towards the light
     to_eye: F64  # [N, k + 1]: the other way round
     delta: Mask  # [N, k + 1]: scattered by a mirror or a smooth interface here
-    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror, see above
+    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror
     infinite: Mask  # [N]: the light is at infinity: v₀ stands for a direction
     distant: F64  # [N, 3]: direction to it
     hittable: Mask  # [N]: a ray can find the light
@@ -64,8 +64,8 @@ def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64
     return counts
 
 
-def weights(paths: Paths, counts: F64) -> F64:
-    """[N, k + 1]: weight of each technique; 0 for those that cannot make the path, NaN where none can."""
+def weights(paths: OraclePaths, counts: F64) -> F64:
+    """[N, k + 1]: the weight of each technique; 0 if it cannot make the path, NaN if none can."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = log_densities(paths) + np.log(counts)
         weighted = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -73,8 +73,8 @@ def weights(paths: Paths, counts: F64) -> F64:
     return weighted / total
 
 
-def log_densities(paths: Paths) -> F64:
-    """[N, k + 1]: log of each technique's density; −∞ where it cannot make the path."""
+def log_densities(paths: OraclePaths) -> F64:
+    """[N, k + 1]: log of each technique's density; −∞ if it cannot make the path."""
     k = paths.edges
     r2, at_light_end, at_eye_end = _edges(paths)
     area_from_light, area_from_eye = at_eye_end / r2, at_light_end / r2  # of an edge: density per solid angle → area
@@ -92,7 +92,7 @@ def log_densities(paths: Paths) -> F64:
     return logs
 
 
-def _edges(paths: Paths) -> tuple[F64, F64, F64]:
+def _edges(paths: OraclePaths) -> tuple[F64, F64, F64]:
     """(squared length, |cos| at the end nearer the light, |cos| at the other) of each edge, [N, k]."""
     offset = np.diff(paths.position, axis=1)
     offset[:, 0] = np.where(paths.infinite[:, None], -paths.distant, offset[:, 0])
@@ -103,7 +103,7 @@ def _edges(paths: Paths) -> tuple[F64, F64, F64]:
     return r2, at_light_end, at_eye_end
 
 
-def _log_from_light(paths: Paths, to_eye: F64, area: F64, cos_0: F64) -> list[F64]:
+def _log_from_light(paths: OraclePaths, to_eye: F64, area: F64, cos_0: F64) -> list[F64]:
     """Log density of the first s vertices, made from the light, for s = 0 … k."""
     start = np.log(paths.emission) + np.log(np.where(paths.light_has_cosine, cos_0, 1))
     logs = [np.zeros(len(cos_0)), np.log(paths.next_event), start + area[:, 0]]
@@ -112,7 +112,7 @@ def _log_from_light(paths: Paths, to_eye: F64, area: F64, cos_0: F64) -> list[F6
     return logs
 
 
-def _log_from_eye(paths: Paths, to_light: F64, area: F64) -> list[F64]:
+def _log_from_eye(paths: OraclePaths, to_light: F64, area: F64) -> list[F64]:
     """Log density of the last t vertices, made from the lens, for t = 0 … k + 1; the lens itself counts 1."""
     k = paths.edges
     logs = [np.zeros(len(area)), np.zeros(len(area)), np.log(paths.camera) + area[:, k - 1]]

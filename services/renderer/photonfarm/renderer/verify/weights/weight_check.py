@@ -11,17 +11,17 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt.emission import read_lights
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import Scene, Settings
+from photonfarm.renderer.verify.scenes.case import BdptSettings, Scene
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
 from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCounts, stored, walk, weights_of
-from photonfarm.renderer.verify.weights.oracle import Mask, Paths
+from photonfarm.renderer.verify.weights.oracle import Mask, OraclePaths
 
 TOLERANCE = 1e-3
-"""Of the sum of a path's weights, and of each weight relative to the oracle's."""
+"""The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""
 REFRACTED = 2e-2
-"""The same through a ball of glass: rays start a little off its surface, so it is not quite a ball."""
+"""The tolerance through a ball of glass: rays start a little off its surface, so it is not quite a ball."""
 EDGES = 6
 _SIZE = 16
 _GRAZING = 4.0  # proportion of densities beyond which the ray's offset decides where it leaves the glass
@@ -70,24 +70,24 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "rotated-envmap": hard_scenes.rotated_envmap,
     "many-lights": hard_scenes.many_lights,
 }
-"""What the tests look at."""
+"""The scenes of the tests."""
 LONG_SCENES = {**SCENES, **{name.replace("_", "-"): build for name, build in hard_scenes.HARD_SCENES.items()}}
-"""What the long version looks at."""
+"""The scenes of the long version."""
 
 
 @dataclass(slots=True)
-class Comparison:
-    """What came of one scene."""
+class WeightComparison:
+    """The errors of the weights in one scene."""
 
     paths: int = 0
     with_delta: int = 0  # of them with a mirror or a smooth interface on the way
     sum_error: float = 0.0  # largest |Σ weights − 1|
     weight_error: float = 0.0  # largest |weight − oracle's| relative to the oracle's, of paths without refraction
-    refracted_error: float = 0.0  # of paths with it, but for grazing ones
+    refracted_error: float = 0.0  # of paths with refraction, except grazing ones
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What is beyond the tolerance; NaN is."""
+        """The errors beyond the tolerance; NaN is beyond it."""
         named = (
             ("the sum of a path's weights", self.sum_error, TOLERANCE),
             ("a weight", self.weight_error, TOLERANCE),
@@ -98,12 +98,14 @@ class Comparison:
         )
 
 
-def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes: int, seed: int = 0) -> Comparison:
-    """All techniques of all paths of 2 … `EDGES` edges that ``lanes`` primary rays make."""
+def compare_weights(
+    build: Callable[[int], Scene], settings: BdptSettings, *, lanes: int, seed: int = 0
+) -> WeightComparison:
+    """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     count = connection_count(settings.connections, EDGES)
-    result = Comparison()
+    result = WeightComparison()
     for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
         complete = np.array(joined.complete)
         if not complete.any():
@@ -125,14 +127,14 @@ def compare_weights(build: Callable[[int], Scene], settings: Settings, *, lanes:
     return result
 
 
-def _can_be_walked(paths: Paths) -> Mask:
+def _can_be_walked(paths: OraclePaths) -> Mask:
     """[N]: whether eye paths find all vertices.
 
-    Rays start a little off surfaces: seen from the vertex itself the next one may lie behind a grazing surface.
+    Rays start a little off surfaces: seen from the vertex itself the next one may be hidden by a grazing surface.
     """
     return np.asarray((paths.delta | (paths.to_light > 0))[:, 2:-1].all(axis=1))
 
 
 def _largest(before: float, errors: npt.ArrayLike) -> float:
-    """NaN if any is."""
+    """The largest error so far; NaN if any is."""
     return float(np.max(np.append(errors, before)))

@@ -1,0 +1,1 @@
+"""What workers, queue and plans cost, and what they withstand."""

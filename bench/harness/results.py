@@ -1,0 +1,92 @@
+"""What all benchmarks do alike: their options, and their page docs/results/NAME.md with NAME.json, signed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "docs/results"
+
+
+def parser(about: str | None) -> argparse.ArgumentParser:
+    """A parser with the option that every benchmark has; `about` is the docstring of its module."""
+    made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, default=FOLDER, help="folder for the Markdown and JSON (docs/results)")
+    return made
+
+
+def write(name: str, text: str, values: dict[str, Any], out: Path, page: str = "") -> None:
+    """Save the page of bench/*/NAME.py, signed in its last line, and its figures; both are named NAME or `page`."""
+    document = {"command": command(name), "commit": commit(), "machine": machine(), **values}
+    save(page or name, f"{text}\n\n{footer(name)}", document, out)
+
+
+def save(stem: str, text: str, document: dict[str, Any], out: Path) -> None:
+    """Write a page and its figures into a folder as STEM.md and STEM.json; print the page."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / f"{stem}.md").write_text(text + "\n", encoding="utf-8")
+    (out / f"{stem}.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    print(text)
+
+
+def command(name: str) -> str:
+    """How to make the table again."""
+    given = iter(sys.argv[1:])
+    told = [argument for argument in given if not (argument == "--out" and next(given))]
+    (script,) = (ROOT / "bench").glob(f"*/{name}.py")
+    module = f"bench.{script.parent.name}.{name}"
+    return shlex.join(["python", "-m", module, *told]) if told else f"make bench-{name.replace('_', '-')}"
+
+
+def machine() -> dict[str, Any]:
+    """What the figures depend on, with the load average that says whether the machine was quiet."""
+    packages = {name: version(name) for name in ("mitsuba", "drjit")}
+    load = round(os.getloadavg()[0], 1)
+    return {"cores": os.cpu_count(), "architecture": platform.machine(), "load_average": load, **packages}
+
+
+def commit() -> str:
+    """The commit of this checkout, abbreviated, and whether more is changed than results; 'unknown' without git.
+
+    The results' own folder does not count: a benchmark writes there while it runs.
+    """
+    try:
+        head = _git("rev-parse", "--short", "HEAD")
+        changed = _git("status", "--porcelain", "--", ".", ":(exclude)docs/results")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + (" with uncommitted changes" if changed else "")
+
+
+def _git(*arguments: str) -> str:
+    """What git says about this checkout."""
+    root = FOLDER.parents[1]
+    return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def footer(name: str) -> str:
+    """Command, commit and machine, as the last line of a page."""
+    made_on = ", ".join(f"{key} {value}" for key, value in machine().items())
+    return f"Made by `{command(name)}` at commit {commit()} ({made_on})."
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def median_and_mean(values: Sequence[float], digits: int = 1) -> str:
+    """As "median (mean)"."""
+    return f"{statistics.median(values):.{digits}f} ({statistics.fmean(values):.{digits}f})"

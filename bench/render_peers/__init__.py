@@ -1,1 +1,0 @@
-"""What `bench/render.py` is made of: peers, their measurement, and the page about them."""

@@ -1,0 +1,1 @@
+"""How efficient, how right and how fast the integrator is."""

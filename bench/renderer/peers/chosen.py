@@ -1,0 +1,76 @@
+"""The settings of `bdpt` that photonfarm's own strategy chooses for a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.renderer.peers.methods import Calibration
+
+LEAST_IMAGE_S = 0.1
+PILOT_SEED = 50_000_000
+"""Far from the seeds that are measured, so that no image helped to choose its own settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Settings, and what it took to find them."""
+
+    connections: int
+    light_ratio: float
+    pilot_wall_s: float  # with the compilation of all candidates; 0 for settings that were given
+    why: str
+
+    def parameters(self) -> dict[str, Any]:
+        """As the plugin takes them."""
+        return {"connections": self.connections, "light_ratio": self.light_ratio}
+
+
+def given(text: str) -> Chosen:
+    """Settings from "CONNECTIONS,LIGHT_RATIO". Raises ValueError for anything else."""
+    try:
+        connections, light_ratio = text.split(",")
+        return Chosen(int(connections), float(light_ratio), 0.0, "given")
+    except ValueError:
+        raise ValueError(
+            f"chosen settings are {text!r}; allowed is CONNECTIONS,LIGHT_RATIO such as 0,1, or nothing to run the pilot"
+        ) from None
+
+
+def pilot_spp(known: Calibration) -> int:
+    """Samples per pixel of the pilot's images, from the calibration of `bdpt`.
+
+    An image's samples take about as long as what it costs beside them, or the pilot would choose by that alone.
+    """
+    return max(1, round((max(2 * known.fixed_s, LEAST_IMAGE_S) - known.fixed_s) / known.sample_s))
+
+
+def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
+    """What the pilot of `photonfarm scene plan` finds for this one view.
+
+    It takes about `seconds` of CPU time, and more where its first round and the kernels of all candidates need more.
+    """
+    import time
+
+    import mitsuba as mi
+
+    from photonfarm.renderer.strategy import content, measurement, pilot
+
+    plugins: dict[Any, Any] = {}
+
+    def render(candidate: Any, seed: int, spp: int) -> Any:
+        if candidate not in plugins:
+            common = {"type": "bdpt", "record": True, "max_depth": max_depth, "rr_depth": 5}
+            settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
+            plugins[candidate] = mi.load_dict({**common, **settings})
+        image = np.array(mi.render(scene, integrator=plugins[candidate], spp=spp, seed=seed))
+        return np.ascontiguousarray(image[..., :3], np.float32)
+
+    start = time.perf_counter()
+    found = content.read(scene, scene.sensors()[0])
+    candidates, _ = content.restrict(found, max_depth, 1.0, measurement.GRID)
+    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
+    best = choice.candidate
+    return Chosen(best.connections, best.light_ratio, time.perf_counter() - start, "; ".join(choice.reasons))

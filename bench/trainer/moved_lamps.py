@@ -1,0 +1,421 @@
+"""How much of what moved lamps change in an image networks explain, beside what is known without learning.
+
+    python -m bench.trainer.moved_lamps [--rooms NAME …] [--views 16] [--half-spp 64] [--work DIR] [--out DIR]
+
+Takes experiments that have run (`make experiments-small`), renders a view of each of some held-out configurations as it
+is, and again with the lamps as in another random configuration, and has every trained network predict both: nothing is
+trained. Denoisers are left out, as they are given an image of the very view. PHOTONFARM_SCENES names the folder of the
+rooms' scene files. Exit code 0, whatever comes out; 2 for a room that has not run, or without a lamp that moves.
+
+Shape letters: G movable groups, H W image, N views, S seeds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bench.harness import results, room_study
+from bench.harness.network_errors import F64, Errors
+from bench.harness.scenes import in_passes
+from bench.trainer.explained import Change, Explained
+from photonfarm.renderer.jobs.path_buffers import frames_of
+from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
+from photonfarm.shared.core.keys import Key, seed_of, view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import Store
+from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
+from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
+from photonfarm.trainer.data.store_source import RawSample, StoreSource
+from photonfarm.trainer.metrics import metric_space
+from photonfarm.trainer.networks import ARCHITECTURES
+from photonfarm.trainer.networks.inputs import Needs, given
+from photonfarm.trainer.predict.evaluation import Predictor
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+
+Base = tuple[Geometry, BasePointCloud]
+
+NAME = "moved_lamps"
+SEED = 1
+"""Of the lamps' other places. Experiments are planned with 0, so that no sample shows these places."""
+
+KNOWN = "light known alone"
+SAME_DEPTH = 1e-3  # relative: so near, and of the same normal, is the same surface
+SAME_ALBEDO = 1e-3  # likewise
+
+
+# -------------------------------------------------------------------------------------------------------------- lamps
+
+
+def lamps(spec: SceneSpec) -> NDArray[np.bool_]:
+    """The movable groups that shine, (G,): all lights, and objects that take a light along."""
+    emitting = _emitting(spec)
+    return np.array([_shines(group, emitting, spec) for group in spec.groups], np.bool_)
+
+
+def _emitting(spec: SceneSpec) -> frozenset[str]:
+    if spec.scene.builtin is not None:
+        return BUILTIN_EMITTING[spec.scene.builtin]
+    return SceneFile.read(find_scene(str(spec.scene.file), spec.name)).emitting
+
+
+def _shines(group: Movable, emitting: frozenset[str], spec: SceneSpec) -> bool:
+    if isinstance(group, Light):
+        return True
+    return any(spec.emitters.factor(shape) > 0 for shape in emitting.intersection(shape_ids(group)))
+
+
+def relit(modification: Modification, other: Modification, shines: NDArray[np.bool_]) -> Modification:
+    """The configuration with the lamps of the other; `shines` as `lamps` gives it."""
+    return Modification.from_vector(np.where(shines[:, None], other.vector, modification.vector))
+
+
+def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
+    """The pixels that show one surface in both, (H, W), also at their edges, which albedo tells: no lamp that moved."""
+    depth = np.abs(a.depth - b.depth) <= SAME_DEPTH * np.maximum(a.depth, b.depth)
+    normal = np.abs(a.normal - b.normal).max(axis=-1) < SAME_DEPTH
+    albedo = np.abs(a.albedo - b.albedo).max(axis=-1) < SAME_ALBEDO
+    same: NDArray[np.bool_] = depth & normal & albedo & (a.depth > 0)
+    return same
+
+
+# -------------------------------------------------------------------------------------------------------------- views
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """A view of one configuration, and all that a network may be told of it."""
+
+    sample: RawSample  # its halves are the reference's
+    photons: Photons | None  # None: the scene has none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """What predicts images: networks that differ in their seeds alone, or what is known without one."""
+
+    name: str
+    seeds: tuple[int, ...]  # none where nothing is learned
+    predictors: tuple[Predictor, ...]  # of each seed
+    needs: Needs
+    points: int | None = None  # first points of the base cloud that it is given; None: all
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """N views of a room, each rendered as it is and with its lamps moved."""
+
+    spec: SceneSpec
+    base: Base
+    pairs: tuple[tuple[Look, Look], ...]
+    units: tuple[Key, ...]  # the configuration of each
+
+    @cached_property
+    def change(self) -> Change:
+        """What the lamps change."""
+        radiance = np.array([[look.sample.radiance for look in pair] for pair in self.pairs])  # (N, 2, 2, H, W, 3)
+        shown = _shown(np.float32(self.spec.exposure) * radiance)
+        same = [stays(first.sample.buffers, second.sample.buffers) for first, second in self.pairs]
+        return Change(shown[:, 1] - shown[:, 0], np.stack(same), self.units)
+
+    def predicted(self, predict: Predictor, candidate: Candidate) -> F64:
+        """What a predictor says that the lamps change, (N, H, W, 3) in the metric space."""
+        total = len(self.base[1].position)
+        memory = TrainingBatch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
+        made = [[predict(self._filled(memory, look))[0].copy() for look in pair] for pair in self.pairs]
+        shown = _shown(np.array(made, np.float32))
+        return shown[:, 1] - shown[:, 0]
+
+    def _filled(self, memory: TrainingBatch, look: Look) -> TrainingBatch:
+        """A look as a batch of one, in memory that is used again."""
+        fill(memory, 0, look.sample, self.spec, self.base[1])
+        if memory.inputs.photons is not None:
+            fill_photons(memory.inputs.photons, 0, given(look.photons))
+        return memory.filled((0,), (b"",))
+
+    def row(self, candidate: Candidate) -> Row:
+        """How much of the change a candidate explains."""
+        left = np.stack([self.change.left(self.predicted(each, candidate)) for each in candidate.predictors], axis=1)
+        there = self.change.there()
+        parts = (Explained(Errors(of, self.units), all_) for of, all_ in zip(left, there, strict=True))
+        return Row(candidate.name, candidate.seeds, *parts)
+
+
+def _shown(exposed: F32) -> F64:
+    """Images (…, H, W, 3) of exposed radiance in the metric space."""
+    shape = exposed.shape
+    images: F64 = metric_space(exposed.reshape(-1, *shape[-3:])).double().numpy().reshape(shape)
+    return images
+
+
+# ---------------------------------------------------------------------------------------------------------- measuring
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a candidate explains."""
+
+    name: str
+    seeds: tuple[int, ...]
+    whole: Explained  # of whole images
+    stays: Explained  # of the pixels that show one surface in both
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """What was measured of a room."""
+
+    name: str
+    lamps: tuple[str, ...]
+    change: Change
+    rows: tuple[Row, ...]
+
+
+def known_light(batch: TrainingBatch) -> F32:
+    """Emission, direct light and gloss of a batch's guides: an image of which nothing is learned."""
+    guides = given(batch.inputs.guides)
+    light: F32 = (guides.emission + guides.direct + guides.gloss).numpy()
+    return light
+
+
+def rooms_that_ran(work: Path) -> list[str]:
+    """The experiments in a folder that have lamps that move and have run, in the order of their names."""
+    ran = {file.parents[2] for file in work.glob(f"*/runs/*/{CHECKPOINT}")}
+    return sorted(folder.name for folder in ran if lamps(load_spec(folder / "spec.json")).any())
+
+
+def trained_runs(folder: Path) -> list[list[TrainedRun]]:
+    """The networks of an experiment, those together that differ in their seeds alone.
+
+    Without denoisers and without what is not trained to its end. Raises IncompleteError where there are none, and
+    SpecError where they are of several scenes.
+    """
+    alike: dict[Any, list[TrainedRun]] = {}
+    for file in sorted((folder / "runs").glob(f"*/{CHECKPOINT}")):
+        run = TrainedRun.load(file.parent)
+        if run.needs.kept:
+            continue
+        if checkpoint.load(file)["step"] < run.settings.max_steps:
+            room_study.tell(f"{run.folder}: is not trained to its end, and left out")
+            continue
+        alike.setdefault(run.settings.model_copy(update={"seed": 0}), []).append(run)
+    if not alike:
+        raise IncompleteError(f"{folder}: holds no trained network; `python experiments/run.py` trains them")
+    if len(scenes := {run.scene_id for runs in alike.values() for run in runs}) > 1:
+        raise SpecError(f"{folder}/runs: are of the scenes {', '.join(sorted(scenes))}; one is needed")
+    order = list(ARCHITECTURES)
+    groups = [sorted(runs, key=lambda run: run.settings.seed) for runs in alike.values()]
+    return sorted(groups, key=lambda runs: (order.index(runs[0].settings.network.architecture), runs[0].folder.name))
+
+
+def candidate_of(runs: Sequence[TrainedRun], spec: SceneSpec, base: Base) -> Candidate:
+    """Networks that differ in their seeds alone; named as the first's folder, without its seed."""
+    first, seeds = runs[0], tuple(run.settings.seed for run in runs)
+    predictors = tuple(run.predictor(spec, base, "cpu") for run in runs)
+    name = first.folder.name.removesuffix(f"-{first.settings.seed}")
+    return Candidate(name, seeds, predictors, first.needs, first.settings.network.points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """A room that can be rendered, with what does not change from view to view."""
+
+    spec: SceneSpec
+    base: Base
+    guides: GuideSpec  # what these are rendered with
+    scene: SceneRenderer  # with as many samples per pixel in a half as a reference has
+
+    @classmethod
+    def of(cls, store: Store, scene_id: str, half_spp: int) -> Self:
+        """A scene of a store; where that has no guides, they are rendered as the spec says."""
+        stored = store.scene(scene_id)
+        spec, guides = located(stored.spec), stored.guides.settings() or stored.spec.guides
+        return cls(spec, stored.base(), guides, load_scene(in_passes(spec, half_spp)))
+
+    def look(self, modification: Modification, view: View) -> Look:
+        """Render a view, and what a network is told of it, which is what `photonfarm infer` tells.
+
+        The seeds of the halves are of this benchmark alone, so that no guide and no sample has their noise.
+        """
+        frames = frames_of(self.spec, modification, [view], self.base[1], lambda _: self.scene, self.guides)
+        key = view_key(modification.key(self.spec.scene_id), view.vector)
+        halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
+        known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
+        return Look(RawSample(modification, view, halves, 1.0, *known), frames.photons)
+
+    def views(self, source: StoreSource, rows: Sequence[int]) -> Views:
+        """The views of some samples, rendered anew."""
+        shines, pairs = lamps(self.spec), []
+        for index, row in enumerate(rows):
+            (sample,) = source.read_batch([row])
+            moved = relit(sample.modification, sample_modification(self.spec, SEED, index), shines)
+            pairs.append((self.look(sample.modification, sample.view), self.look(moved, sample.view)))
+        return Views(self.spec, self.base, tuple(pairs), tuple(units_of(source, rows)))
+
+
+def held_out(source: StoreSource, share: float, views: int) -> list[int]:
+    """The first sample of each of so many held-out configurations; IncompleteError where they are fewer than two."""
+    rows = HeldOutSamples.of(source, share, sys.maxsize).rows
+    first = dict(zip(reversed(units_of(source, rows)), reversed(rows), strict=True))
+    if len(found := sorted(first.values())[:views]) < 2:
+        raise IncompleteError(f"{len(found)} held-out configuration: an interval needs two; plan more, or look at more")
+    return found
+
+
+def measured(name: str, told: argparse.Namespace) -> Room:
+    """An experiment's networks on views whose lamps move. Raises PhotonfarmError where that cannot be."""
+    folder = told.work / name
+    runs = trained_runs(folder)
+    store, scene_id = Store(folder / "store"), runs[0][0].scene_id
+    source = StoreSource(store.root, scene_id)
+    share = min(run.settings.hold_out for group in runs for run in group)  # shares are nested: no run has seen these
+    rows = held_out(source, share, told.views)
+    stage = Stage.of(store, scene_id, told.half_spp)
+    if not lamps(stage.spec).any():
+        raise SpecError(f"{name}: none of its movable groups shines, and this is about lamps that move")
+    candidates = [candidate_of(group, stage.spec, stage.base) for group in runs]
+    if stage.guides.light_samples:
+        candidates.insert(0, Candidate(KNOWN, (), (known_light,), Needs(points=False, guides=True)))
+    views = stage.views(source, rows)
+    found = tuple(views.row(candidate) for candidate in candidates)
+    for row in found:
+        room_study.tell(f"{name}: {row.name} {stated(row.whole)}, on surfaces that stay {stated(row.stays)}")
+    named = (group.name for group, shines in zip(stage.spec.groups, lamps(stage.spec), strict=True) if shines)
+    return Room(name, tuple(named), views.change, found)
+
+
+# --------------------------------------------------------------------------------------------------------------- page
+
+
+def stated(explained: Explained) -> str:
+    """R² and its 95 % interval."""
+    low, high = explained.interval()
+    return f"{explained.share:.3f} ({low:.3f} … {high:.3f})"
+
+
+def each_seed(explained: Explained) -> str:
+    """R² of each seed, and their standard deviation; empty from one seed."""
+    found = explained.of_seeds()
+    if len(found) == 1:
+        return ""
+    return f"{' · '.join(f'{share:.3f}' for share in found)}; s = {found.std(ddof=1):.3f}"
+
+
+def part(room: Room) -> str:
+    """What a page says of a room."""
+    header = ("", "R² (95 %)", "of each seed", "R² on surfaces that stay in view (95 %)", "of each seed")
+    lines = [
+        [row.name, stated(row.whole), each_seed(row.whole), stated(row.stays), each_seed(row.stays)]
+        for row in room.rows
+    ]
+    whole, same = (errors.of_seeds()[0] / 2 for errors in room.change.there())
+    return f"""## {room.name}
+
+Lamps that move: {", ".join(room.lamps)}. {room_study.counted(len(room.change.units), "view")}. What the lamps change is
+{whole:.5f}, half the mean squared difference, of which {same:.5f} lie on surfaces that stay in view,
+{room.change.stays.mean():.0%} of the pixels.
+
+{results.table(header, lines)}"""
+
+
+def page(rooms: Sequence[Room], half_spp: int) -> str:
+    """The tables as Markdown."""
+    parts = "\n\n".join(part(room) for room in rooms)
+    return f"""# How much of what moved lamps change networks explain
+
+Held-out views, each rendered as it is and with its lamps as in another random configuration, objects as they were; the
+networks of the experiments, as they were trained, predict both. With Δ the change of a pixel in the metric space,
+clip(exposure · I, 0, 1)^(1/2.2), and p the predicted one, R² = 1 − Σ (p − Δ)² / Σ Δ², sums over pixels, channels and
+views: 1 explains all, 0 is a prediction that does not change, and below 0 one that changes to the worse. The noise of
+the references is taken out by their halves of {half_spp} spp, but for what that curve makes of it; that of a network's
+own inputs, such as photons and direct light, counts against it, and may be more than all that lamps change where most
+of the light is not theirs.
+
+**Surfaces that stay in view** are pixels that show one surface in both, by depth, normal and albedo, and so no lamp
+that moved; a mirror stays, whatever it shows. **{KNOWN.capitalize()}** is emission, direct light and gloss of the
+guides: nothing in it is learned. Intervals are of a bootstrap over configurations, for these networks, and rough where
+few views carry the sums; seeds of one network are averaged, and s is their standard deviation. Denoisers are left out:
+they are given an image of the very view.
+
+{parts}"""
+
+
+def document(rooms: Sequence[Room]) -> dict[str, Any]:
+    """The figures of moved_lamps.json; of each view, what is there and what is left, as shares of all pixels."""
+    return {
+        room.name: {
+            "lamps": room.lamps,
+            "units": [unit.hex() for unit in room.change.units],
+            "stays": room.change.stays.mean(axis=(1, 2)).round(4).tolist(),
+            "there": dict(zip(("whole", "stays"), map(_rounded, room.change.there()), strict=True)),
+            "rows": [
+                {"name": row.name, "seeds": row.seeds, "whole": _figures(row.whole), "stays": _figures(row.stays)}
+                for row in room.rows
+            ],
+        }
+        for room in rooms
+    }
+
+
+def _figures(explained: Explained) -> dict[str, Any]:
+    """R², its interval, and what it is made of; None for −∞."""
+    low, high = explained.interval()
+    found = explained.share, low, high, *explained.of_seeds()
+    share, *others = (round(float(value), 5) if np.isfinite(value) else None for value in found)
+    return {
+        "r2": share, "interval_95": others[:2], "r2_of_seeds": others[2:], "left": _rounded(explained.left)
+    }  # fmt: skip
+
+
+def _rounded(errors: Errors) -> list[list[float]]:
+    return np.round(errors.values, 8).tolist()
+
+
+def options() -> argparse.ArgumentParser:
+    """What can be told."""
+    parser = results.parser(__doc__)
+    parser.add_argument("--rooms", nargs="+", help="experiments that have run (all whose lamps move)")
+    parser.add_argument("--views", type=int, default=16, help="held-out configurations, at most (%(default)s)")
+    parser.add_argument("--half-spp", type=int, default=64, help="samples per pixel of a half (%(default)s)")
+    where = results.ROOT / "build/experiments/small"
+    parser.add_argument("--work", type=Path, default=where, help="where they have run (build/experiments/small)")
+    return parser
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    parser = options()
+    told = parser.parse_args()
+    torch.set_num_threads(1)
+    try:
+        names = told.rooms or rooms_that_ran(told.work)
+        for name in names:
+            trained_runs(told.work / name)  # what is wrong should be said before hours go by
+        rooms = [measured(name, told) for name in names]
+    except PhotonfarmError as error:
+        parser.error(str(error))
+    if not rooms:
+        parser.error(f"{told.work}: no experiment whose lamps move has run; `python experiments/run.py` runs them")
+    figures = {"views": told.views, "half_spp": told.half_spp, "rooms": document(rooms)}
+    results.write(NAME, page(rooms, told.half_spp), figures, told.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

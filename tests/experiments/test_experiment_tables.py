@@ -1,0 +1,237 @@
+"""The page over the experiments' reports: what it says of them, and what it says where something is missing."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from experiments import tables
+from experiments.experiment import Experiment, SizeName
+from experiments.rooms import Room
+from photonfarm.shared.core.errors import IncompleteError, SpecError
+
+NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")
+MACHINE = {"cpu": "Some CPU", "cores": 2, "architecture": "x86_64", "load_average": [0.4, 0.6, 1.2]}
+
+
+def of_images(values: list[float]) -> dict[str, Any]:
+    mean = sum(values) / len(values)
+    return {"estimate": {"mean": mean, "standard_error": mean / 10, "count": len(values)}, "values": values}
+
+
+def row(name: str, place: int, mse: float) -> dict[str, Any]:
+    """A row of a report's evaluation, of four views, each a configuration."""
+    return {
+        "name": name,
+        "network_seconds": 0.02,
+        "network_seconds_range": [0.019, 0.023],
+        "frame_seconds": {"total": 0.1 * (place + 1)},
+        "linear_mse": {"mean": 1.0, "standard_error": 0.1, "count": 4},
+        "metric_space": {
+            "mse": of_images([mse, 1.1 * mse, 0.9 * mse, mse]),
+            "mssim": of_images([0.7] * 4),
+            "flip": of_images([0.2] * 4),
+            "feature_l1": [of_images([0.1 * (block + 1)] * 4) for block in range(4)],
+            "fid": {"value": 120.0},
+            "kid": {"mean": 0.05},
+            "inception": {"source": "somewhere"},
+        },
+    }  # fmt: skip
+
+
+def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 64) -> dict[str, Any]:
+    """A report.json: 896 images, 769 of them trained on, and 4032 reference passes."""
+    return {
+        "machine": MACHINE,
+        "edit_seconds": 0.1486,
+        "dataset": {
+            "width": film, "height": film, "spp_per_sample": 8, "credits": None, "bytes": 694e6,
+            "transport": {"connections": 4, "light_ratio": 0.25},
+            "spent": {
+                "samples": {"rows": 896, "core_seconds": 527.2}, "top-up": {"rows": 4032, "core_seconds": 725.4},
+            },
+        },
+        "runs": [
+            {
+                "name": name, "architecture": name, "trained_on": 769, "parameters": 1000, "steps": steps,
+                "seconds": {}, "settings": {"max_steps": steps, "batch": 2, "seed": 0},
+            }
+            for name in rows
+        ],
+        "evaluation": {
+            "samples": 112, "units": 112, "noise_floor": 0.07, "device": "cpu", "threads": 1,
+            "references": {"views": 4, "spp": 512},
+            "rows": [row(name, place, 0.01 * (place + 1)) for place, name in enumerate(rows)],
+        },
+    }  # fmt: skip
+
+
+def leave(folder: Path, size: SizeName, document: dict[str, Any]) -> None:
+    """An experiment's folder with its report, and with what was measured of further seeds."""
+    (folder / "report").mkdir(parents=True)
+    (folder / "report/report.json").write_text(json.dumps(document))
+    if again := Experiment.load(folder.name, size).again():
+        evaluated = folder / "runs" / again[0].name / "evaluation.json"
+        evaluated.parent.mkdir(parents=True)
+        evaluated.write_text(json.dumps({"rows": [row(run.name, 0, 0.01) for run in again]}))
+
+
+def room(name: str, document: dict[str, Any] | None = None) -> Room:
+    return Room.of(Experiment.load(name, "small"), document or report(), "1234567")
+
+
+def cells(page: str, first: str) -> list[str]:
+    """The cells of the table's line that begins so; the head stands above it."""
+    line = next(line for line in page.splitlines() if line.startswith(f"| {first} |"))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
+    page = tables.room_table([room("night-living-room-2")])
+    told = dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
+    assert told["title"] == "At night: The White Room"
+    assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
+    assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
+    assert (told["connections"], told["light ratio"]) == ("4", "0.25")
+    assert told["edit, ms"] == "149"
+    assert told["load average of 1, 5, 15 min"] == "0.4, 0.6, 1.2"
+
+
+def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
+    rooms = [room("night-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
+    assert tables.lacking(rooms) == (
+        " Rows that a room lacks are means over the others: denoise_4 without night-living-room."
+    )
+    page = tables.paper_table(rooms, tables.MOVABLE_LIGHTS)
+    assert cells(page, "denoise_4")[1] == "500.0"
+    assert cells(page, "cnn")[:6] == ["cnn", "400.0", "20.0 (19.0 … 23.0)", "2.00", "0.78", cells(page, "cnn")[5]]
+
+
+def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
+    own = (*NETWORKS, "light_transport_without_descriptor")
+    found = [room("static-ablation", report(own, steps=1200, film=128)), room("static-kitchen")]
+    page = tables.page(found, "small")
+    static, ablation = page.split("## Static rooms")[1].split("## The supplement's static ablation")
+    assert "| light_transport_without_descriptor |" in ablation
+    assert "Means over: static-ablation.\n" in ablation
+    assert "Means over: static-kitchen.\n" in static
+    assert "without_descriptor" not in static
+    assert "paper |" not in static.split("### Pairs")[0]  # it published no table of these
+
+
+def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
+    large = report(film=256)
+    large["evaluation"]["device"] = "cuda"
+    page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small")
+    assert "A GPU took part: networks ran on cuda (fixed-living-room); cpu (fixed-dining-room); of the rooms" in page
+    assert "only fixed-living-room is at the paper's resolution" in page
+    assert "images are 256 × 256 (fixed-living-room); 64 × 64 (fixed-dining-room)." in page
+
+
+def test_rooms_of_several_machines_are_named_with_theirs() -> None:
+    other = {**report(), "machine": {**MACHINE, "cpu": "Another"}}
+    found = [room("fixed-living-room"), room("fixed-dining-room", other)]
+    assert tables.said(found, Room.machine) == (
+        "Some CPU, 2 cores, x86_64 (fixed-living-room); Another, 2 cores, x86_64 (fixed-dining-room)"
+    )
+
+
+def test_what_could_not_be_measured_is_not_available() -> None:
+    """Without Inception, with one reference, without times, and without the row that times are ratios of."""
+    bare = report(("cnn", "feature_projection"))
+    for of_row in bare["evaluation"]["rows"]:
+        of_row["metric_space"] |= {"feature_l1": None, "fid": None, "kid": None, "inception": None}
+        of_row["metric_space"]["mse"] = {
+            "estimate": {"mean": 0.01, "standard_error": None, "count": 1}, "values": [0.01],
+        }  # fmt: skip
+    bare["evaluation"]["rows"][1]["frame_seconds"] = None
+    bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
+    found = room("night-living-room", bare)
+    page = tables.page([found], "small")
+    assert cells(page, "cnn")[1:] == [
+        "100.0", "20.0 (19.0 … 23.0)", "n/a", "0.78", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827",
+        "n/a", "33.7", "n/a", "n/a", "0.199",
+    ]  # fmt: skip
+    assert cells(page, "feature_projection")[1] == "n/a"
+    assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
+    assert "Timed on a CPU of unknown model, 2 cores" in page
+    json.dumps(found.document)
+
+
+def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree() -> None:
+    found = room("night-living-room")
+    found.document["further_seeds"] = {"cnn": [[0.041, 0.043, 0.035, 0.041]], "light_transport": [[0.02] * 4]}
+    gap = found.gap("cnn", "light_transport")
+    assert gap is not None
+    assert gap.of_seeds == pytest.approx([0.02 / 0.04, 0.02 / 0.04])
+    assert gap.unit == pytest.approx(0.04)
+    assert cells(tables.order_table([found], {}), "`cnn` − `feature_projection`")[2].startswith("+25% (+")
+    found.document["further_seeds"]["cnn"] = [[0.005] * 4]
+    said = tables._gap(found, "cnn", "light_transport")
+    assert said.endswith("not told apart")
+
+
+def test_gaps_of_views_that_share_a_configuration_are_refused() -> None:
+    shared = report()
+    for of_row in shared["evaluation"]["rows"]:
+        of_row["metric_space"]["mse"]["estimate"]["count"] = 2
+    with pytest.raises(SpecError, match=r"its 4 views are of 2 configurations; .* set views = 1"):
+        room("night-living-room", shared).gap("cnn", "feature_projection")
+
+
+def test_an_earlier_version_s_report_is_refused_with_what_makes_it_anew(tmp_path: Path) -> None:
+    file = tmp_path / "report.json"
+    file.write_text(json.dumps({key: value for key, value in report().items() if key != "machine"}))
+    with pytest.raises(IncompleteError, match=r"experiments/run\.py night-living-room` makes it anew"):
+        Room.read(Experiment.load("night-living-room", "small"), file, "1234567")
+
+
+def test_tables_are_written_with_the_command_and_each_report_s_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
+    assert tables.main() == IncompleteError.exit_code
+    leave(tmp_path / "work" / "small" / "night-living-room", "small", report())
+    assert tables.main() == 0
+    document = json.loads((tmp_path / "out" / "tables.json").read_text())
+    assert document["command"] == "python experiments/tables.py --size small"
+    assert document["rooms"]["night-living-room"]["machine"] == MACHINE
+    assert document["rooms"]["night-living-room"]["further_seeds"]["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
+    assert document["rooms"]["night-living-room"]["runs"]["cnn"]["trained_on"] == 769
+    assert str(tmp_path) not in (tmp_path / "out" / "tables.md").read_text()
+
+
+def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(place: str, name: str, size: SizeName = "small", **values: Any) -> dict[str, Any]:
+        leave(tmp_path / place / size / name, size, report(**values))
+        arguments = ["--size", size, "--work", str(tmp_path / place), "--out", str(tmp_path / "out")]
+        monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
+        assert tables.main() == 0
+        return json.loads((tmp_path / "out" / f"{tables.page_of(size)}.json").read_text())["rooms"]
+
+    first = made("here", "fixed-living-room")
+    page = (tmp_path / "out" / "tables.md").read_text()
+    second = made("elsewhere", "night-living-room")
+    assert list(second) == ["fixed-living-room", "night-living-room"]
+    assert second["fixed-living-room"] == first["fixed-living-room"]
+    part = page[page.index("## Table 1") : page.index("## Error against")]
+    assert part in (tmp_path / "out" / "tables.md").read_text()
+    assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
+    assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size
+    file = tmp_path / "out" / "tables.json"
+    assert "fixed-living-room" in json.loads(file.read_text())["rooms"]  # which stays what it was
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])
+    assert tables.main() == 0
+    document = json.loads(file.read_text())
+    del document["rooms"]["fixed-living-room"]["machine"]
+    for damaged in (json.dumps(document), "{", "[]"):
+        file.write_text(damaged)
+        assert tables.main() == IncompleteError.exit_code
+        assert file.read_text() == damaged

@@ -1,0 +1,266 @@
+"""The experiments' files, and the way through all stages of a tiny one."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+
+from experiments import experiment, run
+from experiments.dry_run import Need
+from experiments.experiment import Experiment, SizeName, merged, names
+from experiments.rooms import Room
+from experiments.stages import PREVIEW, StageError, Stages, _is_done
+from experiments.tables import paper_table, room_table
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, Emitters
+from photonfarm.trainer.report.published import MOVABLE_LIGHTS
+
+ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
+EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]
+EXPECTED += ["night-dining-room", "night-living-room", "night-living-room-2"]
+EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen", "vanishing-living-room-2"]
+
+
+def test_the_experiments_are_all_there() -> None:
+    assert names() == EXPECTED
+
+
+@pytest.mark.parametrize("size", get_args(SizeName))
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) -> None:
+    found = Experiment.load(name, size)
+    runs = {run.name: run.train for run in found.trained()}
+    assert {"light_transport", "cnn"} <= set(runs)
+    losses = {settings["loss"] for settings in runs.values() if not settings["architecture"].startswith("denoise")}
+    assert len(losses) == 1, "networks of one table are trained alike"
+
+
+@pytest.mark.skipif(SCENES_VARIABLE not in os.environ, reason=f"{SCENES_VARIABLE} names no folder with the rooms")
+@pytest.mark.parametrize("name", EXPECTED)
+def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
+    spec, paper = (Experiment.load(name, size).spec() for size in ("small", "paper"))
+    assert spec.credits is not None
+    assert bool(spec.lights) == name.startswith(("movable", "night", "vanishing"))
+    assert (spec.emitters == Emitters(all=0)) == name.startswith(("night", "vanishing"))
+    assert bool(spec.objects) != name.startswith("static")
+    size = 128 if name == "static-ablation" else 256
+    assert (paper.film.width, paper.film.height) == (size, size)
+
+
+def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
+    below: dict[str, Any] = {"a": {"b": 1, "c": {"d": 2}}, "lights": [1, 2], "e": 3}
+    assert merged(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
+        "a": {"b": 1, "c": {"d": 2, "f": 4}}, "lights": [], "e": 3,
+    }  # fmt: skip
+    assert below["a"]["c"] == {"d": 2}
+
+
+def test_an_unknown_experiment_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(SpecError, match="no such experiment; there are fixed-dining-room, "):
+        Experiment.load("kitchen-sink", "small")
+
+
+TINY = """
+title = "A tiny room"
+part = "movable"
+about = "For the test."
+scene = "room.toml"
+
+[small]
+"""
+SIZES = """
+[small]
+about = "tiny"
+changes = { film = { width = 16, height = 16 }, transport = { half_spp = 1 }, points = 256, photons = { paths = 64 } }
+modifications = 12
+views = 1
+seed = 0
+seeds = [0, 1]
+hold_out = 0.4
+references = { views = 2, spp = 4 }
+architectures = ["light_transport", "denoise_4"]
+untrained = ["fill-in"]
+kept = [4]
+
+[small.train]
+preset = "small"
+max_steps = 3
+width = 4
+points = 128
+loss = "paired"
+
+[small.train_denoisers]
+loss = "relative"
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
+    from photonfarm.shared.scene.spec import find_spec
+
+    monkeypatch.setattr(experiment, "HERE", tmp_path)
+    (tmp_path / "tiny.toml").write_text(TINY)
+    (tmp_path / "sizes.toml").write_text(SIZES)
+    (tmp_path / "room.toml").write_text(find_spec("room").read_text())
+    return Experiment.load("tiny", "small")
+
+
+def with_size(tiny: Experiment, **changes: Any) -> Experiment:
+    return tiny.model_copy(update={"size": tiny.size.model_copy(update=changes)})
+
+
+def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> None:
+    need = Need.of(tiny, SampleCosts("0" * 32, 1.0, 2.0, 3.0, 0.5, 0.1))
+    assert (need.samples, need.passes, need.runs) == (12, 2, 3)  # 2 spp a pass; a network twice, and a denoiser
+    assert need.sample_hours == pytest.approx(12 * (1 + 2 + 3 + 2 * 0.5) / 3600)
+    assert need.pass_hours == pytest.approx(2 * (3 + 2 * 0.5) / 3600)
+    longer = Need.of(with_size(tiny, train={**tiny.size.train, "max_steps": 6}), SampleCosts("0" * 32, 1, 1, 1, 1, 0))
+    assert longer.operations == pytest.approx(2 * need.operations)
+    assert need.line(1.0).startswith("tiny: 12 samples 0.0 core-h; 2 further passes for references 0.0 core-h; 3 runs ")
+
+
+def reports(stages: Stages) -> list[int]:
+    """When what is made last was written: the farm's preview and log, checkpoints, references and the report."""
+    files = [*stages.folder.glob("runs/*/checkpoint*"), *stages.folder.glob("references/*.npz")]
+    files = [*sorted(files), *(stages.folder / name for name in (PREVIEW, "logs/render.log", "report/report.json"))]
+    return [file.stat().st_mtime_ns for file in files]
+
+
+@pytest.mark.slow
+def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tmp_path: Path) -> None:
+    first, stages = (Stages(tiny, tmp_path / "work", workers) for workers in (1, 2))  # each compiles all kernels
+    first.write_spec()
+    first.render()
+    stages.train()
+    out = stages.report()
+    report = json.loads((out / "report.json").read_text())
+    rows = report["evaluation"]["rows"]
+    assert [row["name"] for row in rows] == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert report["evaluation"]["references"]["views"] == 2
+    assert report["evaluation"]["references"]["spp"] == 4
+    assert rows[1]["frame_seconds"]["render"] > 0
+    assert rows[0]["frame_seconds"]["render"] == 0
+    assert [run["steps"] for run in report["runs"]] == [3, 3]
+
+    room = Room.read(tiny, out / "report.json", "1234567")
+    assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
+    assert "| denoise_4 |" in paper_table([room], MOVABLE_LIGHTS)
+    assert room_table([room]).splitlines()[-1].startswith("| tiny | A tiny room |")
+    assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
+    assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
+        "light_transport": 2, "denoise_4": 1, "fill-in 1/4": 1,
+    }  # fmt: skip
+
+    before = reports(stages)
+    assert stages.run() == out
+    assert reports(stages) == before
+
+    strange = tmp_path / "work" / "references" / "notes.txt"
+    strange.write_text("Not ours.")
+    fewer = tiny.size.references.model_copy(update={"views": 1})
+    Stages(with_size(tiny, references=fewer), tmp_path / "work", workers=2).render()
+    assert len(list(strange.parent.glob("*.npz"))) == 1
+    assert strange.is_file()
+
+    shutil.rmtree(tmp_path / "work" / "store")  # a report that is made anew, as references are others, ends at once
+    with pytest.raises(StageError, match="tiny: report ended with exit code"):
+        stages.report()
+
+
+@pytest.mark.parametrize(
+    ("since", "done"),
+    [
+        ("nothing", True),
+        ("it did not end", False),
+        ("other arguments", False),
+        ("an output is missing", False),
+        ("a source is newer", False),
+        ("a source is as old", False),
+    ],
+)
+def test_a_verb_is_done_until_its_arguments_what_it_is_made_of_or_what_it_made_change(
+    tmp_path: Path, since: str, done: bool
+) -> None:
+    end, *made = (tmp_path / name for name in ("end", "made", "made too"))
+    of = [tmp_path / name for name in ("old", "older")]
+    for second, file in enumerate([*reversed(of), *made, end]):
+        file.write_text("as told")
+        os.utime(file, (second, second))
+    if since == "it did not end":
+        end.unlink()
+    elif since == "an output is missing":
+        made[1].unlink()
+    elif since.startswith("a source"):
+        second = end.stat().st_mtime + (since == "a source is newer")
+        os.utime(of[1], (second, second))
+    assert _is_done(end, "otherwise" if since == "other arguments" else "as told", made, of) is done
+
+
+def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
+    refused = with_size(tiny, train={**tiny.size.train, "loss": "l1"}, architectures=("light_transport",), seeds=(0,))
+    stages = Stages(refused, tmp_path / "work", workers=1)
+    stages.write_spec()
+    with pytest.raises(StageError, match=r"tiny: train-light_transport ended with exit code 3; .*train-light_trans"):
+        stages.train()
+
+
+def test_training_that_ends_early_without_an_error_is_not_taken_for_done(tiny: Experiment, tmp_path: Path) -> None:
+    """Nothing is rendered, and the trainer waits for samples until its time is over; then it exits with 0."""
+    brief = with_size(
+        tiny, train={**tiny.size.train, "max_seconds": 0.1}, architectures=("light_transport",), seeds=(0,)
+    )
+    stages = Stages(brief, tmp_path / "work", workers=1)
+    stages.write_spec()
+    with pytest.raises(StageError, match="tiny: train-light_transport was stopped early; the same command goes on"):
+        stages.train()
+
+
+def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
+    """The stages of an experiment of one network, of which a checkpoint of some step is there."""
+    from photonfarm.trainer.runs import checkpoint
+    from photonfarm.trainer.runs.settings import preset
+
+    told = {key: experiment.size.train[key] for key in ("max_steps", "loss")}
+    network = {"architecture": "light_transport", "width": 4, "points": 128}
+    settings = preset("small", network=network, hold_out=experiment.size.hold_out, **told)
+    state = {"scene_id": experiment.spec().scene_id, "settings": settings.model_dump(mode="json"), "step": step}
+    (folder / "runs" / "light_transport").mkdir(parents=True)
+    checkpoint.save(folder / "runs" / "light_transport" / "checkpoint.safetensors", state)
+    return Stages(experiment, folder, workers=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"train": {"decay": 0.5}}, "decay = 0.99, and 0.5 is asked for now: move that folder away"),
+        ({"train": {"max_steps": 4}}, "max_steps = 3, and 4 is asked for now"),
+        ({"train": {"preset": "paper-static"}}, "batch = 2, and 128 is asked for now"),
+        ({"hold_out": 0.3}, "hold_out = 0.4, and 0.3 is asked for now"),
+        ({"changes": {"points": 512}}, "scene_id = "),
+    ],
+)
+def test_a_run_of_other_settings_is_refused_with_its_folder(
+    tiny: Experiment, tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    tiny = with_size(tiny, architectures=("light_transport",), seeds=(0,))
+    trained(tiny, tmp_path / "work", step=3).train()
+    assert not (tmp_path / "work" / "logs").exists()  # nothing had to be done
+    other = with_size(tiny, **{key: merged(getattr(tiny.size, key), value) if isinstance(value, dict) else value
+                               for key, value in changes.items()})  # fmt: skip
+    with pytest.raises(StageError, match=said) as refused:
+        Stages(other, tmp_path / "work", workers=1).train()
+    assert str(tmp_path / "work" / "runs" / "light_transport") in str(refused.value)
+
+
+@pytest.mark.parametrize("workers", ["0", "-1", "two"])
+def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run.options().parse_args([f"--workers={workers}"])
+    assert ended.value.code == 2
+    assert f"{workers!r} is no number of processes" in capsys.readouterr().err

@@ -1,0 +1,107 @@
+"""The pages and the code name the same verbs, keys, variables and exit codes; links lead somewhere."""
+
+import re
+import runpy
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.cli.settings import file_defaults
+from photonfarm.shared.cli.verbs import options_by_command
+from photonfarm.shared.core import errors
+from photonfarm.shared.scene import spec as scene_spec
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted(DOCS.rglob("*.md"))]
+
+
+def test_the_page_of_the_command_line_is_made_from_the_code() -> None:
+    made = runpy.run_path(str(ROOT / "scripts/cli_page.py"))["page"]()
+    assert (DOCS / "cli.md").read_text() == made, "run scripts/cli_page.py"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_within_the_repository_lead_to_a_file_and_from_the_site_to_the_site(page: Path) -> None:
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        name, _, anchor = target.partition("#")
+        if "://" in target:
+            continue
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), target
+        assert page.is_relative_to(DOCS) <= file.is_relative_to(DOCS), f"{target} is outside of the site"
+        assert not anchor or anchor in anchors(file), target
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MkDocs make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    kept = [re.sub(r"[^\w\s-]", "", heading.lower()).strip() for heading in headings]
+    return {re.sub(r"[\s]+", "-", heading) for heading in kept}
+
+
+def test_every_page_but_those_of_measurements_is_in_the_navigation_once() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    listed = re.findall(r": (\S+\.md)$", navigation, re.MULTILINE)
+    assert sorted(listed) == sorted([*(page.name for page in DOCS.glob("*.md")), "results/README.md"])
+
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    "Top level": scene_spec.SceneSpec,
+    "scene": scene_spec.Source,
+    "objects": scene_spec.Movable,
+    "lights": scene_spec.Light,
+    "emitters": scene_spec.Emitters,
+    "view": scene_spec.ViewSpec,
+    "film": scene_spec.Film,
+    "transport": scene_spec.Transport,
+    "photons": scene_spec.PhotonSpec,
+    "guides": scene_spec.GuideSpec,
+    "credits": scene_spec.Credits,
+}
+"""The sections of docs/scene-spec.md, and the models whose keys they list."""
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_the_page_of_the_scene_spec_lists_every_key_and_its_default(section: str) -> None:
+    text = (DOCS / "scene-spec.md").read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    told: dict[str, str] = {}
+    for cells in (line.split(" | ") for line in text.splitlines() if line.startswith("| `")):
+        names, defaults = re.findall(r"`([\w.]+)`", cells[0]), cells[1].split(", ")
+        told |= dict(zip(names, defaults if len(defaults) == len(names) else [cells[1]] * len(names), strict=True))
+    fields = SECTIONS[section].model_fields
+    assert {name for name in told if "." not in name} == set(fields)
+    for name, field in fields.items():
+        if field.default is PydanticUndefined:
+            assert told[name] == "required", name
+        elif isinstance(field.default, int | float):
+            assert float(told[name]) == field.default, name
+
+
+def test_the_page_of_the_configuration_lists_every_variable_and_exit_code() -> None:
+    page = (DOCS / "configuration.md").read_text()
+    sources = [file for folder in ("shared", "services") for file in (ROOT / folder).rglob("*.py")]
+    sources += [ROOT / "docker-compose.yml", ROOT / "docker/redis.sh"]
+    named = {name for file in sources for name in re.findall(r"\bPHOTONFARM_[A-Z_]*[A-Z]\b", file.read_text())}
+    assert {name for name in named if f"`{name}`" not in page} == set()
+    codes = {kind.exit_code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "exit_code")}
+    assert codes <= {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
+
+
+def test_the_example_of_a_configuration_file_is_one(tmp_path: Path) -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", (DOCS / "configuration.md").read_text(), re.DOTALL)
+    (tmp_path / "photonfarm.toml").write_text(example)
+    defaults = file_defaults(tmp_path / "photonfarm.toml", options_by_command(umbrella))
+    assert defaults["train"]["max_steps"] == 20000
+    assert defaults["scene"]["plan"]["seconds"] == 120
+
+
+def test_the_example_of_a_spec_is_one() -> None:
+    (example,) = re.findall(r"```toml\n(.*?)```", (DOCS / "own-scene.md").read_text(), re.DOTALL)
+    described = scene_spec.SceneSpec.model_validate(tomllib.loads(example))
+    assert [group.name for group in described.groups] == ["sofa", "ceiling-light"]

@@ -33,11 +33,11 @@ class ImageStack:
     hit: mi.Float  # [K·H·W]: share of primary rays that hit a surface
 
     @classmethod
-    def black(cls, pixels: int) -> Images:
+    def black(cls, pixels: int) -> ImageStack:
         """Black images of ``pixels`` pixels in all."""
         return cls(dr.zeros(mi.Spectrum, pixels), dr.zeros(mi.Float, pixels))
 
-    def add(self, part: Images, first_pixel: int) -> None:
+    def add(self, part: ImageStack, first_pixel: int) -> None:
         """Add a part of the samples to the pixels from ``first_pixel`` on."""
         if dr.width(part.hit) == dr.width(self.hit):
             self.radiance += part.radiance

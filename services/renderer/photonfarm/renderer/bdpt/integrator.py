@@ -108,7 +108,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
-    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> Images:
+    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> ImageStack:
         sensor.sampler().seed(0, 1)  # what another integrator left there would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
@@ -130,7 +130,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     def _trace(
         self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
-    ) -> Images:
+    ) -> ImageStack:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
@@ -150,7 +150,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> Images:
+def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
     """Trace the light paths and the eye paths of a launch. Recorded, Python runs it once for each kind of launch."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None

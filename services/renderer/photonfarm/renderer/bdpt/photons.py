@@ -23,7 +23,7 @@ Columns: TypeAlias = "tuple[mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum]"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Photons:
+class TracedPhotons:
     """Photons in P = paths · depth slots: slot d·paths + i holds hit d + 1 of path i, or bounce −1 and zeros."""
 
     position: Floats  # [P, 3], scene units
@@ -33,7 +33,9 @@ class Photons:
     bounce: npt.NDArray[np.int32]  # [P]: surfaces met before (0: straight from a light), −1 empty
 
 
-def trace_photons(scene: mi.Scene, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None) -> Photons:
+def trace_photons(
+    scene: mi.Scene, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None
+) -> TracedPhotons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights

@@ -1,10 +1,10 @@
 """Training data made by `bdpt` against data made by Mitsuba's `path`, at equal core-seconds of rendering.
 
-    python -m bench.studies.path_data [--experiment fixed-veach-ajar] [--samples 400] [--steps 1000] [--seeds 0 1 2 3]
+    python -m bench.studies.path_data [--experiment fixed-veach-ajar] [--samples 200] [--steps 500] [--seeds 0 1 2 3]
         [--processes 2] [--out docs/results]
 
 Takes the room of an experiment of experiments/, times both integrators, and renders a store of each kind whose
-samples cost the same; PHOTONFARM_SCENES names the folder of its scene files. `light_transport` is trained alike on
+samples cost the same; PHOTONFARM_SCENES names the folder of its scene files. A network is trained alike on
 the first samples of either store, for budgets of a quarter to 1 of `bdpt` and of a quarter to 4 of `path`, and
 measured on held-out views. Leaves docs/results/path_data.{md,json,png}; what is rendered and trained stays in
 build/path_data, and the next call goes on with it. Times are best taken on a quiet machine; the first call settles
@@ -38,7 +38,8 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.data.store_source import StoreSource
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
-HELD_OUT = 1 / 8  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples
+HELD_OUT = 1 / 4  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples
+HELD_OUT_VIEWS = 48
 
 
 class FirstSamples(ChosenSamples):
@@ -58,18 +59,18 @@ def spec_of(told: argparse.Namespace) -> SceneSpec:
 
 
 def requests(told: argparse.Namespace) -> dict[str, list[Request | TopUp]]:
-    """A fifth of configurations more than are trained on, as an eighth of all is held out.
+    """Half as many configurations again as are trained on, as a quarter of all is held out.
 
     Both stores begin with the same plan, so that their first samples are of the same views.
     """
 
     def configurations(share: float) -> Request:
         samples = round(share * told.samples)
-        return Request(modifications=samples + samples // 5 + 8, seed=told.plan_seed)
+        return Request(modifications=samples + samples // 2 + 8, seed=told.plan_seed)
 
     first, most = (configurations(shares[-1]) for shares in BUDGETS.values())
     return {
-        "bdpt": [first, TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}"])],
+        "bdpt": [first, TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])],
         "path": [first, most],
     }
 
@@ -142,9 +143,9 @@ def options() -> argparse.ArgumentParser:
     parser = results.parser(__doc__)
     parser.add_argument("--experiment", default="fixed-veach-ajar", help="whose room it is (%(default)s)")
     parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
-    parser.add_argument("--samples", type=int, default=400, help="of bdpt, trained on at budget 1 (%(default)s)")
+    parser.add_argument("--samples", type=int, default=200, help="of bdpt, trained on at budget 1 (%(default)s)")
     room_study.add_options(parser, "path_data")
-    parser.set_defaults(steps=1000, seeds=[0, 1, 2, 3])
+    parser.set_defaults(steps=500, seeds=[0, 1, 2, 3])
     return parser
 
 

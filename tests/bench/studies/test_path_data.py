@@ -171,7 +171,7 @@ def test_the_page_and_its_figures_and_the_picture_are_made(seeds: tuple[int, ...
     page = path_data_page.page(found, targets, "path_data.png")
     values = json.loads(json.dumps(path_data_page.document(found, targets), allow_nan=False))
 
-    assert [row["samples"] for row in values["arms"]] == [100, 200, 400, 100, 200, 400, 800, 1600]
+    assert [row["samples"] for row in values["arms"]] == [50, 100, 200, 50, 100, 200, 400, 800]
     assert all(np.shape(row[metric]) == (len(seeds), VIEWS) for row in values["arms"] for metric in METRICS.values())
     assert values["factors"]["shown"]["value"] == pytest.approx(2.5, rel=0.2)
     assert values["noise"]["linear"]["ratio"]["value"] == pytest.approx(4, rel=0.1)
@@ -252,5 +252,5 @@ def test_targets_of_both_kinds_are_of_one_view(roots: dict[str, tuple[Path, str]
     made = {kind: Rendered(root, 4, 0.8, 0) for kind, (root, _) in roots.items()}
     references = References.of(Store(made["bdpt"].root), spec, 16, HELD_OUT)
     found = path_data.targets(made, spec, references)
-    assert found.bdpt.shape == found.path.shape == (SAMPLES + SAMPLES // 5 + 8, 2, 8, 8, 3)
+    assert found.bdpt.shape == found.path.shape == (SAMPLES + SAMPLES // 2 + 8, 2, 8, 8, 3)
     assert [found.units[place] for place in found.held_out] == list(references.units)

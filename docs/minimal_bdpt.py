@@ -56,7 +56,7 @@ class Vertex:
 def walk(
     scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, throughput: mi.Color3f, valid: mi.Bool, count: int
 ) -> list[Vertex]:
-    """At most `count` vertices along a ray that goes on by sampling each BSDF."""
+    """Trace at most `count` vertices along a ray that goes on by sampling each BSDF."""
     vertices = []
     for _ in range(count):
         si = scene.ray_intersect(ray, valid)
@@ -70,7 +70,7 @@ def walk(
 
 
 def light_walk(scene: mi.Scene, sampler: mi.Sampler, count: int) -> list[Vertex]:
-    """At most `count` vertices, the first on a light: lights alike, points by area, directions by the cosine."""
+    """Trace at most `count` vertices, the first on a light: lights alike, points by area, directions by the cosine."""
     index = mi.UInt32(sampler.next_1d() * len(scene.emitters()))
     shape = dr.gather(mi.ShapePtr, mi.ShapePtr([light.get_shape() for light in scene.emitters()]), index)
     position = shape.sample_position(0, sampler.next_2d())

@@ -30,7 +30,7 @@ class Need:
 
     @classmethod
     def of(cls, experiment: Experiment, costs: SampleCosts) -> Self:
-        """By the costs of the experiment's scene."""
+        """Estimate from the costs of the experiment's scene."""
         size, spec = experiment.size, experiment.spec()
         spp = 2 * spec.transport.half_spp
         samples = size.modifications * size.views

@@ -26,7 +26,7 @@ class Room:
 
     @classmethod
     def read(cls, experiment: Experiment, file: Path, commit: str) -> Self:
-        """From its report.json, found at a commit; raises IncompleteError for one of an earlier version."""
+        """Read a room from its report.json, made at a commit. Raises IncompleteError for one of an earlier version."""
         report = json.loads(file.read_text(encoding="utf-8"))
         if "machine" not in report:
             raise IncompleteError(
@@ -41,7 +41,7 @@ class Room:
 
     @classmethod
     def kept(cls, experiment: Experiment, document: dict[str, Any], file: Path) -> Self:
-        """From what a tables.json has kept; raises IncompleteError for what an earlier version kept."""
+        """Read a room from what a tables.json has kept. Raises IncompleteError for what an earlier version kept."""
         runs = document.get("runs", {}).values()
         if not {"size", "machine", "commit"} <= document.keys() or not all("settings" in run for run in runs):
             raise IncompleteError(
@@ -52,7 +52,7 @@ class Room:
 
     @classmethod
     def of(cls, experiment: Experiment, report: Mapping[str, Any], commit: str) -> Self:
-        """With what is kept of a report, and the commit that it is of."""
+        """A room with what is kept of a report, and the report's commit."""
         evaluation = report["evaluation"]
         of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
         of_run = ("architecture", "parameters", "steps", "trained_on", "seconds")
@@ -77,7 +77,7 @@ class Room:
 
     @property
     def name(self) -> str:
-        """Of the experiment."""
+        """The name of the experiment."""
         return self.experiment.name
 
     @property

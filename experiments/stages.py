@@ -84,7 +84,7 @@ class Stages:
                 file.unlink()  # of an earlier spec, or of more views than are asked for now
 
     def _references(self) -> list[Path]:
-        """Where they lie: of the first held-out views, in the order of the store, as `views=first:N` counts them."""
+        """The files of references of the first held-out views, in the order that `views=first:N` counts them."""
         size = self.experiment.size
         reader = SceneReader(self.folder / "store", self._scene_id)
         rows = {reader.view_row(row): row for row in reversed(reader.refresh().tolist())}

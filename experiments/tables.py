@@ -127,7 +127,7 @@ def _ours(rooms: Sequence[Room], name: str) -> list[str]:
 
 
 def _mse(rooms: Sequence[Room], name: str) -> str:
-    """Of all seeds."""
+    """The MSE of all seeds."""
     found = [mse for room in rooms if (mse := room.mse(name)) is not None]
     return with_interval(mean(found) if len(found) == len(rooms) else None, 5)
 
@@ -148,7 +148,7 @@ def _theirs(paper: Published | None, unit: Published | None) -> list[str]:
 
 
 def mean(estimates: Sequence[Estimate]) -> Estimate:
-    """Of several rooms, each alike: the mean of their means; each is known as well as its views tell."""
+    """The mean over several rooms of their means, each room alike; each is known as well as its views tell."""
     errors = [each.standard_error for each in estimates if each.standard_error is not None]
     spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
     return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))

@@ -38,7 +38,7 @@ class Account:
     queue_shares: Sequence[float]  # of wall time, job by job
 
     def share(self, *parts: str) -> float:
-        """Of the loop's wall time."""
+        """This part's share of the loop's wall time."""
         return sum(self.wall_s[part] for part in parts) / sum(self.wall_s.values())
 
 
@@ -126,7 +126,7 @@ def planned(store: Path, url: str, count: int, options: argparse.Namespace) -> S
 
 
 def account(folder: Path, options: argparse.Namespace) -> Account:
-    """Of one worker, over `options.jobs` jobs after its first."""
+    """The account of one worker, over `options.jobs` jobs after its first."""
     with EmbeddedRedis(folder / "redis") as redis:
         planned(folder / "store", redis.url, options.jobs + 1, options)
         context = multiprocessing.get_context("spawn")  # Dr.Jit does not outlive a fork

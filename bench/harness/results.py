@@ -88,5 +88,5 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def median_and_mean(values: Sequence[float], digits: int = 1) -> str:
-    """As "median (mean)"."""
+    """Two figures as "median (mean)"."""
     return f"{statistics.median(values):.{digits}f} ({statistics.fmean(values):.{digits}f})"

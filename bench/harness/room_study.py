@@ -154,7 +154,7 @@ class ChosenSamples(StoreSource):
         return np.empty(0, np.int64)
 
     def planned(self) -> int:
-        """As many as were chosen."""
+        """The number of samples that were chosen, and the one that is held out."""
         return len(self.rows) + 1
 
 
@@ -227,7 +227,7 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """Where it is trained."""
+        """The folder that it is trained in."""
         digest = hashlib.sha256(f"{self.settings.model_dump_json()} {code()}".encode()).hexdigest()[:8]
         return self.within / f"{self.name}-{self.settings.seed}-{digest}"
 

@@ -137,7 +137,7 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
 
 
 def _bytes_per_row(path: Path, rows: list[Mapping[str, Any]], arrays: Mapping[str, ArraySchema]) -> float:
-    """Of shards with these rows, one shard for each array."""
+    """Bytes per row of shards with these rows, one shard for each array."""
     total = 0
     for name in rows[0]:
         writer = ShardWriter(path.with_suffix(f".{name}"), arrays[name], len(rows))

@@ -233,7 +233,7 @@ def renamed(scene: Any, done: int, job: int) -> dict[str, int]:
 
 
 def zarr_runs(options: argparse.Namespace) -> int:
-    """It is slow, and a hundredth shows in few runs."""
+    """The number of runs through zarr-python, which is slow: a fifth of the others."""
     return int(max(1, options.repetitions // 5))
 
 

@@ -47,7 +47,7 @@ SHARES = (
 
 
 class Arm(ChosenSamples):
-    """So many configurations of a store, each with what a share gives it, as samples to train on.
+    """The training samples of one share: some configurations of a store, each with what the share gives it.
 
     A sample's halves are means of the halves of `spp` / 2 passes of its view. An arm of a slice holds every `slices`-th
     configuration that has enough, so that arms of two slices share none, and arms with fewer configurations hold some
@@ -57,7 +57,7 @@ class Arm(ChosenSamples):
     def __init__(
         self, root: Path, scene_id: str, share: Share, configurations: int, slice_: tuple[int, int] = (0, 1)
     ) -> None:
-        """Of a slice, its number and how many there are; raises ValueError where the store has too few."""
+        """Choose from a slice, which is its number and how many there are. Raises ValueError where the store has too few."""
         super().__init__(root, scene_id, HELD_OUT)
         reader = SceneReader(root, scene_id)
         reader.refresh()

@@ -133,7 +133,7 @@ def measured_room(number: int, plan: Planned, told: argparse.Namespace) -> Room:
 
 
 def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
-    """Of one share of the budget, one from each seed."""
+    """The runs of one share of the budget, one from each seed."""
     found = []
     for number, seed in enumerate(told.seeds):
         slice_ = number, len(told.seeds)

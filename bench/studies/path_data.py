@@ -84,7 +84,7 @@ def arms(told: argparse.Namespace) -> list[Arm]:
 
 
 def runs(arm: Arm, made: Rendered, where: tuple[Path, str], told: argparse.Namespace) -> list[Run]:
-    """Of one arm, one from each seed; `where` is the folder and the scene's id."""
+    """The runs of one arm, one from each seed; `where` is the folder and the scene's id."""
     folder, scene_id = where
     source = partial(FirstSamples, made.root, scene_id, arm.samples)
     name = f"{arm.kind}-{made.half_spp}-spp-{arm.samples}"

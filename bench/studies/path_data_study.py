@@ -91,7 +91,7 @@ class Study:
         return seed_spread([getattr(one, metric) for one in self.measured if one.arm.share >= least])
 
     def factor(self, metric: str, least: float = 0.0) -> tuple[Found, list[float]]:
-        """By what `path` must grow for the error of `bdpt` at budget 1: of all seeds, and of each.
+        """The factor by which `path` must grow for the error of `bdpt` at budget 1: of all seeds, and of each.
 
         The interval is by `spread` of these arms.
         """

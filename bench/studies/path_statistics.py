@@ -53,7 +53,7 @@ def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float], spr
 
 
 def factors_of_seeds(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> list[float]:
-    """That budget for each seed alone."""
+    """The budget that `factor` finds, for each seed alone."""
     means = np.stack([one.of_seeds() for one in (wanted, *arms)])
     return [crossing(budgets, of_seed[1:], of_seed[0]) for of_seed in means.T]
 

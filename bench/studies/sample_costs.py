@@ -36,7 +36,7 @@ class Room:
         return CostModel.of(self.costs, static=not self.spec.groups)
 
     def more_than_best(self, spp: int, budget: float) -> float:
-        """By what factor the excess error is more where the budget is spent on single views of so many samples."""
+        """The factor by which the excess error grows where the budget is spent on single views of so many samples."""
         single = Allocation(1, 1, 1, spp)
         spent = self.terms.excess(single) / (budget / self.terms.seconds(single))
         return spent / self.terms.excess(self.terms.best(budget))

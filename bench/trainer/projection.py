@@ -52,7 +52,7 @@ class Found:
         self.counts["moved"] += Counts.of(viewed.truth & moved, kept["exact"] & moved)
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """The page's figures as JSON."""
         shares = {name: asdict(c) | {"recall": c.recall, "leak": c.leak} for name, c in self.counts.items()}
         return asdict(self) | {"counts": shares}
 
@@ -74,7 +74,7 @@ def met(counts: Counts) -> bool:
 
 
 def verdict(rooms: Iterable[Found]) -> str:
-    """By which rules the target is met, and in how many of its rooms."""
+    """The rules that meet the target, and in how many rooms each does."""
     of = [found for found in rooms if found.scene in TARGET_ROOMS]
     if not of:
         return "None of the target's rooms was measured."

@@ -328,7 +328,7 @@ def main() -> int:
 
 
 def document(of: Preset) -> dict[str, Any]:
-    """As JSON."""
+    """The page's figures as JSON."""
     rows = [asdict(row) for row in of.rows]
     return {"preset": of.name, "size": of.size, "batch": of.settings.batch, "rows": rows, "reading": asdict(of.reading)}
 

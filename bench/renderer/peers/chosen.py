@@ -24,7 +24,7 @@ class Chosen:
     why: str
 
     def parameters(self) -> dict[str, Any]:
-        """As the plugin takes them."""
+        """The settings as the plugin takes them."""
         return {"connections": self.connections, "light_ratio": self.light_ratio}
 
 

@@ -59,7 +59,7 @@ class LuxCoreMethod:
         )  # fmt: skip
 
     def render(self, seed: int, spp: int) -> Shot:
-        """As `Method`. Raises RuntimeError, with the end of its log, if LuxCore fails or answers too late."""
+        """Render as `Method` says. Raises RuntimeError, with the end of its log, if LuxCore fails or answers too late."""
         path = Path(self._folder.name) / "image.npy"
         assert self._child.stdin is not None
         try:
@@ -71,7 +71,7 @@ class LuxCoreMethod:
         return Shot(np.load(path), cost["wall_s"], cost["cpu_s"])
 
     def possible(self, spp: float) -> int:
-        """As `Method`."""
+        """The nearest possible samples per pixel."""
         return max(1, round(spp))
 
     def _answer(self) -> str:

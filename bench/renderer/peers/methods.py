@@ -46,7 +46,7 @@ class MitsubaMethod:
     stratified_camera: Any = None  # of `multijittered`, where its points are wanted instead of the scene's own sampler
 
     def render(self, seed: int, spp: int) -> Shot:
-        """As `Method`."""
+        """One image, as `Method` says."""
         import mitsuba as mi
 
         cpu, wall = time.process_time(), time.perf_counter()
@@ -56,7 +56,7 @@ class MitsubaMethod:
         return Shot(np.ascontiguousarray(image[..., :3], np.float32), wall, cpu)
 
     def possible(self, spp: float) -> int:
-        """As `Method`; powers of four for `multijitter`.
+        """The nearest possible samples per pixel; powers of four for `multijitter`.
 
         It takes counts that fill a grid, and rounds others up. A sample of other grids costs up to 40 % more (measured
         in Cornell's box, 10 % in the kitchen): its permutations then divide by what is no power of two.

@@ -1,4 +1,4 @@
-"""From images and times to the figures of the table and of the plots."""
+"""The figures of the table and of the plots, made from images and times."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class Account:
     queue_shares: Sequence[float]  # of wall time, job by job
 
     def share(self, *parts: str) -> float:
-        """This part's share of the loop's wall time."""
+        """A part's share of the loop's wall time."""
         return sum(self.wall_s[part] for part in parts) / sum(self.wall_s.values())
 
 

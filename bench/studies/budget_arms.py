@@ -57,7 +57,7 @@ class Arm(ChosenSamples):
     def __init__(
         self, root: Path, scene_id: str, share: Share, configurations: int, slice_: tuple[int, int] = (0, 1)
     ) -> None:
-        """Choose from a slice, which is its number and how many there are. Raises ValueError where the store has too few."""
+        """Choose from a slice: its number, and how many there are. Raises ValueError where the store has too few."""
         super().__init__(root, scene_id, HELD_OUT)
         reader = SceneReader(root, scene_id)
         reader.refresh()

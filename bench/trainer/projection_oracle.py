@@ -65,7 +65,7 @@ def first_met(corners: F64, camera: Camera, spec: SceneSpec, position: F32) -> F
 
 
 def _first(corners: F64, ends: F64, near: F64) -> F64:
-    """`first_met` in camera coordinates. The lines are split in halves, so that each meets few triangles off its way."""
+    """`first_met` in camera coordinates. Lines are split in halves, so that each meets few triangles off its way."""
     found = np.full(len(ends), np.inf)
     if not len(ends):
         return found

@@ -59,7 +59,7 @@ class LuxCoreMethod:
         )  # fmt: skip
 
     def render(self, seed: int, spp: int) -> Shot:
-        """Render as `Method` says. Raises RuntimeError, with the end of its log, if LuxCore fails or answers too late."""
+        """One image. Raises RuntimeError, with the end of its log, if LuxCore fails or answers too late."""
         path = Path(self._folder.name) / "image.npy"
         assert self._child.stdin is not None
         try:

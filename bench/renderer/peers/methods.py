@@ -46,7 +46,7 @@ class MitsubaMethod:
     stratified_camera: Any = None  # of `multijittered`, where its points are wanted instead of the scene's own sampler
 
     def render(self, seed: int, spp: int) -> Shot:
-        """One image, as `Method` says."""
+        """One image."""
         import mitsuba as mi
 
         cpu, wall = time.process_time(), time.perf_counter()

@@ -24,9 +24,9 @@ from photonfarm.trainer.runs import distributed as processes
 from photonfarm.trainer.runs.distributed import Ranks, leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
-from photonfarm.trainer.training.assist import assist
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.loop import Hooks, train
+from photonfarm.trainer.training.other_ranks import assist
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 

@@ -25,8 +25,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, read_selection
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
-from photonfarm.renderer.bdpt.selection import LightIndex, Selection, read_selection
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
 """The kinds of light. EYE_ONLY: no light paths start there; HIT_ONLY: eye paths hit it by chance alone, weight 1."""

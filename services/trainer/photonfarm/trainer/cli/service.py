@@ -52,8 +52,8 @@ def run(
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
     from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
-    from photonfarm.trainer.training.assist import assist
     from photonfarm.trainer.training.loop import stop_on_signals
+    from photonfarm.trainer.training.other_ranks import assist
 
     settings = settings_of(preset_name, changes)
     with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
@@ -161,7 +161,7 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
     store without the scene, and in one of several processes.
     """
     from photonfarm.trainer.data.store_source import StoreSource
-    from photonfarm.trainer.grid import AXES, STEPS, run_grid, table
+    from photonfarm.trainer.grid_search import AXES, STEPS, run_grid, table
     from photonfarm.trainer.runs.distributed import processes
     from photonfarm.trainer.training.loop import stop_on_signals
 

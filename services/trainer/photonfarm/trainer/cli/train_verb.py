@@ -10,8 +10,8 @@ from typing import Any, get_args
 import click
 
 from photonfarm.shared.cli.options import redis_option, store_option
-from photonfarm.trainer.runs.own import is_own
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
+from photonfarm.trainer.runs.user_code import is_own
 
 run_option = click.option(
     "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",

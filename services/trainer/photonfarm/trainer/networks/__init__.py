@@ -19,7 +19,7 @@ from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs import own
+from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 
@@ -59,7 +59,7 @@ def kind_of(architecture: str) -> NetworkKind:
     """
     if architecture in ARCHITECTURES:
         return ARCHITECTURES[architecture]
-    make = own.load("architecture", architecture)
+    make = user_code.load("architecture", architecture)
     if not (isinstance(make, type) and issubclass(make, nn.Module)):
         raise SpecError(f"architecture = {architecture!r}: is {make!r}; a subclass of torch.nn.Module is required")
     return NetworkKind(make, getattr(make, "needs", Needs(points=False)))

@@ -16,8 +16,8 @@ from photonfarm.trainer.predict.evaluation import DevicePredictor, network_predi
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.runs.run_settings import read_settings
 from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.runs.stored_settings import read_settings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

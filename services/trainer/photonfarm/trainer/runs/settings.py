@@ -15,7 +15,7 @@ from pydantic_core import PydanticCustomError
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.runs import biased
-from photonfarm.trainer.runs.own import is_own
+from photonfarm.trainer.runs.user_code import is_own
 
 Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
 Architecture = Literal[

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.runs import own
+from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.training.unbiasedness import Verdict, judged
 
 RELATIVE_EPSILON = 0.05
@@ -76,7 +76,7 @@ def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | No
     """
     if name in LOSSES:
         return LOSSES[name], None
-    loss = own.load("loss", name)
+    loss = user_code.load("loss", name)
     verdict = judged(loss)
     if not verdict.is_unbiased:
         raise SpecError(f"loss = {name!r}: is refused, as it biases under noisy targets: {verdict}")

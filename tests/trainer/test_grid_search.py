@@ -14,10 +14,10 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.plan.request import Request
-from photonfarm.trainer import grid
+from photonfarm.trainer import grid_search
 from photonfarm.trainer.cli import service
 from photonfarm.trainer.data.dataset import rows_held_out
-from photonfarm.trainer.grid import Cell, run_grid, table
+from photonfarm.trainer.grid_search import Cell, run_grid, table
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -102,7 +102,7 @@ def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -
             raise DivergedError("the loss is inf")
         return train(source, settings, folder, hooks)
 
-    monkeypatch.setattr(grid, "train", diverge)
+    monkeypatch.setattr(grid_search, "train", diverge)
     cells = run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)})
     assert [cell.error is None for cell in cells] == [True, False]
     assert table(cells).splitlines()[-1] == "| 0.0001 |  | diverged |  |"
@@ -148,7 +148,7 @@ def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, t
     def halves(order: list[int]) -> tuple[set[float], set[float]]:
         errors = np.array([rows[i] // 2 for i in order], float)  # the number of its configuration stands for an error
         found = HeldOutErrors(Estimate.of(errors), 0.0, errors, errors, tuple(units[i] for i in order))
-        first, second = grid._halves(found)
+        first, second = grid_search._halves(found)
         assert len(first) == len(set(units)) // 2
         assert len(first) + len(second) == len(set(units))
         return set(first), set(second)

@@ -149,6 +149,11 @@ class ChosenSamples(StoreSource):
         self._told = True
         return np.array(new, np.int64)
 
+    def follow_guides(self) -> None:
+        """As `StoreSource` does; then looks once more, as samples are complete only with their guides from now on."""
+        super().follow_guides()
+        super().refresh()
+
     def taken_back(self) -> NDArray[np.int64]:
         """None is."""
         return np.empty(0, np.int64)

@@ -122,6 +122,23 @@ def test_positions_come_with_sines_and_cosines_of_each_octave(make_source) -> No
     torch.testing.assert_close(network(source, octaves=0).coordinates(made.centre + made.scale * x), x)
 
 
+def test_the_logarithm_of_emission_lets_a_lamp_stand_out_beside_a_window(make_source) -> None:
+    source = make_source(1)
+    geometry, cloud = source.base()
+    emission = np.zeros_like(cloud.emission)
+    emission[0], emission[1] = 100.0, 1.0  # window, lamp
+    cloud = replace(cloud, emission=emission)
+
+    def lamp_over_window(kind: str) -> float:
+        chosen = NetworkSettings(width=4, emission=kind)
+        shown = SceneFrame.of(source.spec, geometry, cloud, chosen).appearance[:, 6:]
+        assert np.sqrt(np.mean(shown**2)) == pytest.approx(1)
+        return float(shown[1, 0] / shown[0, 0])
+
+    assert lamp_over_window("linear") == pytest.approx(0.01)
+    assert lamp_over_window("log") > 0.02
+
+
 def test_relative_maxima_are_zero_in_the_base_configuration_and_not_elsewhere(make_source) -> None:
     source = make_source(2)
     made, points = network(source, maxima="relative"), batch_of(source, (0, 1)).inputs.points

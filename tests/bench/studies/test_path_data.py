@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from analytic_scene import small_spec
 from numpy.typing import NDArray
+from store_samples import commit_guides
 
 from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors, replicates, seed_spread
@@ -212,6 +213,9 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str
         pool = Pool(images, [buffers], [Visibility(np.ones(16, np.bool_), np.ones(8, np.bool_))], [photons])
         for job in scene.missing_jobs():
             commit(scene, job, pool)
+        scene.guides.want(spec.guides)
+        for job in scene.missing_jobs():
+            commit_guides(scene, job)
         found[kind] = Path(store.root), spec.scene_id
     return found
 
@@ -240,6 +244,14 @@ def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]])
     *trained_on, looked_at = source.refresh().tolist()
     assert trained_on == source.rows
     assert are_held_out(source.modification_keys([looked_at]), HELD_OUT) == [True]
+
+
+def test_networks_with_guides_can_be_trained_on_chosen_samples(roots: dict[str, tuple[Path, str]]) -> None:
+    source = FirstSamples(*roots["path"], SAMPLES)
+    source.follow_guides()
+    rows = source.refresh().tolist()
+    assert all(sample.guides is not None for sample in source.read_batch(rows[:2]))
+    assert sum(are_held_out(source.modification_keys(rows), HELD_OUT)) == 1
 
 
 def test_more_samples_than_there_are_is_refused(roots: dict[str, tuple[Path, str]]) -> None:

@@ -22,7 +22,8 @@ class SceneFrame:
 
     Positions are taken about the centre of the geometry's bounding box and, like depths, divided by half its diagonal.
     Emission is divided by its root mean square over the cloud: lamps, few points among many, stand out so far that
-    maxima over the points encode their places before any step. Normals, rays and albedo are near 1 anyway.
+    maxima over the points encode their places before any step. With `emission = log` that is done once more with
+    log(1 + emission): lamps and far brighter windows then stand out alike. Normals, rays and albedo are near 1 anyway.
     """
 
     optics: Optics
@@ -47,7 +48,9 @@ class SceneFrame:
         """
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)
-        emission = cloud.emission[used] / max(float(np.sqrt(np.mean(cloud.emission[used] ** 2))), 1e-30)
+        emission = _normalised(cloud.emission[used])
+        if settings.emission == "log":
+            emission = _normalised(np.log1p(emission))
         appearance = np.concatenate([cloud.normal[used], cloud.albedo[used], emission], axis=1)
         scale = max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
         return cls(
@@ -63,3 +66,8 @@ class SceneFrame:
             area=float(geometry.areas().sum()),
             photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
         )
+
+
+def _normalised(emission: F32) -> F32:
+    """Emission (P, 3) over its root mean square."""
+    return np.asarray(emission / max(float(np.sqrt(np.mean(emission**2))), 1e-30), np.float32)

@@ -25,6 +25,7 @@ Architecture = Literal[
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
+Emission = Literal["linear", "log"]
 PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
@@ -69,6 +70,8 @@ class NetworkSettings(_Frozen):
     octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
     maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
     # with which it takes fewer steps to learn what lights do
+    emission: Emission = "linear"  # of the points, over its root mean square; "log" (ours): its logarithm, so that
+    # bright windows do not hide lamps from the maxima
     photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
     # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
@@ -181,7 +184,9 @@ def small(**changes: object) -> TrainSettings:
     relative, as so short a run learns little of lights from absolute ones.
     """
     described: dict[str, object] = {
-        "network": NetworkSettings(architecture="guided_transport", width=16, points=4096, maxima="relative"),
+        "network": NetworkSettings(
+            architecture="guided_transport", width=16, points=4096, maxima="relative", emission="log"
+        ),
         "loss": "relative",
         "batch": 2,
         "learning_rate": 1e-3,

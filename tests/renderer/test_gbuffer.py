@@ -101,6 +101,14 @@ def test_a_two_sided_surface_shows_its_back_and_the_normal_as_modelled() -> None
     np.testing.assert_array_equal(centre(back.normal), (0, 0, 1))
 
 
+@pytest.mark.parametrize("bsdf", [DIFFUSE, {"type": "plastic"}], ids=lambda bsdf: bsdf["type"])
+def test_the_back_of_a_one_sided_surface_is_black(bsdf: dict[str, Any]) -> None:
+    front, back = of(bsdf), of(bsdf, BEHIND)
+    assert centre(front.albedo).all()
+    assert not back.albedo.any()
+    assert centre(back.depth) == pytest.approx(3, abs=1e-5)
+
+
 def test_a_ray_that_hits_nothing_gives_zeros() -> None:
     buffers = of(DIFFUSE, View(np.array([0, 0, 3], np.float32), np.array([0, 0, 9], np.float32)))
     for image in (buffers.depth, buffers.albedo, buffers.normal):

@@ -10,7 +10,8 @@ BSDF at normal exitance, highlights and all (25 for a rough conductor); so it is
 a diffuse reflection. It is exact for diffuse, plastic and roughplastic, and for twosided, bumpmap, normalmap and mask
 around them; for principled it is the base colour, whatever metallic and spec_trans are; blendbsdf blends, and a rough
 conductor in a blend adds its highlight. A texture is looked up without filtering. Two-sided materials return the
-reflectance of the visible side; a one-sided one returns its reflectance from behind too, where it renders black.
+reflectance of the visible side. From behind a one-sided one has albedo 0, as it renders black there; principled and
+mask, which let light through to their backs, have the albedo of their fronts.
 
 **Normals** are interpolated shading normals in world coordinates, of unit length, as modelled: the back of a surface,
 two-sided or not, has the normal of its front. Bump and normal maps are part of the BSDF and not of the normals.
@@ -87,7 +88,7 @@ def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What
     """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
-    found: tuple[Any, ...] = (dr.select(hit, diffuse_reflectance(si, hit), 0),)
+    found: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
     if what == "centre":
         found = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
     dr.eval(found)
@@ -106,6 +107,16 @@ def _rays(camera: Camera, directions: F32, spec: SceneSpec) -> Rays:
     along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis
     near, far = spec.view.near / along, spec.view.far / along
     return points(camera.origin + flat * near[:, None]), mi.Vector3f(points(flat)), floats(far - near)
+
+
+def seen_reflectance(si: Any, active: Any) -> Any:
+    """Diffuse reflectance (Color3f) on the side that rays come from; 0 where the BSDF has no diffuse reflection."""
+    return diffuse_reflectance(si, active & reflects_here(si))
+
+
+def reflects_here(si: Any) -> Any:
+    """Whether rays come from the front of a surface, or its BSDF does something on its back too (Bool)."""
+    return (mi.Frame3f.cos_theta(si.wi) > 0) | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.BackSide)
 
 
 def diffuse_reflectance(si: Any, active: Any) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
-from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, PatternSampler, pattern_of, shifted
 from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.materials import has_other_lobes
@@ -119,9 +119,7 @@ def lit(
         return nothing
     flags = si.bsdf().flags()
     reached = seen.met & (seen.followed + 2 <= settings.max_depth)
-    two_sided = mi.has_flag(flags, mi.BSDFFlags.BackSide)
-    diffuse = reached & (two_sided | (mi.Frame3f.cos_theta(si.wi) > 0))
-    diffuse &= mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
+    diffuse = reached & reflects_here(si) & mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
     other = reached & has_other_lobes(flags) & settings.glossy
     at = _Surface(scene, lights, si, turned(si.sh_frame.n, seen.direction), seen.direction, diffuse, other, settings)
     return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)

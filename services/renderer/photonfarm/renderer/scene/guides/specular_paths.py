@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
-from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
+from photonfarm.renderer.scene.gbuffer import seen_reflectance
 from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned
 from photonfarm.renderer.scene.guides.settings import GuideSettings
 from photonfarm.renderer.scene.guides.specular import specular_of
@@ -33,7 +33,7 @@ def trace(
     number = dr.reinterpret_array(mi.UInt32, bsdf)
     path, last = _followed(scene, ray, first, before, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
-    albedo = diffuse_reflectance(last, met)
+    albedo = seen_reflectance(last, met)
     arrives = lit(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
     found = {
         "hits": dr.select(hit, mi.Float(1), 0),

@@ -96,7 +96,8 @@ class TrainSettings(_Frozen):
     network: NetworkSettings = NetworkSettings()
     seed: Annotated[int, Field(ge=0, lt=1 << 32)] = 0
 
-    loss: LossName = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all are unbiased; or
+    loss: LossName = "linear"  # [S 3.2]; "relative" and "paired" are ours, for lamps in view; all have the
+    # clean image as their minimum, and the first two the gradients of clean targets too [S Lemma 1]; or
     # MODULE:NAME, a function of your own, which is refused if it is found to bias
     batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
     learning_rate: Positive = 5e-4  # [S 3.1]

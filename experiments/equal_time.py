@@ -7,8 +7,10 @@ the same denoiser, given more or fewer pixels: between two of it the error is ta
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +18,22 @@ from numpy.typing import NDArray
 from experiments.rooms import Room
 from photonfarm.trainer.compare.markdown import markdown_table
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 F64 = NDArray[np.float64]
 
 OURS = ("guided_transport", "guided_transport_photons")
 NETWORKS = ("cnn", "feature_projection", "light_transport", "light_transport_photons", "guided", *OURS)
 FAMILIES = {"denoise_": "denoisers trained on the room", "oidn ": "OIDN"}
 """How the names of a family's rows begin, and what it is called."""
+
+BESIDE = {
+    "denoise_": (5, 2, "left"), "denoise_32": (0, 6, "center"), "denoise_64": (-6, -3, "right"),
+    "oidn ": (-6, -5, "right"),
+}  # fmt: skip
+"""Where a denoiser's k stands beside its point, in points, and how it is aligned: of each family, and of those of it
+that lie close together."""
 
 COLUMNS = 2
 GREY = "#777777"  # of denoisers; no network has it
@@ -37,6 +49,11 @@ class Placed:
     errors: F64  # (views,) MSE of each image, the mean of all seeds
 
     @property
+    def kept(self) -> str:
+        """A denoiser's k: it is given 1/k of the pixels."""
+        return re.findall(r"\d+", self.name)[-1]
+
+    @property
     def mse(self) -> float:
         """Over all views."""
         return float(self.errors.mean())
@@ -49,6 +66,7 @@ class AtTime:
     first: Placed
     second: Placed
     share: float
+    beyond: bool = False  # of one alone, which takes less time; so that the family could reach less in that time
 
     def of(self, first: F64, second: F64) -> F64:
         """The error from those of both."""
@@ -77,7 +95,7 @@ def at(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
     if not in_time:
         return None
     best = min(in_time, key=lambda each: each.mse)
-    found = AtTime(best, best, 0.0)
+    found = AtTime(best, best, 0.0, beyond=best.milliseconds < milliseconds)
     if len(in_time) < len(members):
         last, after = in_time[-1], members[len(in_time)]
         share = np.log(milliseconds / last.milliseconds) / np.log(after.milliseconds / last.milliseconds)
@@ -115,7 +133,7 @@ def _against(ours: Placed, members: Sequence[Placed]) -> str:
     if theirs is None:
         return f"all take longer, from {members[0].milliseconds:.0f} ms" if members else "n/a"
     share, low, high = ratio(ours, theirs)
-    return f"{share:.2f} ({low:.2f} … {high:.2f})"
+    return f"{'≥ ' if theirs.beyond else ''}{share:.2f} ({low:.2f} … {high:.2f})"
 
 
 def picture(rooms: Sequence[Room]) -> bytes:
@@ -124,31 +142,41 @@ def picture(rooms: Sequence[Room]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from photonfarm.trainer.report.plots import COLOURS, STYLE
+    from photonfarm.trainer.report.plots import STYLE
 
     rows = -(-len(rooms) // COLUMNS)
-    colours = [colour for colour in COLOURS if colour != GREY]
     with mpl.rc_context(STYLE):
-        figure = Figure((8.4, 2.9 * rows + 0.9), dpi=110, layout="constrained")
+        figure = Figure((8.4, 3.1 * rows + 0.9), dpi=110, layout="constrained")
         FigureCanvasAgg(figure)
-        grid = figure.subplots(rows, COLUMNS, squeeze=False).flat
-        for axes, room in zip(grid, rooms, strict=False):
-            for begins, marker, line in zip(FAMILIES, "os", ("-", "--"), strict=True):
-                members = family(room, begins)
-                places = [each.milliseconds for each in members], [each.mse for each in members]
-                axes.plot(*places, marker=marker, linestyle=line, color=GREY, label=FAMILIES[begins])
-            for each in placed(room, NETWORKS):
-                colour = colours[NETWORKS.index(each.name)]
-                axes.plot(each.milliseconds, each.mse, "D", color=colour, label=each.name)
-            axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")
-        for axes in [*grid][len(rooms) :]:
+        panels = [*figure.subplots(rows, COLUMNS, squeeze=False).flat]
+        for axes, room in zip(panels, rooms, strict=False):
+            _draw(axes, room)
+        for axes in panels[len(rooms) :]:
             axes.set_axis_off()
         handles = {
-            label: handle
-            for axes in figure.axes
-            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+            label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
         }
         figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=3)
         stream = io.BytesIO()
         figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
+
+
+def _draw(axes: Axes, room: Room) -> None:
+    """Draw a room's plot: families as lines with each denoiser's k, and networks."""
+    from photonfarm.trainer.report.plots import COLOURS
+
+    colours = [colour for colour in COLOURS if colour != GREY]
+    for begins, marker, line in zip(FAMILIES, "os", ("-", "--"), strict=True):
+        members = family(room, begins)
+        places = [each.milliseconds for each in members], [each.mse for each in members]
+        axes.plot(*places, marker=marker, linestyle=line, color=GREY, label=FAMILIES[begins])
+        for each in members:
+            x, y, side = BESIDE.get(each.name, BESIDE[begins])
+            place = each.milliseconds, each.mse
+            axes.annotate(each.kept, place, (x, y), textcoords="offset points", ha=side, fontsize=7.5, color=GREY)
+    for each in placed(room, NETWORKS):
+        axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
+    axes.margins(0.09, 0.1)
+    title = room.document["title"].replace(": ", ":\n")
+    axes.set(title=title, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")

@@ -6,13 +6,15 @@
 Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: what was trained on,
 prediction, reference and difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
 of a frame [S Figs. 5, 6]; NAME-predictions.png, predictions of several networks above their errors [S Fig. 7]; and
-NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not run.
+NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not run or whose
+report is an earlier version's.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -29,42 +31,54 @@ from photonfarm.shared.core.pictures import Picture
 from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
 from photonfarm.trainer.predict.animation import read_png, write_png
 from photonfarm.trainer.report.pictures import OVERVIEW, coloured
+from photonfarm.trainer.report.worst_cases import caption as worst_view
 
 ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room-2",
          "fixed-veach-ajar"]  # fmt: skip
 METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
-COMPARED = ("denoise_1", "denoise_16", "oidn 1/1", "cnn", "feature_projection", "light_transport",
-            "light_transport_photons", "guided_transport", "guided_transport_photons")  # fmt: skip
+COMPARED = ("oidn 1/1", "light_transport_photons", "guided", "guided_transport", "guided_transport_photons",
+            "denoise_1")  # fmt: skip
+"""Beside the reference: the best denoiser, the best of the published networks, ours, and a denoiser of the room."""
+
 BEFORE, AFTER = "light_transport_photons", "guided_transport"
-VIEWS = 3
-SIZE = 192  # px of a tile
+VIEWS = 3  # at most, of the first ones
+SIZE = 256  # px of a tile
+TEXT, TEXT_LINE = 24, 30  # px of letters, and from one line of text to the next
 REFERENCE = "reference"
 
 
 class Report:
-    """The pictures of a report: a tile (H, W, 3) for each view that it shows and each predictor."""
+    """The pictures of a report: a tile (H, W, 3) for each predictor and each view that it shows, by the view's row."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises IncompleteError where there is no report."""
+        """Raises IncompleteError where there is no report, or one that does not say what its pictures are of."""
         self.folder = folder
         if not (folder / "report.json").is_file():
             raise IncompleteError(f"{folder}: holds no report; `make experiments-small` makes it")
         document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        shown = document["evaluation"].get("shown")
+        if shown is None:
+            raise IncompleteError(
+                f"{folder}: an earlier version's report, which does not say of which views its pictures are; delete "
+                f"report.json, and `python experiments/run.py {folder.parent.name}` makes it anew"
+            )
         names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
         sheet = read_png(folder / COMPARISON)
         width = (sheet.shape[1] + GAP) // len(names) - GAP
         step = width + LINE + GAP
-        self.views = sheet.shape[0] // step
-        top = sheet.shape[0] + GAP - self.views * step
+        top = sheet.shape[0] + GAP - len(shown) * step + LINE
         self.tiles = {
-            name: [_tile(sheet, top + view * step + LINE, column * (width + GAP), width) for view in range(self.views)]
+            name: {
+                row: _tile(sheet, top + place * step, column * (width + GAP), width) for place, row in enumerate(shown)
+            }
             for column, name in enumerate(names)
         }
-        worst: dict[int, list[str]] = {}
+        self.first: list[int] = shown[:VIEWS]
+        """Rows of the first views that are held out."""
+        self.worst: dict[int, list[str]] = {}
+        """Rows of the worst views, each with the kinds of pixels that it is the worst of."""
         for case in document["worst_cases"]:
-            worst.setdefault(case["row"], []).append(case["kind"])
-        self.worst = [", ".join(kinds) for kinds in worst.values()]
-        """What each of the last views is the worst of; the views before these are the first that are held out."""
+            self.worst.setdefault(case["row"], []).append(case["kind"])
 
 
 def _tile(sheet: Picture, y: int, x: int, size: int) -> Picture:
@@ -81,42 +95,52 @@ def error(tile: Picture, reference: Picture) -> Picture:
 def predictions(report: Report) -> Picture:
     """A column for the reference and one for each network, with the error below each image."""
     names = [name for name in COMPARED if name in report.tiles]
-    first = min(VIEWS, report.views - len(report.worst))
-    reference = report.tiles[REFERENCE]
     blank = np.full((SIZE, SIZE, 3), 255, np.uint8)
     rows = []
-    for view in range(first):
-        shown = [report.tiles[name][view] for name in names]
-        rows.append([reference[view], *shown])
-        rows.append([blank, *(error(tile, reference[view]) for tile in shown)])
+    for view in report.first:
+        reference, *shown = (report.tiles[name][view] for name in (REFERENCE, *names))
+        rows.append([reference, *shown])
+        rows.append([blank, *(error(tile, reference) for tile in shown)])
     return sheet_of([REFERENCE, *names], rows, [""] * len(rows))
 
 
 def worst_cases(report: Report) -> Picture:
     """The worst views: reference, the published networks' best and ours, each with its error."""
-    first = report.views - len(report.worst)
     rows = []
-    for view in range(first, report.views):
+    for view in report.worst:
         reference, before, after = (report.tiles[name][view] for name in (REFERENCE, BEFORE, AFTER))
         rows.append([reference, before, error(before, reference), after, error(after, reference)])
-    return sheet_of([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, report.worst)
+    captions = [worst_view(kinds) for kinds in report.worst.values()]
+    return sheet_of([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions)
 
 
 def sheet_of(heads: list[str], rows: list[list[Picture]], captions: list[str]) -> Picture:
     """Tiles in rows, a head above each column and a caption above each row that has one."""
-    font = ImageFont.load_default(13)
-    step = [SIZE + GAP + (LINE if caption else 0) for caption in captions]
-    sheet = Image.new("RGB", (len(heads) * (SIZE + GAP) - GAP, LINE + sum(step)), "white")
+    font = ImageFont.load_default(TEXT)
+    wrapped = [_wrapped(head, font) for head in heads]
+    y = max(map(len, wrapped)) * TEXT_LINE + GAP
+    step = [SIZE + GAP + (TEXT_LINE if caption else 0) for caption in captions]
+    sheet = Image.new("RGB", (len(heads) * (SIZE + GAP) - GAP, y + sum(step) - GAP), "white")
     draw = ImageDraw.Draw(sheet)
-    for column, head in enumerate(heads):
-        draw.text((column * (SIZE + GAP), 0), head, fill="black", font=font)
-    y = LINE
+    for column, lines in enumerate(wrapped):
+        text = "\n".join(lines)
+        draw.multiline_text((column * (SIZE + GAP), 0), text, fill="black", font=font, spacing=TEXT_LINE - TEXT)
     for row, caption, height in zip(rows, captions, step, strict=True):
-        draw.text((0, y), caption and f"worst of {caption}", fill="black", font=font)
+        draw.text((0, y), caption, fill="black", font=font)
         for column, tile in enumerate(row):
             sheet.paste(Image.fromarray(tile), (column * (SIZE + GAP), y + height - SIZE - GAP))
         y += height
     return np.asarray(sheet)
+
+
+def _wrapped(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
+    """The lines of a head that are no wider than a tile, broken after underscores and blanks."""
+    lines = [""]
+    for part in re.findall("[^_ ]+[_ ]?", head):
+        if font.getlength(lines[-1] + part) > SIZE:
+            lines.append("")
+        lines[-1] += part
+    return lines
 
 
 def make(name: str, report: Report, out: Path) -> None:

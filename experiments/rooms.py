@@ -26,7 +26,7 @@ class Room:
 
     @classmethod
     def read(cls, experiment: Experiment, file: Path, commit: str) -> Self:
-        """Read a room from its report.json, made at a commit. Raises IncompleteError for one of an earlier version."""
+        """Read a room from its report.json, at a commit. Raises IncompleteError for one of an earlier version."""
         report = json.loads(file.read_text(encoding="utf-8"))
         if "machine" not in report:
             raise IncompleteError(
@@ -52,7 +52,7 @@ class Room:
 
     @classmethod
     def of(cls, experiment: Experiment, report: Mapping[str, Any], commit: str) -> Self:
-        """A room with what is kept of a report, and the report's commit."""
+        """A room with what is kept of a report, and the commit at which that was read."""
         evaluation = report["evaluation"]
         of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
         of_run = ("architecture", "parameters", "steps", "trained_on", "seconds")
@@ -62,6 +62,7 @@ class Room:
             "about": experiment.about.strip(),
             "size": experiment.size.about,
             "commit": commit,
+            "trained_at": report.get("trained_at", {}),
             "machine": report["machine"],
             "dataset": report["dataset"],
             "evaluation": {key: evaluation[key] for key in of_all},
@@ -106,6 +107,11 @@ class Room:
         """What it was timed on."""
         found = self.document["machine"]
         return f"{found['cpu'] or 'a CPU of unknown model'}, {found['cores']} cores, {found['architecture']}"
+
+    def commits(self) -> list[str]:
+        """The commits at which its networks were trained; none where that was not recorded."""
+        found: dict[str, list[str]] = self.document.get("trained_at", {})
+        return list(dict.fromkeys(commit for of_run in found.values() for commit in of_run))
 
     def spent(self, kind: str) -> dict[str, Any]:
         """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from bench.harness import results
 from experiments.experiment import Experiment, Run
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
@@ -25,6 +26,7 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format.markers import COMMITTED
 
 EVALUATION = "evaluation.json"  # what `evaluate` leaves in each run's folder
+COMMITS = "commits.json"  # in each run's folder: at which commits it was trained
 PREVIEW = "preview.html"  # what `up` makes last
 
 REFERENCE = re.compile(r"([0-9a-f]{32})(\.partial)?\.npz")
@@ -152,9 +154,22 @@ class Stages:
     def _train(self, run: Run) -> None:
         pairs = [part for key, value in self._settings(run).items() for part in ("--set", f"{key}={_text(value)}")]
         place = ["--store", self.folder / "store", "--run", self._folder(run), "--preset", run.train["preset"]]
+        self._keep_commit(run)
         self._verb(f"train-{run.name}", ["train", self.folder / "spec.json", *place, *pairs])
         if not self._is_trained(run):  # as one that is asked to stop exits with 0
             raise StageError(f"{self.experiment.name}: train-{run.name} was stopped early; the same command goes on")
+
+    def _keep_commit(self, run: Run) -> None:
+        """Add this checkout's commit to those at which a run was trained: several, if it was interrupted."""
+        if (now := results.commit()) not in (found := self._commits(run)):
+            self._folder(run).mkdir(parents=True, exist_ok=True)
+            (self._folder(run) / COMMITS).write_text(json.dumps([*found, now]) + "\n")
+
+    def _commits(self, run: Run) -> list[str]:
+        """The commits at which a run was trained; none where an earlier version trained it."""
+        file = self._folder(run) / COMMITS
+        found: list[str] = json.loads(file.read_text()) if file.is_file() else []
+        return found
 
     def _folder(self, run: Run) -> Path:
         return self.folder / "runs" / run.name
@@ -175,9 +190,18 @@ class Stages:
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
         denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
+        self._tell_commits(out / "report.json")
         if again := self.experiment.again():
             self._measure("evaluate", again, ["--without-inception"], self._folder(again[0]) / EVALUATION)
         return out
+
+    def _tell_commits(self, report: Path) -> None:
+        """Write into report.json at which commits each run was trained, those of further seeds among them."""
+        document = json.loads(report.read_text(encoding="utf-8"))
+        trained_at = {run.name: self._commits(run) for run in self._runs()}
+        if document.get("trained_at") != trained_at:
+            text = json.dumps({**document, "trained_at": trained_at}, indent=2, ensure_ascii=False)
+            report.write_text(text + "\n", encoding="utf-8")
 
     def _measure(self, verb: str, runs: Sequence[Run], more: Sequence[Any], made: Path) -> None:
         """What a verb makes of some runs against the references."""

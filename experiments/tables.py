@@ -6,39 +6,30 @@
 Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and leaves tables.md, tables.json
 and tables.png, for the paper's size tables-paper.md and so on. Rooms that the JSON in OUT has, and that have no report
 here, stay, and are said on stderr: they may have run elsewhere. Delete a room's entry, and it goes. What was found out
-beyond the figures stands in experiments/findings.md, which becomes the last part of the page of the small size. Exit
-code 0, 3 where a report's views are not independent, or 7 where there is neither a report nor a room that stays, or one
-of either is of an earlier version.
+stands in experiments/findings.md, with which the page of the small size begins. Exit code 0, 3 where a report's views
+are not independent, or 7 where there is neither a report nor a room that stays, or one of either is of an earlier
+version.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar, get_args
-
-import numpy as np
+from typing import get_args
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
 
 from bench.harness import results
 from experiments import equal_time
 from experiments.experiment import HERE, Experiment, Part, SizeName, names
-from experiments.rooms import Room, estimate
+from experiments.paper_tables import CLOSE, error_table, further_table, lacking, order_table
+from experiments.room_tables import cost_table, descriptions, room_table, said, wrapped
+from experiments.rooms import Room
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
-from photonfarm.shared.core.estimate import Estimate
-from photonfarm.trainer.compare.markdown import markdown_table
-from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
-from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, Table
-from photonfarm.trainer.report.tables import with_interval
-
-T = TypeVar("T")
+from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Table
 
 PARTS: Mapping[Part, tuple[str, Table]] = {
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
@@ -50,208 +41,41 @@ PARTS: Mapping[Part, tuple[str, Table]] = {
 }
 """The page's parts: title, and the paper's figures."""
 
-ORDER = ("cnn", "feature_projection", "light_transport", "light_transport_photons")
-OURS = (
-    ("feature_projection", "guided_transport"),
-    ("cnn", "guided"),
-    ("guided", "guided_transport"),
-    ("guided_transport", "guided_transport_photons"),
-)
-"""What ours is compared with: the published network that lacks the same, and itself without a part."""
-
-CLOSE = 0.1  # ≈: a gap of less than this share of the first's error
-
-
-# -------------------------------------------------------------------------------------------------- the paper's table
-
-COLUMNS = {
-    "time per frame, ms": False, "network alone, ms (range)": False, "× light_transport": True, "MSE (95 %)": True,
-    "MSSIM (95 %)": True, "FID": True, "KID": False, "Feature L1 (95 %)": True,
-}  # fmt: skip
-"""Heads of the columns, and whether the paper has such a one."""
-
-
-def paper_table(rooms: Sequence[Room], published: Table) -> str:
-    """The paper's columns, each a mean over the rooms that have the row; the published figure beside each."""
-    head = ["architecture"]
-    for column, is_published in COLUMNS.items():
-        head += [column, "paper"] if published and is_published else [column]
-    lines = []
-    for name in _row_names(rooms):
-        ours = _ours([room for room in rooms if name in room.rows], name)
-        theirs = _theirs(published.get(name), published.get("light_transport"))
-        line = [name]
-        for cell, paper, is_published in zip(ours, theirs, COLUMNS.values(), strict=True):
-            line += [cell, paper] if published and is_published else [cell]
-        lines.append(line)
-    return markdown_table(head, lines)
-
-
-def lacking(rooms: Sequence[Room]) -> str:
-    """Which rows are no mean over all rooms, a sentence; empty where all are."""
-    without = {name: [room.name for room in rooms if name not in room.rows] for name in _row_names(rooms)}
-    said = "; ".join(f"{name} without {', '.join(rooms)}" for name, rooms in without.items() if rooms)
-    return f" Rows that a room lacks are means over the others: {said}." if said else ""
-
-
-def _row_names(rooms: Sequence[Room]) -> list[str]:
-    return list(dict.fromkeys(name for room in rooms for name in room.rows))
-
-
-def _ours(rooms: Sequence[Room], name: str) -> list[str]:
-    """The cells of a row that all the rooms have."""
-
-    def each(of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
-        found = [value for room in rooms if (value := of(room.rows[name])) is not None]
-        return found if len(found) == len(rooms) else None
-
-    def averaged(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> str:
-        values = each(of)
-        return NOT_AVAILABLE if values is None else f"{np.mean(values):.{digits}f}"
-
-    def interval(metric: str, digits: int) -> str:
-        values = each(lambda row: estimate(row, metric))
-        return with_interval(None if values is None else mean(values), digits)
-
-    network = averaged(lambda row: 1e3 * row["network_seconds"], 1)
-    low = averaged(lambda row: 1e3 * row["network_seconds_range"][0], 1)
-    high = averaged(lambda row: 1e3 * row["network_seconds_range"][1], 1)
-    ratios = [room.time_ratio(name) for room in rooms]
-    ratio = NOT_AVAILABLE if None in ratios else f"{np.mean([*filter(None, ratios)]):.2f}"
-    total = averaged(lambda row: row["frame_seconds"] and 1e3 * row["frame_seconds"]["total"], 1)
-    return [
-        total, f"{network} ({low} … {high})", ratio, _mse(rooms, name), interval("mssim", 3),
-        averaged(lambda row: _of_set(row, "fid", "value"), 1), averaged(lambda row: _of_set(row, "kid", "mean"), 4),
-        interval(f"feature_l1_{HEADLINE_BLOCK}", 3),
-    ]  # fmt: skip
-
-
-def _mse(rooms: Sequence[Room], name: str) -> str:
-    """The MSE of all seeds."""
-    found = [mse for room in rooms if (mse := room.mse(name)) is not None]
-    return with_interval(mean(found) if len(found) == len(rooms) else None, 5)
-
-
-def _of_set(row: Mapping[str, Any], metric: str, key: str) -> float | None:
-    """A metric of a set of images, by the key of its value; None where it could not be computed."""
-    found = row.get(metric)
-    return None if found is None else found[key]
-
-
-def _theirs(paper: Published | None, unit: Published | None) -> list[str]:
-    """The published cells of a row, as many as COLUMNS."""
-    if paper is None or unit is None:
-        return [""] * len(COLUMNS)
-    ratio = f"{paper.seconds / unit.seconds:.2f}"
-    errors = f"{paper.mse:.4f}", f"{paper.mssim:.3f}", f"{paper.fid:.1f}"
-    return ["", "", ratio, *errors, "", f"{paper.feature_l1:.3f}"]
-
-
-def mean(estimates: Sequence[Estimate]) -> Estimate:
-    """The mean over several rooms of their means, each room alike; each is known as well as its views tell."""
-    errors = [each.standard_error for each in estimates if each.standard_error is not None]
-    spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
-    return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
-
-
-# ---------------------------------------------------------------------------------------------------------- the order
-
-
-def order_table(rooms: Sequence[Room], published: Table) -> str:
-    """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
-    head = ("pair", "paper: gap", *(f"{room.name}: gap (95 %; each seed)" for room in rooms))
-    lines = []
-    for first, second in (*pairwise(ORDER), *OURS):
-        theirs = ""
-        if first in published and second in published:
-            share = 1 - published[second].mse / published[first].mse
-            theirs = f"{share:+.0%} {sign(share)}"
-        lines.append([f"`{first}` − `{second}`", theirs, *(_gap(room, first, second) for room in rooms)])
-    return markdown_table(head, lines)
-
-
-def _gap(room: Room, first: str, second: str) -> str:
-    gap = room.gap(first, second)
-    if gap is None:
-        return NOT_AVAILABLE
-    interval, share = confidence_interval(gap.difference), gap.difference.mean / gap.unit
-    if interval is None:
-        return f"{share:+.0%}"
-    seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in gap.of_seeds)
-    told = f"{share:+.0%} ({interval[0] / gap.unit:+.0%} … {interval[1] / gap.unit:+.0%}; {seeds}) {sign(share)}"
-    agree = len({of_seed > 0 for of_seed in gap.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
-    return told if agree else f"{told}, not told apart"
-
-
-def sign(share: float) -> str:
-    """≈ for a small gap, whatever its significance; > where the first's error is larger."""
-    return "≈" if abs(share) < CLOSE else ">" if share > 0 else "<"
-
-
-# ---------------------------------------------------------------------------------------------------------- the rooms
-
-
-def room_table(rooms: Sequence[Room]) -> str:
-    """What each room's figures were measured on, what that cost, and whether the machine was quiet."""
-    head = (
-        "experiment", "title", "images trained on", "held out", "render of images, core-s", "reference passes",
-        "render of passes, core-s", "spp", "connections", "light ratio", "references", "noise of targets, linear MSE",
-        "MB in all", "edit, ms", "load average of 1, 5, 15 min", "credits",
-    )  # fmt: skip
-    return markdown_table(head, [_room_line(room) for room in rooms])
-
-
-def _room_line(room: Room) -> list[str]:
-    card, evaluation = room.document["dataset"], room.document["evaluation"]
-    trained_on = sorted({run["trained_on"] for run in room.document["runs"].values()})
-    images, passes = room.spent("samples"), room.spent("top-up")
-    references, owed = evaluation["references"], card["credits"]
-    edit, load = room.document["edit_seconds"], room.document["machine"]["load_average"]
-    return [
-        room.name, room.document["title"], " or ".join(map(str, trained_on)),
-        " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)), f"{images['core_seconds']:.0f}",
-        f"{passes['rows']}", f"{passes['core_seconds']:.0f}", f"{card['spp_per_sample']}",
-        f"{card['transport']['connections']}", f"{card['transport']['light_ratio']:g}",
-        f"{references['views']} views, {references['spp']} spp" if references else NOT_AVAILABLE,
-        f"{evaluation['noise_floor']:.3g}", f"{card['bytes'] / 1e6:.0f}",
-        NOT_AVAILABLE if edit is None else f"{1e3 * edit:.0f}",
-        ", ".join(f"{average:.1f}" for average in load),
-        "" if owed is None else f"“{owed['title']}” by {owed['author']}, {owed['licence']}",
-    ]  # fmt: skip
-
-
-def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
-    """What holds of the rooms: once where it is the same of all, or else each with the rooms that it is of."""
-    found: dict[str, list[str]] = {}
-    for room in rooms:
-        found.setdefault(of(room), []).append(room.name)
-    if len(found) == 1:
-        return next(iter(found))
-    return "; ".join(f"{what} ({', '.join(which)})" for what, which in found.items())
-
-
-# ----------------------------------------------------------------------------------------------------------- the page
+RECIPES: Mapping[SizeName, str] = {
+    "small": "a relative loss, demodulation 0.2, relative maxima, 2 octaves, exact occlusion, a cosine schedule and "
+    "averaged weights",
+    "paper": "a paired loss, demodulation 0.2, 2 octaves and exact occlusion",
+}
+"""What differs from the supplement in the training of its networks."""
 
 
 def page(found: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
-    parts = [f"# The paper's tables over our rooms, `{size}`", introduction(found, size), READING]
-    for part, (title, published) in PARTS.items():
-        if rooms := [room for room in found if room.experiment.part == part]:
-            named = ", ".join(room.name for room in rooms)
-            parts.append(f"## {title}\n\nMeans over: {named}.{lacking(rooms)}\n\n{paper_table(rooms, published)}")
-            parts.append(f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}")
-            parts.append(f"### The rooms\n\n{room_table(rooms)}")
-    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(found)))
+    parts = [f"# The paper's tables over our rooms, `{size}`", wrapped(introduction(found, size))]
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
-    parts.append(
+    parts.append(reading(size))
+    for part, (title, published) in PARTS.items():
+        if rooms := [room for room in found if room.experiment.part == part]:
+            parts += _part(rooms, title, published)
+    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(found)))
+    made = (
         f"Timed on {said(found, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
-        f"`{command(size)}`. Taken from their reports at commit "
-        f"{said(found, lambda room: str(room.document['commit']))}."
+        f"`{command(size)}`."
     )
-    return "\n\n".join(parts)
+    return "\n\n".join([*parts, wrapped(made)])
+
+
+def _part(rooms: Sequence[Room], title: str, published: Table) -> list[str]:
+    """The tables of some rooms: pairs, errors, further metrics, and what they were measured on."""
+    means = wrapped(f"Means over: {', '.join(room.name for room in rooms)}.{lacking(rooms)}")
+    return [
+        f"## {title}", f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}",
+        f"### Time and errors\n\n{means}\n\n{error_table(rooms, published)}",
+        f"### Further times and metrics\n\n{further_table(rooms, published)}",
+        f"### The rooms\n\n{room_table(rooms)}", cost_table(rooms), descriptions(rooms),
+    ]  # fmt: skip
 
 
 def page_of(size: SizeName) -> str:
@@ -275,9 +99,9 @@ def introduction(found: Sequence[Room], size: SizeName) -> str:
         if (having := [room for room in found if steps(room)])
     ]
     return (
-        f"The size `{size}`: {said(found, lambda room: str(room.document['size']))}. {_resolution(found)} Each row "
-        f"of a room is one network (or denoiser), trained on that room's images alone: {', '.join(trained)}. Denoisers "
-        "see 1/k of the pixels of one noisy half-estimate."
+        f"The size `{size}`: {said(found, lambda room: str(room.document['size']))}. {_resolution(found)} All networks "
+        f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
+        "are denoisers, which are given 1/k of the pixels of one noisy half-estimate."
     )
 
 
@@ -295,19 +119,40 @@ def _resolution(found: Sequence[Room]) -> str:
     return f"No GPU was at hand: {size}"
 
 
-READING = f"""\
-Errors are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
-out of MSE and is in all other metrics. MSE of networks is the mean of all their seeds, and all else is the first
-seed's. Intervals are over held-out configurations (95 %, Student's t). Two networks are told apart where the interval
-of their gap excludes 0 and all seeds agree on its sign. In the tables of pairs ≈ is a gap of less than {CLOSE:.0%} of
-the first's error; < and > say whose error is larger. FID is of as few images as there are references, so it can be
-compared within this page only. n/a: not measured, or a row that a room lacks.
+READING = """\
+## How to read the tables
 
-Time is from the scene to the image on one core, without editing the scene, which all need: each room's table has it
-as “edit”. “paper” are the published figures, of four other rooms' average at 256² on the authors' machine. No value
-can be compared with ours; of the times only the ratios between networks can. Denoisers' cannot: they depend on the
-samples per pixel that are rendered for them, here those of one half, and of small images launching the renderer
-costs most."""
+**Networks.** Rows named cnn, feature_projection, light_transport and light_transport_photons are the paper's networks
+trained by our recipe ({recipe}), not by the supplement's to the letter; what differs is in
+[Train and evaluate](../training.md#presets). Those named guided are ours.
+
+**Errors** are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
+out of MSE and is in all other metrics. MSE of networks is the mean of all their seeds, and all else is the first
+seed's. Intervals are over held-out configurations (95 %, Student's t). FID is of as few images as there are references,
+so it can be compared within this page only.
+
+**Pairs.** A cell is how far the first's MSE is above the second's, as a share of the first's (in brackets its 95 %
+interval, then each seed's gap). Two networks are told apart where the interval excludes 0 and all seeds agree on the
+sign. ≈ is a gap of less than {close:.0f} %; < and > say whose error is larger.
+
+**Time** is from the scene to the image on one core, without editing the scene, which all need: each room's table has it
+as “edit”. A column “× light_transport” is the time of a frame over that of light_transport.
+
+**The paper's figures** stand in columns named “paper”; they are of four other rooms' average at 256² on the authors'
+machine. No value can be compared with ours; of the times only the ratios between networks can. Denoisers' cannot: they
+depend on the samples per pixel that are rendered for them, here those of one half, and of small images launching the
+renderer costs most.
+
+**Rooms.** Connections and light ratio are settings of `bdpt`, light samples a setting of the guides
+([scene spec](../scene-spec.md)). Why they were chosen so stands below the tables, with what moves.
+
+n/a: not measured, or a row that a room lacks. –: not in the paper."""
+
+
+def reading(size: SizeName) -> str:
+    """What the tables' figures are, and what they can be compared with."""
+    paragraphs = READING.format(recipe=RECIPES[size], close=100 * CLOSE).split("\n\n")
+    return "\n\n".join(wrapped(paragraph) for paragraph in paragraphs)
 
 
 OF_TIME = """\
@@ -316,9 +161,13 @@ OF_TIME = """\
 ![MSE over the time of a frame, room by room]({picture})
 
 Everything is charged: editing the scene, buffers, guides, photons, samples that a denoiser is given, and the network,
-on one core. A denoiser is given one half-estimate of each pixel, or of one of so many; between two of a family the
-error is taken to follow a power of the time. Below 1 ours is ahead of the best that the family reaches in the same
-time. Intervals are a bootstrap over configurations.
+on one core. A denoiser is given one half-estimate of each pixel, or of one of k; its k stands beside its point. Between
+two of a family the error is taken to follow a power of the time. Below 1 ours is ahead of the best that the family
+reaches in the same time. Intervals are a bootstrap over configurations.
+
+A family ends with one half-estimate of all pixels (k = 1). In longer frames it is credited with the least error that it
+has reached by then, although it could use more samples in that time. Such ratios are marked ≥: our advantage is at most
+what they say.
 
 {table}"""
 

@@ -27,6 +27,12 @@ def test_beyond_its_slowest_a_family_has_the_least_error_that_it_reaches() -> No
     assert ratio(placed(900, 0.005), found)[0] == pytest.approx(0.5)
 
 
+def test_a_ratio_to_a_family_that_could_use_more_samples_in_that_time_is_marked_as_a_bound() -> None:
+    assert equal_time._against(placed(900, 0.005), FAMILY).startswith("≥ 0.50 (")
+    assert equal_time._against(placed(400, 0.005), FAMILY).startswith("0.50 (")
+    assert equal_time._against(placed(200, 0.01), FAMILY).startswith("0.50 (")
+
+
 def test_a_family_that_takes_longer_has_no_error_at_that_time() -> None:
     assert at(FAMILY, 99) is None
     assert at([], 99) is None

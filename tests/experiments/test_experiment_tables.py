@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from experiments import tables
+from experiments import equal_time, paper_tables, room_tables, tables
 from experiments.experiment import Experiment, SizeName
 from experiments.rooms import Room
 from photonfarm.shared.core.errors import IncompleteError, SpecError
@@ -48,9 +48,10 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
     return {
         "machine": MACHINE,
         "edit_seconds": 0.1486,
+        "trained_at": {"cnn": ["1111111"], "light_transport": ["1111111", "2222222"]},
         "dataset": {
             "width": film, "height": film, "spp_per_sample": 8, "credits": None, "bytes": 694e6,
-            "transport": {"connections": 4, "light_ratio": 0.25},
+            "transport": {"connections": 4, "light_ratio": 0.25}, "guides": {"light_samples": 16},
             "spent": {
                 "samples": {"rows": 896, "core_seconds": 527.2}, "top-up": {"rows": 4032, "core_seconds": 725.4},
             },
@@ -91,24 +92,49 @@ def cells(page: str, first: str) -> list[str]:
 
 
 def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
-    page = tables.room_table([room("night-living-room-2")])
-    told = dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
-    assert told["title"] == "At night: The White Room"
+    told: dict[str, str] = {}
+    for page in (
+        room_tables.room_table([room("night-living-room-2")]),
+        room_tables.cost_table([room("night-living-room-2")]),
+    ):
+        told |= dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
-    assert (told["render of images, core-s"], told["render of passes, core-s"]) == ("527", "725")
-    assert (told["connections"], told["light ratio"]) == ("4", "0.25")
+    assert (told["images, core-s"], told["passes, core-s"]) == ("527", "725")
+    assert (told["connections"], told["light ratio"], told["light samples"]) == ("4", "0.25", "16")
     assert told["edit, ms"] == "149"
     assert told["load average of 1, 5, 15 min"] == "0.4, 0.6, 1.2"
 
 
+def test_a_room_is_described_with_what_moves_its_title_and_the_commits_of_training() -> None:
+    found = room("night-living-room-2")
+    told = " ".join(room_tables.descriptions([found]).split())
+    assert told.startswith("- **night-living-room-2** (At night: The White Room): The windows of movable-living-room-2")
+    assert "`photonfarm scene plan` chose them" in told
+    assert told.endswith("Trained at commit 1111111, 2222222; its report was read at commit 1234567.")
+    del found.document["trained_at"], found.document["dataset"]["guides"]  # as an earlier version kept it
+    assert "At which commit it was trained was not recorded" in " ".join(room_tables.descriptions([found]).split())
+    assert cells(room_tables.room_table([found]), "night-living-room-2")[-1] == "n/a"
+
+
+def test_lines_of_prose_are_at_most_as_wide_as_the_page_and_break_neither_code_nor_links() -> None:
+    text = room_tables.wrapped("word " * 23 + "`a command` " + "word " * 21 + "[a link](page.md)", "- ", "  ")
+    assert [len(line) <= 120 for line in text.splitlines()] == [True] * 3
+    assert [line[:11] for line in text.splitlines()] == ["- word word", "  `a comman", "  [a link]("]
+
+
 def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
     rooms = [room("night-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
-    assert tables.lacking(rooms) == (
+    assert paper_tables.lacking(rooms) == (
         " Rows that a room lacks are means over the others: denoise_4 without night-living-room."
     )
-    page = tables.paper_table(rooms, tables.MOVABLE_LIGHTS)
+    page = paper_tables.error_table(rooms, tables.MOVABLE_LIGHTS)
+    assert cells(page, "architecture") == [
+        "architecture", "ms a frame", "MSE (95 %)", "paper: MSE", "MSSIM (95 %)", "paper: MSSIM",
+    ]  # fmt: skip
     assert cells(page, "denoise_4")[1] == "500.0"
-    assert cells(page, "cnn")[:6] == ["cnn", "400.0", "20.0 (19.0 … 23.0)", "2.00", "0.78", cells(page, "cnn")[5]]
+    assert cells(page, "cnn")[1] == "400.0"
+    page = paper_tables.further_table(rooms, tables.MOVABLE_LIGHTS)
+    assert cells(page, "cnn")[:4] == ["cnn", "20.0 (19.0 … 23.0)", "2.00", "0.78"]
 
 
 def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
@@ -120,13 +146,42 @@ def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
     assert "Means over: static-ablation.\n" in ablation
     assert "Means over: static-kitchen.\n" in static
     assert "without_descriptor" not in static
-    assert "paper |" not in static.split("### Pairs")[0]  # it published no table of these
+    assert "| paper" not in static.split("## Error against")[0]  # it published no table of these
+
+
+@pytest.mark.parametrize("size", ["small", "paper"])
+def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is(size: SizeName) -> None:
+    page = tables.page([Room.of(Experiment.load("night-living-room", size), report(), "1234567")], size)
+    heads = [line for line in page.splitlines() if line.startswith("## ")]
+    findings = ["## What agrees with the paper, and what does not"] if size == "small" else []
+    assert heads[: len(findings) + 1] == [*findings, "## How to read the tables"]
+    assert heads[-1] == "## Error against the time of a frame"
+    assert f"by our recipe (a {'relative' if size == 'small' else 'paired'} loss, demodulation 0.2, " in page
+    assert "not by the supplement's to the letter" in " ".join(page.split())
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_each_room_has_a_panel_with_its_title_and_what_is_left_of_the_grid_stays_empty(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    subplots = Figure.subplots
+    monkeypatch.setattr(Figure, "subplots", lambda self, *a, **k: (drawn.append(self), subplots(self, *a, **k))[1])
+    rows = (*NETWORKS, "denoise_4", "denoise_16", "oidn 1/1")
+    names = ("night-living-room", "movable-veach-ajar")[:count]
+    assert equal_time.picture([room(name, report(rows)) for name in names]).startswith(b"\x89PNG")
+    panels = drawn[0].axes
+    titles = ["At night:\nThe Grey & White Room", "Movable objects and lights:\nVeach, Ajar"][:count]
+    assert [panel.get_title() for panel in panels if panel.axison] == titles
+    assert [text.get_text() for text in panels[0].texts] == ["4", "16", "1"]
 
 
 def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
     large = report(film=256)
     large["evaluation"]["device"] = "cuda"
-    page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small")
+    page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small").replace("\n", " ")
     assert "A GPU took part: networks ran on cuda (fixed-living-room); cpu (fixed-dining-room); of the rooms" in page
     assert "only fixed-living-room is at the paper's resolution" in page
     assert "images are 256 × 256 (fixed-living-room); 64 × 64 (fixed-dining-room)." in page
@@ -135,7 +190,7 @@ def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
 def test_rooms_of_several_machines_are_named_with_theirs() -> None:
     other = {**report(), "machine": {**MACHINE, "cpu": "Another"}}
     found = [room("fixed-living-room"), room("fixed-dining-room", other)]
-    assert tables.said(found, Room.machine) == (
+    assert room_tables.said(found, Room.machine) == (
         "Some CPU, 2 cores, x86_64 (fixed-living-room); Another, 2 cores, x86_64 (fixed-dining-room)"
     )
 
@@ -152,9 +207,9 @@ def test_what_could_not_be_measured_is_not_available() -> None:
     bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
     found = room("night-living-room", bare)
     page = tables.page([found], "small")
-    assert cells(page, "cnn")[1:] == [
-        "100.0", "20.0 (19.0 … 23.0)", "n/a", "0.78", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827",
-        "n/a", "33.7", "n/a", "n/a", "0.199",
+    assert cells(page, "cnn")[1:] == ["100.0", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827"]
+    assert cells(page.split("### Further")[1], "cnn")[1:] == [
+        "20.0 (19.0 … 23.0)", "n/a", "0.78", "n/a", "33.7", "n/a", "n/a", "0.199",
     ]  # fmt: skip
     assert cells(page, "feature_projection")[1] == "n/a"
     assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
@@ -169,9 +224,9 @@ def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree
     assert gap is not None
     assert gap.of_seeds == pytest.approx([0.02 / 0.04, 0.02 / 0.04])
     assert gap.unit == pytest.approx(0.04)
-    assert cells(tables.order_table([found], {}), "`cnn` − `feature_projection`")[2].startswith("+25% (+")
+    assert cells(paper_tables.order_table([found], {}), "`cnn` − `feature_projection`")[1].startswith("+25% (+")
     found.document["further_seeds"]["cnn"] = [[0.005] * 4]
-    said = tables._gap(found, "cnn", "light_transport")
+    said = paper_tables.gap(found, "cnn", "light_transport")
     assert said.endswith("not told apart")
 
 

@@ -13,9 +13,10 @@ import pytest
 from experiments import experiment, run
 from experiments.dry_run import Need
 from experiments.experiment import Experiment, SizeName, merged, names
+from experiments.paper_tables import error_table
+from experiments.room_tables import room_table
 from experiments.rooms import Room
-from experiments.stages import PREVIEW, StageError, Stages, _is_done
-from experiments.tables import paper_table, room_table
+from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SCENES_VARIABLE, Emitters
@@ -147,11 +148,15 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert rows[1]["frame_seconds"]["render"] > 0
     assert rows[0]["frame_seconds"]["render"] == 0
     assert [run["steps"] for run in report["runs"]] == [3, 3]
+    assert report["evaluation"]["shown"]
+    assert list(report["trained_at"]) == ["light_transport", "denoise_4", "light_transport-seed-1"]
+    assert all(len(commits) == 1 for commits in report["trained_at"].values())
 
     room = Room.read(tiny, out / "report.json", "1234567")
+    assert room.commits() == report["trained_at"]["light_transport"]
     assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
-    assert "| denoise_4 |" in paper_table([room], MOVABLE_LIGHTS)
-    assert room_table([room]).splitlines()[-1].startswith("| tiny | A tiny room |")
+    assert "| denoise_4 |" in error_table([room], MOVABLE_LIGHTS)
+    assert room_table([room]).splitlines()[-1].startswith("| tiny | ")
     assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
     assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
         "light_transport": 2, "denoise_4": 1, "fill-in 1/4": 1,
@@ -256,6 +261,25 @@ def test_a_run_of_other_settings_is_refused_with_its_folder(
     with pytest.raises(StageError, match=said) as refused:
         Stages(other, tmp_path / "work", workers=1).train()
     assert str(tmp_path / "work" / "runs" / "light_transport") in str(refused.value)
+
+
+def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_them(
+    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = Stages(with_size(tiny, architectures=("light_transport",)), tmp_path / "work", workers=1)
+    first, again = stages._runs()
+    for commit in ("1234567", "89abcde", "89abcde"):
+        monkeypatch.setattr("bench.harness.results.commit", lambda commit=commit: commit)
+        stages._keep_commit(first)
+    assert json.loads((tmp_path / "work/runs" / first.name / COMMITS).read_text()) == ["1234567", "89abcde"]
+    report = tmp_path / "report.json"
+    report.write_text(json.dumps({"edit_seconds": 0.1}))
+    stages._tell_commits(report)
+    told = json.loads(report.read_text())
+    assert told == {"edit_seconds": 0.1, "trained_at": {first.name: ["1234567", "89abcde"], again.name: []}}
+    written = report.stat().st_mtime_ns
+    stages._tell_commits(report)
+    assert report.stat().st_mtime_ns == written
 
 
 @pytest.mark.parametrize("workers", ["0", "-1", "two"])

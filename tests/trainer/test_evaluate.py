@@ -187,6 +187,18 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
                 assert np.abs(picture.astype(int) - display(image, scene.spec.exposure)).max() <= 1
 
 
+def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture_is_of(
+    scene: SceneStore, store: Path, trained, references: Path
+) -> None:
+    run = trained("run")
+    first = compare(store, [run], references=references, without_inception=True).document()["shown"]
+    other = next(row for row in held_out(store, scene, 0.4)[::2] if row not in first)
+    chosen = [first[1], other, first[0], other]
+    found = compare(store, [run], references=references, without_inception=True, choose=lambda *_: chosen)
+    assert found.document()["shown"] == [*first, other]
+    assert comparison(found).shape[0] == comparison(replace(found, shown=found.shown[:4])).shape[0] + 256 + 18 + 8
+
+
 def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
     """Of 256 pixels one of 256 is one, and one of 257 none."""
     source = make_source(3)

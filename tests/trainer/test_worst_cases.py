@@ -7,7 +7,15 @@ import pytest
 
 from photonfarm.shared.core.frame_costs import Surface
 from photonfarm.shared.core.records import ViewBuffers
-from photonfarm.trainer.report.worst_cases import HeldOutView, kinds, shadow_edges, squared_error, worst_cases
+from photonfarm.trainer.report.worst_cases import (
+    KINDS,
+    HeldOutView,
+    caption,
+    kinds,
+    shadow_edges,
+    squared_error,
+    worst_cases,
+)
 
 SIZE = 16
 
@@ -51,6 +59,13 @@ def test_one_view_may_be_the_worst_of_several_kinds_and_a_kind_that_no_view_show
     found = worst_cases(views)
     assert [(case.kind, case.row) for case in found] == [("mirrors and clear glass", 1), ("all pixels", 1)]
     assert worst_cases([]) == []
+
+
+def test_a_caption_names_all_kinds_that_a_view_is_the_worst_of() -> None:
+    assert caption(["close to the camera"]) == "Worst view of near surfaces"
+    assert caption(KINDS) == (
+        "Worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows and all pixels"
+    )
 
 
 def test_without_the_renderer_s_surfaces_the_other_kinds_are_found() -> None:

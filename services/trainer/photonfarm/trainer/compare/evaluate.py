@@ -142,6 +142,7 @@ class Evaluation:
             "threads": self.threads,
             "references": None if self.references is None else asdict(self.references),
             "rows": [row.document(self.rows[0]) for row in self.rows],
+            "shown": [target.row for target in self.shown],  # of the store: the rows of comparison.png, from the top
         }
 
 

@@ -90,6 +90,7 @@ class DatasetCard:
             "points": spec.points,
             "transport": spec.transport.model_dump(),
             "photons": spec.photons.model_dump(),
+            "guides": spec.guides.model_dump(),
             "spp_per_sample": 2 * spec.transport.half_spp,
             "samples_planned": status.samples_planned,
             "samples_complete": status.samples_complete,

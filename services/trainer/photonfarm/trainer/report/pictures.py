@@ -10,6 +10,7 @@ from photonfarm.shared.core.pictures import Picture, display, display_values
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
+from photonfarm.trainer.report.worst_cases import caption as worst_view
 
 OVERVIEW = "overview.png"
 OVERVIEW_WIDTH = 192  # px, at least, of each picture of it
@@ -102,9 +103,10 @@ def legend_of_cases(contents: ReportContents) -> str:
 
 
 def _case(contents: ReportContents, target: Target) -> Case:
-    kinds = [f"worst of {case.kind}" for case in contents.worst if case.row == target.row]
+    kinds = [case.kind for case in contents.worst if case.row == target.row]
     what = "reference" if target.is_reference else "noisy target"
-    caption = f"row {target.row}{''.join(f', {kind}' for kind in kinds)}; {what} of {target.spp} samples per pixel"
+    worst = f"{worst_view(kinds)}; " if kinds else ""
+    caption = f"{worst}row {target.row}; {what} of {target.spp} samples per pixel"
     images = ((entry.name, entry.row.shown.get(target.row)) for entry in contents.entries)
     shown = tuple(_shown(name, image, target.image) for name, image in images if image is not None)
     return Case(caption, display(target.image, 1.0), shown)

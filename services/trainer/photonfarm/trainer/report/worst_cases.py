@@ -5,7 +5,7 @@ Shape letters: H W image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,9 @@ CLOSE = 0.05  # quantile of all depths below which a pixel is close to the camer
 MIRRORS, SPECULAR, NEAR, SHADOWS, ALL = KINDS = (
     "mirrors and clear glass", "specular surfaces", "close to the camera", "fine shadows", "all pixels",
 )  # fmt: skip
+SHORT = {NEAR: "near surfaces"}
+"""The kinds whose pixels have a shorter name in captions; all others keep theirs."""
+
 LEAST = 0.005  # the least share of the image's pixels in a case
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
 SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to this difference, cosine and ratio surfaces are the same
@@ -65,6 +68,12 @@ def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
                 case = WorstCase(kind, view.row, share, float(error[mask].mean()))
                 scored.setdefault(kind, []).append((share * case.mse, case))
     return [max(scored[kind], key=lambda each: each[0])[1] for kind in KINDS if kind in scored]
+
+
+def caption(kinds: Sequence[str]) -> str:
+    """The caption of a view that is the worst of some kinds, at least one."""
+    *others, last = (SHORT.get(kind, kind) for kind in kinds)
+    return "Worst view of " + " and ".join([*([", ".join(others)] if others else []), last])
 
 
 def squared_error(view: HeldOutView) -> NDArray[np.float64]:

@@ -1,0 +1,197 @@
+"""The paper's Tables 1 and 2 over several rooms, with the published figures in columns of their own; pairs of rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import numpy as np
+
+from experiments.rooms import Room, estimate
+from photonfarm.shared.core.estimate import Estimate
+from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
+from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.report.published import Published, Table
+from photonfarm.trainer.report.tables import with_interval
+
+T = TypeVar("T")
+
+UNIT = "light_transport"
+"""The row that ratios of times refer to."""
+
+UNPUBLISHED = "–"
+
+ORDER = ("cnn", "feature_projection", UNIT, "light_transport_photons")
+OURS = (
+    ("feature_projection", "guided_transport"),
+    ("cnn", "guided"),
+    ("guided", "guided_transport"),
+    ("guided_transport", "guided_transport_photons"),
+)
+"""What ours is compared with: the published network that lacks the same, and itself without a part."""
+
+CLOSE = 0.1  # ≈: a gap of less than this share of the first's error
+
+
+# ------------------------------------------------------------------------------------------------------------ columns
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column: its head, its cell in some rooms' row of a name, and the published figure, given its row and UNIT's."""
+
+    head: str
+    ours: Callable[[Sequence[Room], str], str]
+    theirs: Callable[[Published, Published], str] | None = None
+
+
+def _each(rooms: Sequence[Room], name: str, of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
+    """A value of each room's row; None where one lacks it."""
+    found = [value for room in rooms if (value := of(room.rows[name])) is not None]
+    return found if len(found) == len(rooms) else None
+
+
+def _mean(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> Callable[[Sequence[Room], str], str]:
+    def cell(rooms: Sequence[Room], name: str) -> str:
+        values = _each(rooms, name, of)
+        return NOT_AVAILABLE if values is None else f"{np.mean(values):.{digits}f}"
+
+    return cell
+
+
+def _interval(metric: str, digits: int) -> Callable[[Sequence[Room], str], str]:
+    def cell(rooms: Sequence[Room], name: str) -> str:
+        values = _each(rooms, name, lambda row: estimate(row, metric))
+        return with_interval(None if values is None else mean(values), digits)
+
+    return cell
+
+
+def _of_set(metric: str, key: str) -> Callable[[Mapping[str, Any]], float | None]:
+    """A function to a metric of a set of images, by the key of its value; None where it could not be computed."""
+    return lambda row: row[metric][key] if row.get(metric) is not None else None
+
+
+def _mse(rooms: Sequence[Room], name: str) -> str:
+    """The MSE of all seeds."""
+    found = [mse for room in rooms if (mse := room.mse(name)) is not None]
+    return with_interval(mean(found) if len(found) == len(rooms) else None, 5)
+
+
+def _network(rooms: Sequence[Room], name: str) -> str:
+    """The time of the network alone, and its range."""
+    middle = _mean(lambda row: 1e3 * row["network_seconds"], 1)(rooms, name)
+    low = _mean(lambda row: 1e3 * row["network_seconds_range"][0], 1)(rooms, name)
+    high = _mean(lambda row: 1e3 * row["network_seconds_range"][1], 1)(rooms, name)
+    return f"{middle} ({low} … {high})"
+
+
+def _time_ratio(rooms: Sequence[Room], name: str) -> str:
+    ratios = [room.time_ratio(name) for room in rooms]
+    return NOT_AVAILABLE if None in ratios else f"{np.mean([*filter(None, ratios)]):.2f}"
+
+
+def mean(estimates: Sequence[Estimate]) -> Estimate:
+    """The mean over several rooms of their means, each room alike; each is known as well as its views tell."""
+    errors = [each.standard_error for each in estimates if each.standard_error is not None]
+    spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
+    return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
+
+
+# ------------------------------------------------------------------------------------------------------------- tables
+
+ERRORS = (
+    Column("ms a frame", _mean(lambda row: row["frame_seconds"] and 1e3 * row["frame_seconds"]["total"], 1)),
+    Column("MSE (95 %)", _mse, lambda paper, _: f"{paper.mse:.4f}"),
+    Column("MSSIM (95 %)", _interval("mssim", 3), lambda paper, _: f"{paper.mssim:.3f}"),
+)
+FURTHER = (
+    Column("network alone, ms (range)", _network),
+    Column(f"× {UNIT}", _time_ratio, lambda paper, unit: f"{paper.seconds / unit.seconds:.2f}"),
+    Column("FID", _mean(_of_set("fid", "value"), 1), lambda paper, _: f"{paper.fid:.1f}"),
+    Column("KID", _mean(_of_set("kid", "mean"), 4)),
+    Column(
+        "Feature L1 (95 %)", _interval(f"feature_l1_{HEADLINE_BLOCK}", 3), lambda paper, _: f"{paper.feature_l1:.3f}"
+    ),
+)
+
+
+def error_table(rooms: Sequence[Room], published: Table) -> str:
+    """The time of a frame and its errors, each a mean over the rooms that have the row. Raises SpecError."""
+    return _table(rooms, published, ERRORS)
+
+
+def further_table(rooms: Sequence[Room], published: Table) -> str:
+    """Times of networks and metrics of features, each a mean over the rooms that have the row."""
+    return _table(rooms, published, FURTHER)
+
+
+def _table(rooms: Sequence[Room], published: Table, columns: Sequence[Column]) -> str:
+    """A row for each predictor; behind a column that the paper has, its figures."""
+    head = ["architecture"]
+    for column in columns:
+        head.append(column.head)
+        if published and column.theirs:
+            head.append(f"paper: {column.head.removesuffix(' (95 %)')}")
+    return markdown_table(head, [_line(rooms, name, published, columns) for name in _row_names(rooms)])
+
+
+def _line(rooms: Sequence[Room], name: str, published: Table, columns: Sequence[Column]) -> list[str]:
+    having, paper = [room for room in rooms if name in room.rows], published.get(name)
+    line = [name]
+    for column in columns:
+        line.append(column.ours(having, name))
+        if published and column.theirs:
+            line.append(column.theirs(paper, published[UNIT]) if paper else UNPUBLISHED)
+    return line
+
+
+def lacking(rooms: Sequence[Room]) -> str:
+    """Which rows are no mean over all rooms, a sentence; empty where all are."""
+    without = {name: [room.name for room in rooms if name not in room.rows] for name in _row_names(rooms)}
+    said = "; ".join(f"{name} without {', '.join(rooms)}" for name, rooms in without.items() if rooms)
+    return f" Rows that a room lacks are means over the others: {said}." if said else ""
+
+
+def _row_names(rooms: Sequence[Room]) -> list[str]:
+    return list(dict.fromkeys(name for room in rooms for name in room.rows))
+
+
+# -------------------------------------------------------------------------------------------------------------- pairs
+
+
+def order_table(rooms: Sequence[Room], published: Table) -> str:
+    """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
+    head = ("pair", *(["paper"] if published else []), *(room.name for room in rooms))
+    lines = []
+    for first, second in (*pairwise(ORDER), *OURS):
+        theirs = UNPUBLISHED
+        if first in published and second in published:
+            share = 1 - published[second].mse / published[first].mse
+            theirs = f"{share:+.0%} {sign(share)}"
+        paper = [theirs] if published else []
+        lines.append([f"`{first}` − `{second}`", *paper, *(gap(room, first, second) for room in rooms)])
+    return markdown_table(head, lines)
+
+
+def gap(room: Room, first: str, second: str) -> str:
+    """How far the first's MSE is above the second's, as a share of it. Raises SpecError as `Room.gap`."""
+    found = room.gap(first, second)
+    if found is None:
+        return NOT_AVAILABLE
+    interval, share = confidence_interval(found.difference), found.difference.mean / found.unit
+    if interval is None:
+        return f"{share:+.0%}"
+    seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in found.of_seeds)
+    told = f"{share:+.0%} ({interval[0] / found.unit:+.0%} … {interval[1] / found.unit:+.0%}; {seeds}) {sign(share)}"
+    agree = len({of_seed > 0 for of_seed in found.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
+    return told if agree else f"{told}, not told apart"
+
+
+def sign(share: float) -> str:
+    """≈ for a small gap, whatever its significance; > where the first's error is larger."""
+    return "≈" if abs(share) < CLOSE else ">" if share > 0 else "<"

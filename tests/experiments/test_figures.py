@@ -1,0 +1,94 @@
+"""The figures over a report: which of its pictures stand where, and what is said of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments import figures
+from experiments.figures import AFTER, BEFORE, REFERENCE, Report
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.trainer.compare.comparison import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluation_samples import Target
+from photonfarm.trainer.predict.animation import write_png
+
+FIRST = [22, 55, 64, 65]
+WORST = {"mirrors and clear glass": 64, "specular surfaces": 305, "close to the camera": 22, "all pixels": 64}
+"""Two of three worst views are among the first ones."""
+
+PREDICTORS = (BEFORE, AFTER)
+
+
+def grey(row: int, column: int) -> np.ndarray:
+    """An image that tells which row of the store and which column it is of."""
+    return np.full((8, 8, 3), (row + 100 * column) / 1000, np.float32)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A report of two predictors, with its pictures as `photonfarm report` lays them."""
+    shown = [*FIRST, 305]
+    targets = tuple(Target(row, grey(row, 0), 256, is_reference=True, half_a=grey(row, 0)) for row in shown)
+    rows = [
+        SimpleNamespace(name=name, shown={row: grey(row, column) for row in shown})
+        for column, name in enumerate(PREDICTORS, start=1)
+    ]
+    write_png(comparison(SimpleNamespace(shown=targets, rows=rows)), tmp_path / COMPARISON)  # type: ignore[arg-type]
+    document = {
+        "evaluation": {"rows": [{"name": name} for name in PREDICTORS], "shown": shown},
+        "worst_cases": [{"kind": kind, "row": row} for kind, row in WORST.items()],
+    }
+    (tmp_path / "report.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+def linear(tile: np.ndarray) -> np.ndarray:
+    """What was shown, but for the rounding of the display."""
+    return (tile / 255) ** 2.2
+
+
+def test_a_tile_is_that_of_its_row_also_where_a_worst_view_is_among_the_first(folder: Path) -> None:
+    report = Report(folder)
+    assert report.first == [22, 55, 64]
+    assert report.worst == {
+        64: ["mirrors and clear glass", "all pixels"], 305: ["specular surfaces"], 22: ["close to the camera"],
+    }  # fmt: skip
+    for column, name in enumerate((REFERENCE, *PREDICTORS)):
+        assert list(report.tiles[name]) == [*FIRST, 305]
+        for row, tile in report.tiles[name].items():
+            np.testing.assert_allclose(linear(tile), grey(row, column)[0, 0, 0], atol=0.005)
+
+
+def test_the_worst_views_are_captioned_by_what_they_are_the_worst_of(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laid = []
+    monkeypatch.setattr(figures, "sheet_of", lambda *told: laid.append(told))
+    figures.worst_cases(Report(folder))
+    ((heads, rows, captions),) = laid
+    assert heads == [REFERENCE, BEFORE, "its error", AFTER, "its error"]
+    assert captions == [
+        "Worst view of mirrors and clear glass and all pixels",
+        "Worst view of specular surfaces",
+        "Worst view of near surfaces",
+    ]
+    assert [linear(row[0]).mean() for row in rows] == pytest.approx([0.064, 0.305, 0.022], abs=0.005)
+
+
+def test_a_sheet_has_a_row_of_errors_below_each_of_at_most_three_views(folder: Path) -> None:
+    sheet = figures.predictions(Report(folder))
+    tile = figures.SIZE + figures.GAP
+    assert sheet.shape[1] == (1 + len(PREDICTORS)) * tile - figures.GAP
+    assert sheet.shape[0] // tile == 2 * figures.VIEWS
+
+
+def test_a_report_that_does_not_say_what_its_pictures_are_of_is_refused(folder: Path) -> None:
+    document = json.loads((folder / "report.json").read_text())
+    del document["evaluation"]["shown"]
+    (folder / "report.json").write_text(json.dumps(document))
+    with pytest.raises(IncompleteError, match="does not say of which views its pictures are"):
+        Report(folder)

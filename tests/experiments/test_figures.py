@@ -17,7 +17,7 @@ from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.predict.animation import write_png
 
 FIRST = [22, 55, 64, 65]
-WORST = {"mirrors and clear glass": 64, "specular surfaces": 305, "close to the camera": 22, "all pixels": 64}
+WORST = {"mirrors and clear glass": 64, "specular surfaces": 305, "near surfaces": 22, "all pixels": 64}
 """Two of three worst views are among the first ones."""
 
 PREDICTORS = (BEFORE, AFTER)
@@ -55,7 +55,7 @@ def test_a_tile_is_that_of_its_row_also_where_a_worst_view_is_among_the_first(fo
     report = Report(folder)
     assert report.first == [22, 55, 64]
     assert report.worst == {
-        64: ["mirrors and clear glass", "all pixels"], 305: ["specular surfaces"], 22: ["close to the camera"],
+        64: ["mirrors and clear glass", "all pixels"], 305: ["specular surfaces"], 22: ["near surfaces"],
     }  # fmt: skip
     for column, name in enumerate((REFERENCE, *PREDICTORS)):
         assert list(report.tiles[name]) == [*FIRST, 305]

@@ -14,6 +14,7 @@ from photonfarm.trainer.report.worst_cases import (
     kinds,
     shadow_edges,
     squared_error,
+    thin_objects,
     worst_cases,
 )
 
@@ -62,9 +63,10 @@ def test_one_view_may_be_the_worst_of_several_kinds_and_a_kind_that_no_view_show
 
 
 def test_a_caption_names_all_kinds_that_a_view_is_the_worst_of() -> None:
-    assert caption(["close to the camera"]) == "Worst view of near surfaces"
+    assert caption(["near surfaces"]) == "Worst view of near surfaces"
     assert caption(KINDS) == (
-        "Worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows and all pixels"
+        "Worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows, thin objects "
+        "and all pixels"
     )
 
 
@@ -78,7 +80,7 @@ def test_what_is_nearer_than_most_that_is_seen_is_close_to_the_camera() -> None:
     near[:2] = 0.5
     near[15] = 0  # nothing is there
     masks = dict(kinds(view(1, buffers=replace(view(1).buffers, depth=near)), close=1.0))
-    assert masks["close to the camera"].sum() == 2 * SIZE
+    assert masks["near surfaces"].sum() == 2 * SIZE
 
 
 def test_the_noise_of_the_reference_is_no_error_on_average() -> None:
@@ -121,3 +123,13 @@ def test_a_step_in_one_half_of_the_reference_or_in_opposite_ways_is_noise() -> N
     shadow[:, 8:] = 0.1
     assert shadow_edges(replace(wall, half_a=shadow)).sum() == 0
     assert shadow_edges(replace(wall, half_a=shadow, half_b=shadow[:, ::-1])).sum() == 0
+
+
+def test_thin_objects_are_a_few_pixels_wide_and_nearer_than_both_sides() -> None:
+    depth = np.full((SIZE, SIZE), 5.0, np.float32)
+    depth[:, 4:6] = 2  # a leg
+    depth[:, 9:] = 2  # a wall
+    depth[12:14, :4] = 0  # a hole
+    wanted = np.zeros((SIZE, SIZE), np.bool_)
+    wanted[:, 4:6] = True
+    np.testing.assert_array_equal(thin_objects(depth), wanted)

@@ -18,14 +18,12 @@ from photonfarm.shared.core.records import F32, ViewBuffers
 Mask = NDArray[np.bool_]
 
 CLOSE = 0.05  # quantile of all depths below which a pixel is close to the camera
-MIRRORS, SPECULAR, NEAR, SHADOWS, ALL = KINDS = (
-    "mirrors and clear glass", "specular surfaces", "close to the camera", "fine shadows", "all pixels",
+MIRRORS, SPECULAR, NEAR, SHADOWS, THIN, ALL = KINDS = (
+    "mirrors and clear glass", "specular surfaces", "near surfaces", "fine shadows", "thin objects", "all pixels",
 )  # fmt: skip
-SHORT = {NEAR: "near surfaces"}
-"""The kinds whose pixels have a shorter name in captions; all others keep theirs."""
-
 LEAST = 0.005  # the least share of the image's pixels in a case
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
+THIN_PIXELS, THIN_DEPTH = 3, 0.9  # a thin object is at most so many pixels wide, and so much nearer than both sides
 SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to this difference, cosine and ratio surfaces are the same
 
 
@@ -72,7 +70,7 @@ def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
 
 def caption(kinds: Sequence[str]) -> str:
     """The caption of a view that is the worst of some kinds, at least one."""
-    *others, last = (SHORT.get(kind, kind) for kind in kinds)
+    *others, last = kinds
     return "Worst view of " + " and ".join([*([", ".join(others)] if others else []), last])
 
 
@@ -90,6 +88,7 @@ def kinds(view: HeldOutView, close: float) -> Iterator[tuple[str, Mask]]:
         yield SPECULAR, view.surface == Surface.SPECULAR
     yield NEAR, (view.buffers.depth > 0) & (view.buffers.depth < close)
     yield SHADOWS, shadow_edges(view)
+    yield THIN, thin_objects(view.buffers.depth)
     yield ALL, np.ones_like(view.buffers.depth, np.bool_)
 
 
@@ -106,6 +105,21 @@ def shadow_edges(view: HeldOutView) -> Mask:
         steps = irradiance[:, *second] - irradiance[:, *first]
         edges[first] |= ((steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)) & _alike(view.buffers, first, second)
     return edges
+
+
+def thin_objects(depth: F32) -> Mask:
+    """The pixels of objects that are a few pixels wide, such as the legs of a chair, (H, W), by their depth (H, W).
+
+    Along one axis, what lies `THIN_PIXELS` to either side is farther away.
+    """
+    far = np.where(depth > 0, depth, np.inf)
+    thin = np.zeros(depth.shape, np.bool_)
+    for axis in (0, 1):
+        widths = [(THIN_PIXELS, THIN_PIXELS) if other == axis else (0, 0) for other in (0, 1)]
+        padded = np.pad(far, widths, mode="edge")
+        sides = [np.take(padded, np.arange(depth.shape[axis]) + start, axis) for start in (0, 2 * THIN_PIXELS)]
+        thin |= far < THIN_DEPTH * np.minimum(*sides)
+    return thin
 
 
 Part = tuple[slice, slice]

@@ -46,7 +46,7 @@ def block_at_home(size: int) -> Scene:
 
 
 def block_far_away(size: int) -> Scene:
-    """The same with the block outside of the old bounding sphere, in the picture."""
+    """The scene of `block_at_home`, its block outside of the former bounding sphere but still in the picture."""
     return _under_sky_and_sun(size, mi.ScalarTransform4f().translate(SHIFT).translate([0, 0, 0.8]).scale(0.8))
 
 
@@ -102,7 +102,7 @@ def mirrored_light(size: int) -> Scene:
 
 
 def unmirrored_light(size: int) -> Scene:
-    """The same box without a mirroring: it is symmetric."""
+    """The room of `mirrored_light`, its box not mirrored; as the box is symmetric, the images must be equal."""
     return _cube_light(size, mirrored=False)
 
 

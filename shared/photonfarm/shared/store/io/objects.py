@@ -331,5 +331,5 @@ def _pack(folder: Path, packed: Path) -> None:
 
 def _version(about: ObjectMeta) -> str:
     """A text that changes with an object's bytes."""
-    told = about["e_tag"] or f"{about['last_modified']} {about['size']}"
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    version = about["e_tag"] or f"{about['last_modified']} {about['size']}"
+    return hashlib.sha256(version.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Rows that are hard for their lights."""
+"""Scenes that are hard because of their lights."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def move_block(scene: Any) -> None:
 
 
 def point_caustic(size: int) -> Scene:
-    """The caustic of a point light under a glass ball that is out of the picture itself."""
+    """The caustic of a point light under a glass ball, which is itself out of the picture."""
     glass = {"type": "dielectric", "int_ior": 1.5}
     return {
         "type": "scene",
@@ -225,4 +225,4 @@ SCENES = (
               hard_scenes.many_lights, PATH),
     HardScene(26, "projector", "a pattern thrown from a point", projector, PATH),
 )  # fmt: skip
-"""Rows 6, 7, 11–16, 22–26."""
+"""The scenes of rows 6, 7, 11–16 and 22–26."""

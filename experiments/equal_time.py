@@ -55,7 +55,7 @@ class Placed:
 
     @property
     def mse(self) -> float:
-        """Over all views."""
+        """The mean squared error over all views."""
         return float(self.errors.mean())
 
 

@@ -68,7 +68,7 @@ class Errors:
         return found.mean - reach, found.mean + reach
 
     def _parts(self) -> tuple[Estimate, Estimate]:
-        """Over configurations, and over seeds."""
+        """The estimates over configurations, and over seeds."""
         return Estimate.of(group_means(self.of_views(), self.units)), Estimate.of(self.of_seeds())
 
 
@@ -84,7 +84,7 @@ def each_seed(errors: Errors, form: str = ".5f") -> str:
 
 
 def of_intervals(seeds: int) -> str:
-    """What a page says of its intervals."""
+    """The sentence of a page about its intervals."""
     if seeds == 1:
         return "Intervals are over configurations, for these networks: those of another seed may lie outside."
     return (

@@ -53,11 +53,11 @@ Base = tuple[Geometry, BasePointCloud]
 
 NAME = "moved_lamps"
 SEED = 1
-"""Of the lamps' other places. Experiments are planned with 0, so that no sample shows these places."""
+"""The master seed of the lamps' other places. Experiments are planned with seed 0, so no sample shows these places."""
 
 KNOWN = "light known alone"
-SAME_DEPTH = 1e-3  # relative: so near, and of the same normal, is the same surface
-SAME_ALBEDO = 1e-3  # likewise
+SAME_DEPTH = 1e-3  # relative difference up to which points with one normal lie on the same surface
+SAME_ALBEDO = 1e-3  # difference up to which two albedos are the same
 
 
 # -------------------------------------------------------------------------------------------------------------- lamps
@@ -87,7 +87,7 @@ def relit(modification: Modification, other: Modification, shines: NDArray[np.bo
 
 
 def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
-    """The pixels that show one surface in both, (H, W), also at their edges, which albedo tells: no lamp that moved."""
+    """The pixels that show the same surface in both views, (H, W), over their whole area: so albedo is compared too."""
     depth = np.abs(a.depth - b.depth) <= SAME_DEPTH * np.maximum(a.depth, b.depth)
     normal = np.abs(a.normal - b.normal).max(axis=-1) < SAME_DEPTH
     albedo = np.abs(a.albedo - b.albedo).max(axis=-1) < SAME_ALBEDO

@@ -16,16 +16,16 @@ from photonfarm.shared.scene.view import Camera
 F64 = NDArray[np.float64]
 
 SELF_HIT = 1e-4
-"""A line of sight ends this share of its length before its point, so that it does not meet the point's own surface."""
+"""The share of its length by which a line of sight ends before its point, so that it misses the point's own surface."""
 
 AT_ONCE = 8192
-"""Triangles: with so few lines, what is worked out of them stays in the processor's cache."""
+"""The number of triangles tested at a time, so that intermediate results stay in the processor's cache."""
 
 TOGETHER = 16
-"""Lines at most that are tried against the same triangles."""
+"""The largest number of lines that are tested against the same triangles."""
 
 ROUNDING = 1e-9
-"""Of directions: what touches the outermost line is in its way."""
+"""The tolerance for directions, by which a triangle that touches the outermost line is in its way."""
 
 
 def triangles(geometry: Geometry, modification: Modification) -> F64:

@@ -368,7 +368,7 @@ def test_our_worker_renders_every_honest_job_and_gives_the_stranger_nothing(
     assert PASSWORD not in said
     assert "were not names of jobs, and were thrown away" in said
     assert "Traceback" not in said
-    assert "is not of the store" in said, "strangers' jobs of unknown scenes are refused aloud"
+    assert " has no job " in said, "strangers' jobs of unknown scenes are refused aloud"
 
 
 # ---------------------------------------------------------------------------------- what would stop the refill for good

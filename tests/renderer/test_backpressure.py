@@ -36,7 +36,7 @@ def test_a_size_is_read_as_it_is_written(size: str, in_bytes: int) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--reserve", "5 bananas"], "'5 bananas' is no size; write it as 500MB or 2GB"),
+        (["--reserve", "5 bananas"], "'5 bananas' is not a size; write it like 500MB or 2GB"),
         (["--ahead", "0.5"], "0.5 is not in the range x>=1"),
         (["--job", "1"], "--job needs --scene"),
     ],

@@ -267,7 +267,7 @@ def test_no_more_points_are_looked_for_than_are_asked_for(
     ("scene", "rows", "message"),
     [
         ("room", ["2", "4"], r"^row 4 of scene \w+ is not complete; 4 of 4 planned rows are, which `"),
-        ("attic", ["0"], "no scene that 'attic' stands for"),
+        ("attic", ["0"], "no scene has the id or name 'attic'"),
     ],
 )
 def test_a_row_or_a_scene_that_is_not_there_is_named(

@@ -271,7 +271,7 @@ def test_a_scene_file_that_is_not_the_planned_one_is_refused(
 
 
 def test_a_job_of_another_store_is_refused(store: Store, recorded: type) -> None:
-    with pytest.raises(QueueError, match="is not of the store"):
+    with pytest.raises(QueueError, match="has no job 0 of scene 0000"):
         ShardRenderer(store, worker="test", load=recorded.load).render("0" * 32, 0)
 
 

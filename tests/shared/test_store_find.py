@@ -169,7 +169,7 @@ def test_guides_are_listed_where_the_scene_is_to_have_some(store: Store, scene: 
 def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene: SceneStore) -> None:
     for name in (scene.scene_id, scene.scene_id[:6], "small"):
         assert scene_named(store, name) == scene.scene_id
-    with pytest.raises(StoreError, match=f"no scene that 'other' stands for; it holds {scene.scene_id}"):
+    with pytest.raises(StoreError, match=f"no scene has the id or name 'other'; give one of the ids {scene.scene_id}"):
         scene_named(store, "other")
     other = store.add(samples.small_spec(exposure=2.0))
     with pytest.raises(StoreError, match="2 scenes"):

@@ -210,8 +210,8 @@ def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--kept", "4"], "--kept is what untrained denoisers are given"),
-        (["--inception", "file"], "--inception is for the columns that compare with references"),
+        (["--kept", "4"], "--kept applies only to untrained denoisers"),
+        (["--inception", "file"], "--inception is used only to compare with references"),
         (["room"], "Got unexpected extra argument (room)"),
     ],
 )

@@ -116,7 +116,7 @@ def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, tra
         shown = pixels(tmp_path / "out/target.png")[::16, ::16].astype(int)
         assert np.abs(shown - target).max() <= 1
         assert [file.name for file in found.files] == ["prediction.png", "target.png"]
-        said = f"row {row}: held out; squared error " if wanted else f"row {row}: was trained on (it is not held out)"
+        said = f"row {row}: held out; squared error " if wanted else f"row {row}: a training sample, "
         assert found.sentence.startswith(said)
 
 

@@ -38,7 +38,7 @@ def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:
             train(make_source(24), tiny(**change), run)
     with pytest.raises(SpecError, match=r"or the same values \(--set width=4 --seed 0\)$"):
         train(make_source(24), tiny(network={"width": 5}, seed=2), run)
-    with pytest.raises(SpecError, match=r"or the same values \(no --demodulation\)$"):
+    with pytest.raises(SpecError, match=r"or the same values \(without --demodulation\)$"):
         train(make_source(24), tiny(network={"width": 4, "demodulation": 0.2}), run)
     assert read_settings(run) == tiny(max_steps=2)
 
@@ -54,9 +54,9 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
     train(make_source(24), tiny(max_steps=2), run)
     with (run / METRICS).open("a") as file:
         file.write(f"{line}\n")
-    with pytest.raises(StoreError, match=r"metrics\.jsonl: holds .*, which is no record of a training run"):
+    with pytest.raises(StoreError, match=r"metrics\.jsonl: holds the line .*, which is not a record of a training run"):
         metrics_log.read(run / METRICS)
-    with pytest.raises(StoreError, match="which is no record of a training run; take it out"):
+    with pytest.raises(StoreError, match="which is not a record of a training run; remove that line"):
         train(make_source(24), tiny(max_steps=3), run)
     assert checkpoint.load(run / CHECKPOINT)["step"] == 2
 
@@ -64,7 +64,7 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
 def test_weights_alone_are_no_checkpoint_to_go_on_from(make_source, tiny, run) -> None:
     train(make_source(24), tiny(max_steps=2), run)
     shutil.copy(run / INITIAL, run / CHECKPOINT)
-    with pytest.raises(StoreError, match="holds weights alone, and not where a run stood"):
+    with pytest.raises(StoreError, match="holds only weights, and not the state of a run"):
         train(make_source(24), tiny(max_steps=3), run)
 
 
@@ -102,7 +102,9 @@ def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, ti
     written = json.loads((run / "settings.json").read_text())
     older = {**written, "network": {k: v for k, v in written["network"].items() if k not in ("octaves", "maxima")}}
     (run / "settings.json").write_text(json.dumps(older))
-    with pytest.raises(SpecError, match="lacks octaves, maxima of the network: another version's run; train anew"):
+    with pytest.raises(
+        SpecError, match="lacks the network settings octaves, maxima: another version wrote it; train anew"
+    ):
         TrainedRun.load(run)
     (run / "settings.json").write_text(json.dumps({**written, "network": {**written["network"], "octaves": 1}}))
     with pytest.raises(SpecError, match=r"was trained with network\.octaves = 2, and 1 is asked for now"):
@@ -118,7 +120,7 @@ def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source
     state = checkpoint.load(run / CHECKPOINT)
     del state["settings"]["network"]["octaves"]
     checkpoint.save(run / CHECKPOINT, state)
-    with pytest.raises(SpecError, match="lacks octaves of the network: another version's run; train anew"):
+    with pytest.raises(SpecError, match="lacks the network settings octaves: another version wrote it; train anew"):
         train(make_source(24), tiny(max_steps=2), run)
 
 
@@ -174,7 +176,7 @@ def test_a_checkpoint_whose_numbers_are_not_those_written_is_refused(make_source
     whole[-400] ^= 1
     (run / CHECKPOINT).write_bytes(whole)
     for use in (lambda: train(make_source(24), tiny(), run), lambda: TrainedRun.load(run)):
-        with pytest.raises(StoreError, match=r"is damaged: .*; without this file the run begins anew"):
+        with pytest.raises(StoreError, match=r"is damaged, .*; remove it, and the run begins anew"):
             use()
 
 
@@ -182,7 +184,7 @@ def test_a_checkpoint_of_an_older_format_is_named_as_that(make_source, tiny, run
     with monkeypatch.context() as older:
         older.setattr(checkpoint, "FORMAT", 2)
         train(make_source(24), tiny(max_steps=2), run)
-    with pytest.raises(StoreError, match=r"has format 2; this version reads 3$"):
+    with pytest.raises(StoreError, match="has format 2, but this version reads format 3"):
         checkpoint.load(run / CHECKPOINT)
 
 

@@ -26,14 +26,22 @@ IMAGES = ("radiance", "albedo", "normal", "depth")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """The points of a scene in the configuration of one sample; the scene's own points, moved with their groups."""
+    """The P points of a scene in the configuration of one sample: the scene's own points, moved with their groups.
 
-    position: F32  # (P, 3) scene units, world
-    normal: F32  # (P, 3) unit, geometric, world
-    albedo: F32  # (P, 3) diffuse reflectance
-    emission: F32  # (P, 3) radiance that leaves along the normal, linear RGB
-    present: NDArray[np.bool_]  # (P,) False for points of groups that are removed
-    seen: NDArray[np.bool_]  # (P,) whether the view sees the point: it is in the image, and nothing hides it
+    position: (P, 3) float32, world coordinates in scene units.
+    normal: (P, 3) float32, geometric unit normals in world coordinates.
+    albedo: (P, 3) float32, diffuse reflectance.
+    emission: (P, 3) float32, radiance that leaves along the normal, linear RGB.
+    present: (P,) bool, False for points of removed groups.
+    seen: (P,) bool, whether the view sees the point: it is in the image, and nothing hides it.
+    """
+
+    position: F32
+    normal: F32
+    albedo: F32
+    emission: F32
+    present: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
 
 
 class Sample:

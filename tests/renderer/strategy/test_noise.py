@@ -27,12 +27,12 @@ def dependent(rng: np.random.Generator) -> NDArray[np.float64]:
     return independent(rng) + patches + rng.normal(0, CONNECTED / 5)
 
 
-def tallied(draw: Draw, views: int, pairs: int, rng: np.random.Generator) -> BlockSums:
-    tally = BlockSums()
+def sums_of(draw: Draw, views: int, pairs: int, rng: np.random.Generator) -> BlockSums:
+    sums = BlockSums()
     for view in range(views):
         for _ in range(pairs):
-            tally.add(*(as_image(draw(rng)) for _ in "ab"), WEIGHTS, view)
-    return tally
+            sums.add(*(as_image(draw(rng)) for _ in "ab"), WEIGHTS, view)
+    return sums
 
 
 def as_image(grey: NDArray[np.float64]) -> F32:
@@ -46,8 +46,8 @@ def test_candidates_of_one_mean_are_charged_next_to_nothing_for_few_images(draw:
     charges = []
     for seed in range(10):
         rng = np.random.default_rng([seed, views])
-        tallies = [tallied(draw, views, pairs, rng) for _ in range(CANDIDATES)]
-        charges += [missed(tally, [other for other in tallies if other is not tally]) for tally in tallies]
+        candidates = [sums_of(draw, views, pairs, rng) for _ in range(CANDIDATES)]
+        charges += [missed(sums, [other for other in candidates if other is not sums]) for sums in candidates]
     assert np.mean(charges) < 0.02 * 0.25
 
 
@@ -61,6 +61,6 @@ def with_caustic(rng: np.random.Generator) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(8))
 def test_a_candidate_that_misses_a_caustic_is_charged_for_one_pair_of_images_in_each_view(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    without, finds = tallied(dependent, 8, 1, rng), tallied(with_caustic, 8, 1, rng)
+    without, finds = sums_of(dependent, 8, 1, rng), sums_of(with_caustic, 8, 1, rng)
     assert missed(without, [finds]) > 0.25  # more than the noise that is seen
     assert missed(finds, [without]) < 0.02 * 0.25

@@ -29,7 +29,7 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
 def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
     found = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
     if found is None:
-        raise click.BadParameter(f"{size!r} is no size; write it as 500MB or 2GB")
+        raise click.BadParameter(f"{size!r} is not a size; write it like 500MB or 2GB")
     return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
 
 
@@ -71,7 +71,7 @@ def work(
     check: bool,
     **settings: Any,
 ) -> None:
-    """Render queued jobs into the store, on one core, until told to stop; start one per core.
+    """Render queued jobs into the store, on one core, until asked to stop; start one per core.
 
     A store that does not exist is waited for; --until-complete ends with exit code 4 then. One Redis serves one store.
     Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.

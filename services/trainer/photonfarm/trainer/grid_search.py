@@ -220,7 +220,7 @@ def _read(path: Path, about: Mapping[str, Any]) -> list[Cell]:
         cells = [Cell(cell["changes"], tuple(cell["picked_by"]), tuple(cell["per_unit"])) for cell in written["cells"]]
         before, now = ({**document, **document["settings"]} for document in (written, about))
     except (ValueError, LookupError, TypeError) as error:
-        raise StoreError(f"{path}: is not what a grid left there; without this file it begins anew") from error
+        raise StoreError(f"{path}: is not a list of grid results; remove it, and the grid begins anew") from error
     for key in now:
         if key != "settings" and before.get(key) != now[key]:
             raise SpecError(f"{path}: has {key} = {before.get(key)!r}, now {now[key]!r}; use another run folder")

@@ -13,20 +13,20 @@ from pathlib import Path
 _LAUNCH = """
 import ctypes, os, signal, sys
 if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: end with the process that started us…
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: end with the process that started us
     if os.getppid() != int(sys.argv[1]):
-        sys.exit(1)  # …which has ended already
+        sys.exit(1)  # that process has ended already
 os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
 def tied(command: Sequence[str]) -> list[str]:
-    """The command wrapped so that on Linux it gets SIGTERM however this process ends; the main thread must start it."""
+    """The command, wrapped so that on Linux it gets SIGTERM when this process ends; the main thread must start it."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """The number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -34,10 +34,10 @@ NAP_S = 0.1  # the longest delay until a `Stop` is noticed
 
 
 class Stop:
-    """Set by a signal's handler: `threading.Event` without its lock.
+    """A request to stop, which signal handlers may set: like `threading.Event`, but without a lock.
 
-    A handler interrupts the main thread anywhere, in another handler too. If that holds the event's lock, in `set` or
-    at the beginning of `wait`, the handler's `set` waits for ever.
+    A handler may interrupt the main thread anywhere, even inside of another handler. If the main thread holds the lock
+    of an event at that moment, in `set` or at the beginning of `wait`, the handler's own `set` would wait forever.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Stop:
         return self._is_set
 
     def wait(self, seconds: float) -> bool:
-        """Wait at most so many seconds for the request; returns whether there is one."""
+        """Wait for the request, at most so many seconds; returns whether there is one."""
         end = time.monotonic() + seconds
         while not self._is_set and (left := end - time.monotonic()) > 0:
             time.sleep(min(left, NAP_S))

@@ -56,7 +56,7 @@ class Allocation:
 
     @property
     def samples(self) -> int:
-        """The number of samples."""
+        """The number of samples, M·V·P."""
         return self.modifications * self.views * self.passes
 
 
@@ -83,10 +83,10 @@ class CostModel:
 
     @classmethod
     def of(cls, costs: SampleCosts, *, static: bool) -> Self:
-        """The terms of a scene whose costs were measured.
+        """The cost model of a scene whose costs were measured.
 
-        A static scene has one configuration, which is paid for once and is no source of error: its views are the first
-        stage, and stand in an allocation as configurations of one view.
+        A static scene has one configuration, which is paid for once and causes no error. Its views are the first stage,
+        and an allocation counts them as configurations of one view.
         """
         return cls(replace(costs, configuration_s=0.0), rho=0.0, most_views=1) if static else cls(costs)
 
@@ -122,7 +122,7 @@ class CostModel:
         return min(found, key=self.excess)
 
     def _affordable(self, budget_s: float) -> Iterator[Allocation]:
-        """One pass of 2, 4, 8 … 1024 spp for each number of views, of as many configurations as the budget pays for."""
+        """One pass of 2, 4, 8 … 1024 spp for each number of views, with all configurations that the budget pays for."""
         for views in range(1, self.most_views + 1):
             for spp in (2**power for power in range(1, MOST_SPP.bit_length())):
                 one = self.seconds(Allocation(1, views, 1, spp))

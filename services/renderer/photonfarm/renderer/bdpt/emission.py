@@ -1,4 +1,4 @@
-"""The lights of a scene as data: which light is chosen with what probability, and how a light path starts.
+"""The lights of a scene as data: the probability of choosing each light, and the start of a light path.
 
 The selection probabilities are arrays in device memory, never literals: they are rebuilt from the scene at the start
 of each render without reading anything back, so a light that is switched off in place (radiance 0) is never chosen and
@@ -29,7 +29,7 @@ from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, read
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
-"""The kinds of light. EYE_ONLY: no light paths start there; HIT_ONLY: eye paths hit it by chance alone, weight 1."""
+"""The kinds of light. Light paths never start at EYE_ONLY; HIT_ONLY is found by hits alone, which have weight 1."""
 
 _KIND_BY_CLASS = {
     "AreaLight": AREA,
@@ -41,7 +41,7 @@ _KIND_BY_CLASS = {
     "DirectionalEmitter": DIRECTION,
 }
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
-"""The beginnings of the names of parameters that scale a light's brightness."""
+"""The first parts of the names of parameters that scale a light's brightness."""
 
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 
@@ -64,15 +64,15 @@ class Lights:
     radius: mi.Float  # [1]: its radius
 
     def only(self, kind: int) -> bool:
-        """Whether all lights that can be selected are of this kind: decided on the host, so others cost nothing."""
+        """Whether all lights that can be selected are of this kind; the host knows it, so other kinds cost nothing."""
         return all(k in (kind, HIT_ONLY) for k in self.kinds)
 
     def has(self, kind: int) -> bool:
-        """Whether there is a light of this kind: decided on the host."""
+        """Whether there is a light of this kind, which is known on the host."""
         return kind in self.kinds
 
     def is_kind(self, index: LightIndex, kind: int) -> mi.Bool:
-        """Mask of the lanes whose light ``index`` is of this kind."""
+        """The mask of lanes whose light ``index`` is of this kind."""
         if not self.has(kind):
             return mi.Bool(False)
         if self.only(kind):
@@ -80,13 +80,13 @@ class Lights:
         return dr.gather(mi.UInt32, self.kind, index) == kind
 
     def nee_probability(self, emitter: mi.EmitterPtr, p: mi.Point3f) -> mi.Float:
-        """Probability of choosing ``emitter`` for next event estimation at points ``p`` (0 for the null pointer)."""
+        """The probability of choosing ``emitter`` for next event estimation at points ``p``; 0 for the null pointer."""
         if self.selection is None:
             return dr.gather(mi.Float, self.alive, dr.reinterpret_array(mi.UInt32, emitter))
         return self.selection.probability(p, emitter)
 
     def emission_factor(self, emitter: mi.EmitterPtr) -> mi.Float:
-        """ê of the given emitters (0 for the null pointer)."""
+        """The ê of the given emitters; 0 for the null pointer."""
         return dr.gather(mi.Float, self.emission, dr.reinterpret_array(mi.UInt32, emitter))
 
 
@@ -94,7 +94,7 @@ class Lights:
 
 
 def read_lights(scene: mi.Scene) -> Lights:
-    """The scene's lights as they are now: some small arrays and one small kernel, no host synchronisation."""
+    """The scene's lights as they are now, by some small arrays and one small kernel, without host synchronisation."""
     emitters = list(scene.emitters())
     n = len(emitters)
     ids = [_registry_id(emitter) for emitter in emitters]
@@ -133,12 +133,12 @@ def read_lights(scene: mi.Scene) -> Lights:
 
 
 def _registry_id(emitter: mi.Emitter) -> int:
-    """Dr.Jit's number of an emitter: a literal, so reading it waits for nothing."""
+    """Dr.Jit's registry id of an emitter; it is a literal, so reading it waits for nothing."""
     return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
 
 
 def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
-    """How a light is treated; ``shape`` is the one it covers, if any."""
+    """The kind of a light; ``shape`` is the shape that carries it, if any."""
     kind = _KIND_BY_CLASS.get(emitter.class_name(), EYE_ONLY)
     if kind != AREA:
         return kind
@@ -153,8 +153,8 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
 def is_flat(mesh: mi.Mesh) -> mi.Bool:
     """Whether a mesh light's vertex normals are its faces' normals, as data [1].
 
-    Otherwise Mitsuba converts densities with the wrong cosine (so does `path`, which is biased there): such lights
-    get selection probability 0, and only hits find them.
+    Otherwise Mitsuba converts densities with the wrong cosine, which also biases `path`. Such lights get selection
+    probability 0, and only hits find them.
     """
     if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
         return mi.Bool(True)

@@ -99,17 +99,17 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             return image
 
     def render_seeds(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> mi.TensorXf:
-        """Independent images of one view [K, H, W, 3], one for each seed; small ones in one launch.
+        """Independent images of one view, [K, H, W, 3], one for each seed; several small images share a launch.
 
-        Each is the image that ``render`` gives for its seed: bit by bit on one thread if an image's samples and its
-        light paths are multiples of 16, the lanes of a SIMD packet, and otherwise up to the order of sums. Raises as
-        ``render`` does.
+        Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
+        an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
+        their order. Raises as ``render`` does.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
     def _render(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> ImageStack:
-        sensor.sampler().seed(0, 1)  # what another integrator left there would be evaluated with our input
+        sensor.sampler().seed(0, 1)  # else the state left by another integrator would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
         with dr.suspend_grad():
@@ -151,7 +151,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 
 def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
-    """Trace the light paths and the eye paths of a launch. Recorded, Python runs it once for each kind of launch."""
+    """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
     if lights is not None and options.traces_light:
@@ -162,7 +162,7 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
         vertices, seen = trace_light_paths(
             scene, sensor, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
         )
-        dr.eval(splats)  # a kernel of its own: both loops in one are slower by a twentieth
+        dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()
     sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.EYE, pixel)
@@ -185,21 +185,21 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
 
 
 def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
-    """The number of the light path that the eye path ``lane`` of an image is joined to, but for the shift.
+    """The number of the light path that the eye path ``lane`` of an image is joined to, before the shift.
 
-    It is the eye path's own number, except where there are more light paths than eye paths: there the eye paths take
-    light paths from all over, since neighbours among these start alike. Any choice is right, as the shift is uniform
-    over all light paths.
+    It is the eye path's own number unless there are more light paths than eye paths. Then eye paths take light paths
+    evenly from all of them, since neighbouring light paths start alike. Every choice is unbiased, as the shift is
+    uniform over all light paths.
     """
     return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
 
 def connection_count(connections: int, max_depth: int) -> float:
-    """The technique count of connections: n_C over a nominal number of vertices per light path.
+    """The technique count of connections: n_C over a nominal number of vertices per light path, 3 at most.
 
-    A connection picks one of a path's vertices at random, so each (s, t) gets n_C/length of them on average. Any
-    constant keeps the estimate unbiased (the counts only shape the weights); 3 is about the length in the closed rooms
-    that were measured.
+    A connection picks one of a path's vertices at random, so each technique (s, t) gets n_C/length of them on average.
+    Every constant keeps the estimate unbiased, as counts only change the weights. About 3 was the mean length in the
+    closed rooms that were measured.
     """
     return connections / min(3, max(1, max_depth - 2))
 

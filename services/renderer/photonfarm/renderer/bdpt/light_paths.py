@@ -1,15 +1,14 @@
-"""Light sub-paths walk from a light into the scene; their vertices are joined to the lens, and one of each is kept.
+"""Traces light sub-paths from the lights; joins their vertices to the lens, and keeps one of each path for connections.
 
-The first surface vertex is not joined to the lens (t=1) as the later ones are: direct light is left to next event
-estimation, whose noise is less than that of splats, and which is complete for it (lights that it cannot sample start
-no light paths either).
+The first surface vertex is not joined to the lens (t=1), but all later ones are. Direct light is left to next event
+estimation, which has less noise than splats. It misses none, as lights that it cannot sample start no light paths.
 
-The vertex kept for connections is drawn uniformly among those a connection can reach, by reservoir sampling (Vitter,
-*Random Sampling with a Reservoir*, 1985), together with how many there were. So the storage is one vertex for each path
-whatever ``max_depth`` is, nothing can overflow, and weighting the kept vertex by the number it was drawn from keeps
-the sum over all of them unbiased.
+The vertex kept for connections is drawn uniformly among those that a connection can reach, by reservoir sampling
+(Vitter, *Random Sampling with a Reservoir*, 1985), and their number is kept too. So each path needs storage for one
+vertex whatever ``max_depth`` is. The kept vertex is weighted by that number, which keeps the sum over all vertices
+unbiased.
 
-The light side never evaluates an adjoint BSDF. It evaluates the radiance-mode BSDF with directions exchanged, times
+The light side never evaluates an adjoint BSDF. It evaluates the radiance-mode BSDF with exchanged directions, times
 |cos_g(out)|/|cos_g(in)|, so both sides integrate the same function under any shading normal (Veach 1997, §5.3).
 """
 
@@ -33,7 +32,7 @@ _MAX_THROUGHPUT_KEPT = 0.95
 
 @dataclass(frozen=True, slots=True)
 class PathOptions:
-    """What both kinds of sub-path need to know; numbers that may change between renders are in device memory."""
+    """The options of both kinds of sub-path; numbers that may change between renders are in device memory."""
 
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
@@ -45,13 +44,13 @@ class PathOptions:
 
     @property
     def kind(self) -> tuple[int, ...]:
-        """The numbers that the kernels are made for."""
+        """The numbers for which the kernels are compiled."""
         return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light
 
 
 @dataclass(slots=True)
 class LightVertices:
-    """One kept vertex for each of N light paths; its surface is found again from its intersection record."""
+    """One kept vertex for each of N light paths; its surface is computed again from the intersection record."""
 
     origin: mi.Point3f  # the ray that reached it
     direction: mi.Vector3f
@@ -103,11 +102,10 @@ def trace_light_paths(
     paths: mi.UInt32,
     splat: Splat,
 ) -> tuple[LightVertices | None, mi.UInt32]:
-    """Trace a light path for each of n points of ``rng`` and add their images on the lens by ``splat``.
+    """Trace a light path for each of n points of ``rng``, and add what the lens sees of them by ``splat``.
 
-    ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch.
-
-    Returns (kept vertices, number each was drawn from [n]), or (None, ·) where no connections are wanted.
+    ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch. Returns the kept vertices, or
+    None without connections, and the number of vertices that each was drawn from, [n].
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
@@ -128,7 +126,7 @@ def trace_light_paths(
 
 
 def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler) -> LightState:
-    """The loop variables at the first hit, with the light paths that hit anything active."""
+    """The loop variables at the first hit; active are the light paths that hit a surface."""
     active = mi.Bool(start.valid)
     hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     active &= hit.is_valid()
@@ -146,7 +144,7 @@ def vertex_bounce(
     splat: Splat,
     vertices: LightVertices | None,
 ) -> tuple[LightState]:
-    """One vertex of a light path: join it to the lens, keep it perhaps, scatter."""
+    """Handle one vertex of a light path: join it to the lens, perhaps keep it, and scatter."""
     ctx = mi.BSDFContext()
 
     # ------------------------------------ Arrive ------------------------------------
@@ -196,10 +194,10 @@ def vertex_bounce(
 
 
 def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
-    """The ray from ``start`` on the near plane to just before a surface.
+    """The ray from ``start`` on the near plane to a point just before a surface.
 
-    The other way round, ``spawn_ray_to`` would leave out the last part, and what stands just behind the near plane
-    would hide nothing, though it hides all from primary rays.
+    ``spawn_ray_to`` makes a ray in the other direction that ends before ``start``. Objects right behind the near plane
+    would then hide nothing, although they do for primary rays.
     """
     end = si.spawn_ray_to(start).o
     way = end - start
@@ -208,7 +206,7 @@ def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
 
 
 def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in: mi.Float, count: mi.Float) -> None:
-    """Sample the next direction; delta lobes by their importance-mode weight times Veach's factor (1997, eq. 5.20)."""
+    """Sample the next direction; delta lobes get their importance-mode weight times Veach's factor (1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
     bs, delta_weight = bsdf.sample(importance, si, s.rng.next_1d(), s.rng.next_2d(), s.active)
@@ -219,7 +217,7 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
 
     shading = dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.abs(mi.Frame3f.cos_theta(bs.wo))
     factor = dr.select(delta, delta_weight * shading, value / bs.pdf) * (cos_out / cos_in)
-    # A failed sample may have a density and a direction: only its weight, which is 0, says that it failed
+    # A failed sample may have a density and a direction: only its weight of 0 shows that it failed
     s.active &= (bs.pdf > 0) & (dr.max(delta_weight) > 0) & (dr.max(factor) > 0) & dr.isfinite(dr.max(factor))
     s.throughput = dr.select(s.active, s.throughput * factor, 0)
 
@@ -230,10 +228,10 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
 
 
 def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
-    """Russian roulette by the throughput relative to that at the start.
+    """Play Russian roulette with the throughput, relative to that at the start, as the probability of survival.
 
-    After ``rr_depth`` edges it is as in Mitsuba's ``path``. Before, it is played only with paths that have lost more
-    than two thirds of their throughput: they cost as much as others and carry less.
+    After ``rr_depth`` edges it works as in Mitsuba's ``path``. Before, only paths that have lost more than two thirds
+    of their throughput may end, since they cost as much as others and carry less.
     """
     left = dr.max(s.throughput) / dr.max(start.throughput)
     kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
@@ -242,10 +240,10 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
 
 
 def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
-    """What a BSDF takes to be evaluated with its directions exchanged: ``si`` with ``wo`` for ``si.wi``, and ``si.wi``.
+    """The arguments that evaluate a BSDF with exchanged directions: ``si`` with ``wo`` for ``si.wi``, and ``si.wi``.
 
-    Of these, ``bsdf.eval`` gives BSDF·|cos_s(wi)| of radiance that comes in along ``si.wi`` and leaves along ``wo``,
-    and ``bsdf.pdf`` the reverse density of a bounce from ``si.wi`` to ``wo``: that of sampling ``si.wi`` from ``wo``.
+    With them ``bsdf.eval`` is BSDF·|cos_s(wi)| for radiance that arrives along ``si.wi`` and leaves along ``wo``, and
+    ``bsdf.pdf`` is the density of sampling ``si.wi`` from ``wo``, the reverse of a bounce from ``si.wi`` to ``wo``.
     """
     turned = mi.SurfaceInteraction3f(si)
     wi = mi.Vector3f(si.wi)
@@ -256,9 +254,10 @@ def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceI
 def start_weights(
     start: Emission, lights: Lights, p: mi.Point3f, r2: mi.Float, mask: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """(dVCM, dVC) of light paths' first rays, which arrive at ``p`` over the squared distance ``r2``; see weights.py.
+    """The (dVCM, dVC) of the first rays of light paths, which arrive at ``p`` over a squared distance ``r2``.
 
-    Lanes outside ``mask`` may hold anything. With p_NEE = p_ω·cos₀/r² and e = ê·cos₀ an area light's cos₀ cancels.
+    See weights.py. Lanes outside ``mask`` may hold anything. An area light's cos₀ cancels, as p_NEE = p_ω·cos₀/r² and
+    e = ê·cos₀.
     """
     selection = lights.nee_probability(start.emitter, p)
     dvcm, dvc = weights.light_start(selection, start.factor), mi.Float(0)
@@ -277,7 +276,7 @@ def start_weights(
 
 
 def _record(s: LightState, dvcm: mi.Float, dvc: mi.Float) -> LightVertices:
-    """The vertex to be kept of a light path."""
+    """The record of a light path's vertex, to be kept."""
     return LightVertices(
         s.ray.o,
         s.ray.d,

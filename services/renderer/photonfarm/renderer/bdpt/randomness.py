@@ -1,14 +1,14 @@
 """Random numbers: Owen-scrambled Sobol' points, in pairs of dimensions, each with its own scramble.
 
-The points of a *sequence* are stratified together: the samples of one pixel for eye paths, all light paths of an image
-for light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol' whose index and
-coordinates are scrambled as Owen does, by hashing (Burley, *Practical Hash-based Owen Scrambling*, JCGT 2020; the
-permutation is that of Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point is uniform, and
-an estimate from them has the expectation of independent ones; sequences of different seeds, pixels or purposes are
-independent of each other.
+The points of a *sequence* are stratified together. A sequence is the samples of one pixel for eye paths, and all light
+paths of an image for light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol',
+whose index and coordinates are scrambled by Owen's method, with a hash (Burley, *Practical Hash-based Owen Scrambling*,
+JCGT 2020; the permutation is that of Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point
+is uniform, and an estimate has the same expectation as from independent points. Sequences of different seeds, pixels or
+purposes are independent of each other.
 
-Seeds enter the kernels as data, so another seed never compiles anything. The sensor's own sampler only sets the default
-number of samples per pixel: the two kinds of path would consume it differently.
+Seeds enter the kernels as data, so a new seed compiles nothing. The sensor's own sampler only sets the default number
+of samples per pixel, since the two kinds of path would draw from it differently.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ LIGHT, EYE, PAIRING, PHOTONS = range(4)
 _ULP = 1 / (1 << 24)
 
 SHIFTS = 64
-"""The depths of an eye path with a shift of their own; deeper ones use them again, which only correlates them."""
+"""The number of depths with a shift of their own; deeper eye vertices reuse them, which only correlates them."""
 
 
 def image_keys(seeds: Sequence[int]) -> mi.UInt32:
     """The seeds as device data [K]."""
     keys = mi.UInt32(list(seeds))
-    dr.make_opaque(keys)  # a single one would be a literal
+    dr.make_opaque(keys)  # a single seed would be a literal
     return keys
 
 
 def stream(key: mi.UInt32, purpose: int, number: mi.UInt32 | int = 0) -> mi.UInt32:
-    """The sequence of a key (an image's), a purpose and a number (a pixel's): Tiny Encryption (Zafar et al. 2010)."""
+    """The sequence of an image's key, a purpose and a pixel's number, by Tiny Encryption (Zafar et al. 2010)."""
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
 
 
 class RandomNumbers(Protocol):
-    """What the choice of a light asks of a source of random numbers."""
+    """A source of random numbers, as the choice of a light uses it."""
 
     def next_1d(self) -> mi.Float:
         """A number in [0, 1)."""
@@ -56,11 +56,11 @@ class RandomNumbers(Protocol):
 
 @dataclass(slots=True)
 class Sampler:
-    """A point of a sequence, read one pair of dimensions after the other; it is part of the loops' state."""
+    """A point of a sequence, whose pairs of dimensions are read one after the other; part of the loops' state."""
 
-    sequence: mi.UInt32  # which sequence
-    index: mi.UInt32  # which point, its bits reversed
-    dimension: mi.UInt32  # pairs read so far
+    sequence: mi.UInt32  # the number of the sequence
+    index: mi.UInt32  # the number of the point, its bits reversed
+    dimension: mi.UInt32  # the number of pairs read so far
 
     def next_1d(self) -> mi.Float:
         """A number in [0, 1)."""
@@ -68,13 +68,13 @@ class Sampler:
         return _unit(_scramble(dr.brev(_scramble(self.index, seed)), _mix(seed)))
 
     def next_independent(self) -> mi.Float:
-        """A number in [0, 1) that is not stratified, for what stratifying gains nothing."""
+        """A number in [0, 1) that is not stratified, for uses that gain nothing from stratification."""
         return mi.Float(_mix(self._next_seed() ^ self.index) >> 8) * _ULP
 
     def next_2d(self) -> mi.Point2f:
         """A point in [0, 1)²."""
         seed = self._next_seed()
-        x = _scramble(self.index, seed)  # the bits of a shuffled index, reversed: Sobol's first coordinate
+        x = _scramble(self.index, seed)  # the reversed bits of a shuffled index, which are Sobol's first coordinate
         index = dr.brev(x)
         first = _mix(seed)
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
@@ -91,9 +91,9 @@ def sampler(sequence: mi.UInt32, index: mi.UInt32) -> Sampler:
 
 
 def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
-    """The shifts from eye paths' numbers to those of the light paths that they are joined to [K·64·n_C].
+    """The shifts from numbers of eye paths to numbers of the light paths that they are joined to, [K·64·n_C].
 
-    They are uniform below the number of light paths: one for each image of a launch, depth and connection.
+    There is one for each image of a launch, depth and connection, uniform below the number of light paths.
     """
     table = [
         np.random.default_rng([seed, PAIRING, launch.first_sample]).integers(
@@ -105,11 +105,11 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
 
 
 def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
-    """A stratified point in [0, 1)² for each of ``n`` [1] lanes, close in space for lanes that are close in number.
+    """A stratified point in [0, 1)² for each of ``n`` [1] lanes; lanes of close numbers get points close to each other.
 
     Lane k gets a uniform point of the k-th piece of Morton's curve, cut into n equal pieces (He and Owen, *Extensible
-    grids: uniform sampling on a space filling curve*, 2016). Rays that start alike are traced faster together. The
-    place along the curve has 32 bits, and so 16 for each coordinate: the bits below those are independent.
+    grids: uniform sampling on a space filling curve*, 2016). Rays with similar origins are traced faster together.
+    The place along the curve has 32 bits, 16 for each coordinate; the bits below them are drawn independently.
     """
     length = mi.UInt32((mi.Float64(lane) + mi.Float64(rng.next_1d())) * (4294967296.0 / mi.Float64(n)))
     below = mi.Point2f(rng.next_independent(), rng.next_independent())
@@ -118,7 +118,7 @@ def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
 
 
 def _every_other_bit(x: mi.UInt32) -> mi.UInt32:
-    """The 16 bits of even number, moved together."""
+    """The 16 bits at even places, moved together."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits
     return x
@@ -135,7 +135,7 @@ def _mix(x: mi.UInt32) -> mi.UInt32:
 
 
 def _scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """A scramble of Owen's kind for numbers whose bits are reversed: bits flip by a hash of the bits below them."""
+    """Owen's scramble of a number whose bits are reversed: each bit is flipped by a hash of the bits below it."""
     x = x + seed
     x ^= x * 0x6C50B47C
     x ^= x * 0xB82F1E52
@@ -144,7 +144,7 @@ def _scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def _sobol_1(index: mi.UInt32) -> mi.UInt32:
-    """Sobol's second coordinate, its bits reversed: Pascal's triangle modulo 2 times the bits of the index."""
+    """The reversed bits of Sobol's second coordinate: Pascal's triangle modulo 2, times the bits of the index."""
     x = index
     for shift, bits in ((16, 0x0000FFFF), (8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
         x = x ^ ((x >> shift) & bits)
@@ -152,5 +152,5 @@ def _sobol_1(index: mi.UInt32) -> mi.UInt32:
 
 
 def _unit(reversed_bits: mi.UInt32) -> mi.Float:
-    """The number in [0, 1) whose binary digits these are, the last one first: the 24 that a Float holds."""
+    """The number in [0, 1) with these binary digits, given in reverse order; it keeps the 24 that a Float holds."""
     return mi.Float(dr.brev(reversed_bits) >> 8) * _ULP

@@ -1,4 +1,4 @@
-"""Launches are traced by Python once and replayed afterwards, by ``dr.freeze`` with its key made explicit."""
+"""Records launches: Python traces each kind once, by ``dr.freeze`` with an explicit key; later ones are replayed."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ State = TypeVarTuple("State")
 log = logging.getLogger(__name__)
 
 RECORDINGS = 16
-"""The number of recordings kept: the oldest makes room for a new one."""
+"""The number of recordings kept; the oldest is dropped for a new one."""
 
 ATTEMPTS = 2
+"""The number of attempts at a recording."""
 
 
 class Recorder:
-    """Calls a function of a scene, a sensor and other arguments, recorded once for each kind of call.
+    """Calls a function of a scene, a sensor and other arguments, and records it once for each kind of call.
 
-    ``dr.freeze`` tells calls apart by its arguments' variables and by the hashes of Python's numbers among them, and
-    has been seen to replay the recording of another number (Dr.Jit 1.5). So each kind has a recording of its own.
+    ``dr.freeze`` distinguishes calls by the variables among the arguments and by hashes of Python's numbers. It has
+    been seen to replay the recording of another number (Dr.Jit 1.5), so each kind has a recording of its own.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -33,11 +34,11 @@ class Recorder:
         self._recorded: dict[Hashable, _Recording] = {}
 
     def __call__(self, kind: Hashable, scene: mi.Scene, sensor: mi.Sensor | None, *arguments: Any) -> Any:
-        """The function's result. ``kind`` holds every number that the kernels are made for.
+        """The function's result. ``kind`` holds every number for which the kernels are compiled.
 
-        Where recording fails, the function is called as it is: Mitsuba makes some tables when they are first asked for,
-        which fails one attempt. It is called so for good once a second attempt has failed (lenses). The scene and the
-        sensor of a recording are kept, so that no others are taken for them.
+        If an attempt to record fails, the function is called directly. One attempt may fail because Mitsuba builds some
+        tables when they are first needed. After a second failure, as with lenses, the function is always called
+        directly. A recording keeps its scene and sensor, so that no others can get their ids.
         """
         kind = (id(scene), id(sensor), kind)
         if kind not in self._recorded:
@@ -57,7 +58,7 @@ class Recorder:
 
 @dataclass(slots=True)
 class _Recording:
-    """A function recorded for one kind of call, and how many attempts have failed."""
+    """A function recorded for one kind of call, and the number of failed attempts."""
 
     call: Callable[..., Any]
     scene: mi.Scene
@@ -66,7 +67,7 @@ class _Recording:
 
 
 def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, recorded; in two variants at most, as Dr.Jit records again where it took data for a constant."""
+    """The recorded function, in at most two variants: Dr.Jit records again if it took data for a constant."""
     frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
     return frozen
 
@@ -79,10 +80,10 @@ def traced_once(
     labels: Sequence[str],
     label: str,
 ) -> tuple[*State]:
-    """``dr.while_loop`` in symbolic mode, without the second tracing by which Dr.Jit looks for loop-invariant state.
+    """Run ``dr.while_loop`` in symbolic mode, without the second tracing by which Dr.Jit looks for invariant state.
 
-    Tracing is most of the time of a small image, and these loops have next to no invariant state to find. Dr.Jit
-    evaluates the annotations of dataclasses in ``state``: what they name must be there at run time.
+    Tracing takes most of the time of a small image, and these loops have hardly any invariant state. Dr.Jit evaluates
+    the annotations of dataclasses in ``state``, so the names in them must exist at run time.
     """
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         final: tuple[*State] = dr.while_loop(state, cond, body, labels=labels, label=label, mode="symbolic")

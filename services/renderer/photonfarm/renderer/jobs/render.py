@@ -145,7 +145,7 @@ class ShardRenderer:
         the planned one, IncompleteError if renders stay non-finite or buffers are.
         """
         if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
-            raise QueueError(f"scene {scene_id}, job {job}: is not of the store {self._store.root}")
+            raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
         if stored.is_done(job):
             return False
         loaded = self._scene(scene_id)

@@ -1,13 +1,13 @@
-"""Image-space buffers of a view [supplement 1.3]. Free of noise.
+"""The image-space buffers of a view [supplement 1.3], which have no noise.
 
-**Depth and normal** are those of the first hit of one ray through each pixel centre; **albedo** is a mean over the
-pixel's area, by a regular grid of 4 × 4 rays, as the radiance of a box filter is: a single ray would show another
-texel, and at edges another surface.
+**Depth and normal** are those of the first hit of one ray through each pixel centre. **Albedo** is a mean over the
+pixel's area, by a regular grid of 4 × 4 rays, because the radiance of a box filter is such a mean too. A single ray
+would show another texel, and at edges another surface.
 
 **Albedo** is the diffuse reflectance of the first surface, and 0 for surfaces without a diffuse part (glass, mirrors,
-metals, null). Mitsuba's `eval_diffuse_reflectance` returns, for those without one of their own, π times the whole
-BSDF at normal exitance, highlights and all (25 for a rough conductor); so it is called only if the BSDF's flags have
-a diffuse reflection. It is exact for diffuse, plastic and roughplastic, and for twosided, bumpmap, normalmap and mask
+metals, null). For BSDFs without a function of their own Mitsuba's `eval_diffuse_reflectance` returns π times the whole
+BSDF at normal exitance, with its highlights (25 for a rough conductor). So it is called only if the BSDF's flags have a
+diffuse reflection. It is exact for diffuse, plastic and roughplastic, and for twosided, bumpmap, normalmap and mask
 around them; for principled it is the base colour, whatever metallic and spec_trans are; blendbsdf blends, and a rough
 conductor in a blend adds its highlight. A texture is looked up without filtering. Two-sided materials return the
 reflectance of the visible side. From behind a one-sided one has albedo 0, as it renders black there; principled and
@@ -17,7 +17,7 @@ mask, which let light through to their backs, have the albedo of their fronts.
 two-sided or not, has the normal of its front. Bump and normal maps are part of the BSDF and not of the normals.
 
 **Null and mask** surfaces count as surfaces: a mask has the normal, depth and albedo of what it masks, whatever its
-opacity there, as at the first intersection.
+opacity at that place.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
 
 GRID = 4
-"""The rays along each axis of a pixel whose mean is the albedo."""
+"""The number of rays along each axis of a pixel, over which albedo is averaged."""
 
 RAYS = 1 << 20
-"""The rays traced at a time, at least those of one point of each pixel: 16 of them for an image of 256²."""
+"""The number of rays traced at a time, or one for each pixel if that is more."""
 
 
 def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
     """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is hit.
 
-    With a `recorder` of `look` Python runs only once, which is half of the time in scenes of many materials.
+    With a `recorder` of `look`, Python runs only the first time; it takes half of the time in scenes of many materials.
     """
     camera = Camera.of(view, spec)
     directions = camera.rays()

@@ -1,4 +1,4 @@
-"""Candidates at equal cost: the error of each in the CPU time that a spec accepts for a half-estimate."""
+"""Candidates compared at equal cost: their errors in the CPU time that a spec allows for a half-estimate."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from photonfarm.renderer.strategy.pilot import longest
 
 @dataclass(frozen=True, slots=True)
 class CandidateAtCost(MeasuredCandidate):
-    """A candidate at the samples per pixel that fit the time; `time_s` is that of such a half-estimate."""
+    """A candidate with the samples per pixel that fit the time; `time_s` is the time of such a half-estimate."""
 
     half_spp: int
     half_error: float  # relMSE of such a half-estimate
-    fits: bool  # whether a sample per pixel costs about that time or less
+    fits: bool  # whether at least about one sample per pixel fits the time
 
 
 def offers(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
     """Every measured candidate, at the samples per pixel that fit `half_s`.
 
-    The variance of an image is that of a sample over their number, so error × time is error a sample × time / samples.
+    The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
+    sample × time / n.
     """
     plain = measurement.row(PLAIN)
     return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
@@ -51,7 +52,7 @@ def _per_sample_s(row: CandidateRow, half_s: float) -> float:
 
 
 def best(offered: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:
-    """The offer of least error × time, among those measured longest."""
+    """The offer with the least error × time, among the candidates that were measured longest."""
     return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
 
 
@@ -60,10 +61,11 @@ def _cost(offer: CandidateAtCost) -> float:
 
 
 def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
-    """The settings to take if the given ones are accepted now: themselves, unless others are significantly better.
+    """The settings to choose, given present ones: these, or others that are significantly better at the same cost.
 
-    A whole number of samples changes the cost a little, at which another candidate may be better still; so gains are
-    followed until there is none, and a plan that is written confirms itself. A cycle gains nothing.
+    Rounding to a whole number of samples changes the cost a little, and at the new cost another candidate may be better
+    still. So the search goes on until nothing is better, and a plan made for the result chooses it again. If the search
+    comes back to earlier settings, the present ones stay.
     """
     seen = [(candidate, half_spp)]
     while (better := _better(measurement, *seen[-1])) is not None:

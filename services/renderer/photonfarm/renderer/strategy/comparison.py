@@ -20,13 +20,13 @@ WORTHWHILE = 0.05
 
 
 class RelativeErrors(Frozen):
-    """The relMSE of one image of a candidate, by views, with its unseen noise; for a single view, by pairs.
+    """A candidate's relMSE of one image, with the charge for missed light, by views, or by pairs of a single view.
 
-    It is accompanied by that of plain path tracing over the images of the same seeds: both have the same rare bright
-    samples, so that their ratio is known better than either.
+    `plain` has the same values of plain path tracing, over images of the same seeds. Both have the same rare bright
+    samples, so their ratio is more certain than either of them.
     """
 
-    images: int  # rendered, over all views
+    images: int  # number of rendered images, over all views
     own: tuple[float, ...]
     plain: tuple[float, ...]
 
@@ -41,11 +41,12 @@ class RelativeErrors(Frozen):
         return self.mean / _mean(self.plain)
 
     def relative_spread(self, other: RelativeErrors) -> float | None:
-        """The standard error of the ratio of two candidates' ratios, over itself; None for a single value each.
+        """The relative standard error of one candidate's `ratio` over another's; None from a single value each.
 
-        It is that of a ratio of means (Cochran, *Sampling Techniques*, 6.5), over views: so it contains the
-        contributions of the noise and of the choice of views; that of the times is negligible. For equal numbers of
-        images, plain path tracing's cancel; otherwise the two ratios are taken as independent, which overstates it.
+        It is the standard error of a ratio of means (Cochran, *Sampling Techniques*, 6.5), taken over views. So it
+        contains the noise and the choice of views; the error of measured times is negligible. If both candidates have
+        the same number of images, the errors of plain path tracing cancel. Otherwise the two ratios are taken as
+        independent, which overstates the result.
         """
         if self.images == other.images:
             return _standard_error(_scaled(self.own) - _scaled(other.own))
@@ -72,7 +73,7 @@ class MeasuredCandidate:
 
     candidate: Candidate
     errors: RelativeErrors
-    missed: float  # the part of the error inferred from light in other candidates' images (see `noise`)
+    missed: float  # the part of the error inferred from light that other candidates found (see `noise.missed`)
     time_s: float  # CPU time of one image
     relative_cost: float  # error × time over that of plain path tracing: the time to the same error
     spread: float | None  # standard error of relative_cost; None from a single pair of images
@@ -88,12 +89,12 @@ class Saving:
     """How much sooner one candidate reaches the error of another."""
 
     over: Candidate
-    factor: float  # time of the other over that of the one, to equal error
+    factor: float  # the other's time over this one's, to equal error
     spread: float | None  # its standard error
 
     @property
     def deviations(self) -> float:
-        """The standard errors of log(factor) above 0, which treats a ratio and its inverse alike; 0 if unknown."""
+        """log(factor) in standard errors, so that a factor and its inverse differ only in sign; 0 if unknown."""
         if self.spread is None:
             return 0.0
         return math.log(self.factor) / max(self.spread / self.factor, 1e-9)
@@ -105,7 +106,7 @@ class Saving:
 
 
 def saving(one: MeasuredCandidate, over: MeasuredCandidate) -> Saving:
-    """The saving of one candidate over another, both at their cost."""
+    """The saving of one candidate over another, from the errors and times of both."""
     factor = over.relative_cost / one.relative_cost
     relative = over.errors.relative_spread(one.errors)
     return Saving(over.candidate, factor, None if relative is None else factor * relative)

@@ -1,4 +1,4 @@
-"""The CPU time of images as a function of their samples per pixel."""
+"""Measures the CPU time of an image as a function of its samples per pixel."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 
 from photonfarm.renderer.strategy.candidate import Candidate, Render
 
-LEAST_SAMPLES, MOST_SAMPLES = 0.7, 65536
-"""The least samples per pixel that must fit a time, and the most of a spec.
+LEAST_SAMPLES = 0.7
+"""The least samples per pixel that a time must pay for: rounded to 1 they cost 1.4 times as much at most."""
 
-Rounded up to 1, the least cost 1.4 times as much at most.
-"""
+MOST_SAMPLES = 65536
+"""The largest number of samples per pixel in a spec."""
 
 LEAST_TURNS, MOST_TURNS = 3, 60
 
 RANGE = 4
-"""The largest over the smallest timed number of samples: the smallest is that of a half-estimate, if both fit."""
+"""The larger over the smaller of the two numbers of samples that are timed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,20 +30,20 @@ class ImageCost:
 
     @classmethod
     def through(cls, few: int, few_s: float, many: int, many_s: float) -> ImageCost:
-        """The cost through the times at two numbers of samples per pixel."""
+        """The cost as a line through the times at two numbers of samples per pixel."""
         sample_s = max((many_s - few_s) / (many - few), 0.02 * few_s / few)  # if noise hides it
         return cls(max(few_s - few * sample_s, 0.0), sample_s)
 
     def time_s(self, spp: float) -> float:
-        """The time of an image with so many samples per pixel."""
+        """The time of an image with `spp` samples per pixel."""
         return self.fixed_s + spp * self.sample_s
 
     def pays(self, seconds: float) -> bool:
-        """Whether a sample per pixel fits a time."""
+        """Whether a time pays for about one sample per pixel: for LEAST_SAMPLES."""
         return seconds >= self.time_s(LEAST_SAMPLES)
 
     def bought(self, seconds: float) -> int:
-        """The samples per pixel that fit a time: a whole number as in a spec, at least 1."""
+        """The samples per pixel that a time pays for, as a whole number of at least 1."""
         return int(np.clip(round((seconds - self.fixed_s) / self.sample_s), 1, MOST_SAMPLES))
 
 
@@ -72,7 +72,7 @@ def time_images(
 def _samples(
     render: Render, candidate: Candidate, half_spp: int, seconds: float, clock: Callable[[], float]
 ) -> tuple[int, int]:
-    """The two numbers of samples per pixel; an image of each takes about `seconds` together at most."""
+    """The two numbers of samples per pixel to time; two such images take about `seconds` together at most."""
     render(candidate, 0, 1)  # compiles
     one = _time_of(render, candidate, 1, clock)  # includes the fixed part, which more samples do not repeat
     few = int(np.clip(seconds / ((1 + RANGE) * max(one, 1e-9)), 1, half_spp))

@@ -1,4 +1,4 @@
-"""The measurement of a spec's scene: everything a plan follows from, as it is kept on disk."""
+"""The measurement of a spec's scene: everything that a plan depends on, as it is kept on disk."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ GRID = tuple(
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 
-More light paths than eye paths help only with light that splats alone find: connections use as many of them as there
-are eye vertices, so that a ratio above 1 would gain them nothing.
+A light ratio above 1 helps only with light that splats alone find. Connections gain nothing from it: they use one light
+path for each eye vertex, however many there are.
 """
 
 FIRST_ROUND = 0.4
 """The largest share of the pilot's time for its first round: later rounds decide between the best."""
 
 TIMING = 0.2
-"""The share of the time for timing images."""
+"""The share of the given time that is spent on timing images."""
 
 LEAST_VIEWS, MOST_VIEWS = 3, 8
 
 LIT = 16
-"""The configurations in which light paths are traced: photons that contribute in any of them are worth storing."""
+"""The number of configurations in which light paths are traced, to see which photons are worth storing."""
 
 Log = Callable[[str], None]
 """A function that takes a line about the progress."""
@@ -64,7 +64,7 @@ class CandidateRow(Frozen):
 
 
 class Measurement(Frozen):
-    """One pilot of one scene: all that a plan depends on, whatever the spec's settings for what plans decide."""
+    """One pilot of one scene: all that a plan depends on besides the settings that it decides."""
 
     film: Film  # of the pilot
     spp: int
@@ -75,7 +75,7 @@ class Measurement(Frozen):
     left_out: tuple[str, ...]
     rows: tuple[CandidateRow, ...]  # empty if every view is black
     shared: float  # as in `Choice`
-    filled: tuple[float, ...]  # as in `light_reach`, with the next two
+    filled: tuple[float, ...]  # this and the next two as in `light_reach`
     near: tuple[tuple[float, ...], ...]
     power: tuple[tuple[float, ...], ...]
     asked_s: float  # CPU time that the pilot was given
@@ -93,7 +93,7 @@ class Measurement(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """The candidates' images: their film and samples per pixel, and the pilot's results."""
+    """The comparison of candidates: the film and samples per pixel of the images, and the pilot's results."""
 
     film: Film
     spp: int
@@ -175,8 +175,8 @@ def _images(cost: ImageCost, half_s: float, spp: int) -> float:
 def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
     """The film, samples per pixel and number of views whose first round takes no more than its share of the time.
 
-    They are those of the spec, and as many views as there is time for. Samples are reduced first; then the film is
-    halved, as long as the samples dominate the time.
+    Film and samples are those of the spec if there is time for them, and there are as many views as there is time for.
+    Otherwise samples are reduced first; then the film is halved, as long as the samples dominate the time.
     """
     fixed, sample = sum(cost.fixed_s for cost in costs.values()), sum(cost.sample_s for cost in costs.values())
     images = 2 + max(1.0, SCOUTS / len(costs))
@@ -190,9 +190,9 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
 
 
 def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
-    """The cost that was timed beforehand, corrected by the many images of the pilot.
+    """A candidate's row: its cost as timed beforehand, corrected by the times of the pilot's many images.
 
-    If the pilot's images have far fewer samples, they are not used: their fixed part hides the time of their samples.
+    Images of the pilot with far fewer samples correct nothing, as their fixed part hides the time of their samples.
     """
     similar = RANGE * pilot_spp >= half_spp
     correction = measured.time_s / cost.time_s(pilot_spp) if similar else 1.0

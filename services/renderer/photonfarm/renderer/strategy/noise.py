@@ -1,51 +1,16 @@
-"""How noisy a candidate's images are, including noise that the pilot is too short to see.
+"""The noise of a candidate's images: noise that the pilot sees, and a charge for light that it is too short to see.
 
-A candidate's error is the variance between its images, and where another finds significantly more light in some block
-of the image, the variance that it must have there to have missed that light. Rare bright samples that all candidates
-have at equal seeds do not count. The rest of this text says how much is significant, and how much is charged.
+Shape letters: H W image, B × B blocks, V views. Of a pixel, x is the value, r the reference, and y the weighted value
+x/√(r² + ε·mean(r)²). The mean variance of y is the relative mean squared error (relMSE) of one image.
 
-Shape letters: H W image, B × B blocks. All is measured in images of the pilot, whatever their samples per pixel. Seen
-from a pixel, x is its value, r the reference of the view, and y = x/√(r² + ε·mean(r)²) its weighted value; so that the
-mean variance of y is the relative mean squared error (relMSE) of one image. ε = 0.01.
+**Noise that is seen** is mean (y_a − y_b)²/2 over two independent images a, b of a view. Rare bright samples that all
+candidates share are left out (`not_counted`).
 
-**Noise that is seen.** Two independent images a, b of one view give mean (y_a − y_b)²/2.
-
-**Noise that all share.** Some light no technique finds well (a caustic seen in a mirror). With equal seeds all
-candidates have the same rare bright samples of it, and whether a short pilot has one is chance. In each pair that part
-is the mean over pixels of the least (y_a − y_b)²/2 of all candidates, and what of it exceeds 8 times its median over
-the pairs of a view is not counted. Where that part rules, candidates differ by their time at most; where it does not,
-without bound. In later rounds "all" are those still measured, though one that was dropped may have avoided the sample:
-it was dropped on pairs in which it took part, and from those left the same is subtracted, so that a choice among them
-is off by the ratio of their times at most.
-
-**Noise that is not seen.** A technique that finds some light with a small probability q a sample has a variance of
-about E²/q there, E the light's share in y; but in a pilot of N samples with N·q < 1 it mostly sees neither that
-variance nor that light. The light is then missing from its mean. As all candidates have one mean, its mean m over N
-independent samples has E[N·(m − μ)²] = var y, whatever the tails; so where another candidate d finds significantly
-more, the candidate is charged with
-
-    missed = mean over blocks of max over d of  N · max(0, (m_d − m)² − t²·(s² + s_d²)),    m_d > m,
-
-N the samples behind the mean that fewer are behind (what little evidence there is against a candidate does not grow
-with the candidate's own images), s the standard errors of the block means: nothing while a deficit is within t standard
-errors, and growing from 0 beyond. It is what is least plausible (an event missed by N samples is as rare as 1/N, or
-rarer), so that it understates what is missed. One lucky sample does not convict others: a mean that rests on one sample
-has a standard error of its own size. The blocks are tried at several sizes, since light may be missing in a spot or all
-over; the largest counts.
-
-**How sure that is.** Pixels depend on each other where eye paths are joined to the same light paths: a block mean then
-has ρ times the variance that independent pixels would give it, measured up to 40. So in a block of n pixels
-
-    s² = max(ρ · mean variance of a pixel / n, variance between the images) / images,    N = n · images / ρ.
-
-One block has few pairs of images, but a candidate's settings are the same everywhere: of each pair in each view, R is
-the mean over the M blocks of (variance of the block mean between the two images) / (mean variance of a pixel / n), and
-ρ the mean of R, 1 at least. Pairs are independent, the blocks of one image may not be: by Satterthwaite's rule a pair
-has 2·mean(R)²/var(R) degrees of freedom, between 1 and M, and s² that times the number of pairs. Where the variance
-between its images is the larger, as near a light, a block stands for itself, with the pairs of its view. A difference
-has the degrees of freedom ν of Welch and Satterthwaite, and t is the quantile of Student's distribution at the
-probability that a normal one exceeds z = 4, rather too large for small ν: 210 for ν = 2, 7.7 for ν = 8, 4.3 for ν = 64.
-So a single pair convicts next to nobody.
+**Light that is missed.** A technique that finds some light with a small probability may find none of it in a short
+pilot. Its images then lack that light, and show no noise from it either. But all candidates have the same mean image,
+so another candidate's images show what is missing. A mean m over N independent samples has E[N·(m − μ)²] = var y. So a
+candidate whose mean m of a block is significantly below the mean m_d of another is charged N·(m_d − m)², less what
+chance explains (`missed`).
 """
 
 from __future__ import annotations
@@ -60,14 +25,16 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_means
 
 EPSILON = 0.01
+"""ε, which bounds the weights of dark pixels."""
+
 BLOCKS = (1, 4, 16)
 """The numbers of blocks along each side of the image, for missing light."""
 
 SIGNIFICANT = 4.0
-"""The limit in standard errors, if these were exact: exceeded by chance once in 30 000 blocks, at almost no charge."""
+"""The limit z, in standard errors: if these were exact, chance would exceed it in one of 30 000 blocks."""
 
 SHARED = 8.0
-"""The multiple of its median beyond which the part that all candidates share is not counted."""
+"""The multiple of its median up to which the noise that all candidates share is counted."""
 
 Blocks = NDArray[np.float64]
 
@@ -75,9 +42,9 @@ Blocks = NDArray[np.float64]
 def view_weights(images: Sequence[F32]) -> F32 | None:
     """1/√(r² + ε·mean(r)²) of a view, (H, W, 3), from images that serve no other purpose; None for a black view.
 
-    The weighted images must not be among them: a bright sample in r would divide itself away, and with it the very
-    noise to be measured. r is the mean image, or its mean over 3 × 3 pixels where that is brighter: few images may miss
-    a light in the corner of a pixel, but not in all pixels around it.
+    The weighted images must not be among them: a bright sample in r would hide the noise that it causes. r is the mean
+    image, or its mean over 3 × 3 pixels where that is brighter: few images may miss a light in the corner of a pixel,
+    but not in all pixels around it.
     """
     pooled = np.mean(images, axis=0, dtype=np.float64)
     edged = np.pad(pooled, ((1, 1), (1, 1), (0, 0)), mode="edge")
@@ -87,13 +54,22 @@ def view_weights(images: Sequence[F32]) -> F32 | None:
 
 
 def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[float], float]:
-    """The relMSE of one image from each candidate's pair of images, and the part that all of them share."""
+    """The relMSE of one image from each candidate's pair of images, and the part that all candidates share.
+
+    The shared part is the mean over pixels of the least (y_a − y_b)²/2 of all candidates.
+    """
     squares = [((a.astype(np.float64) - b) * weights) ** 2 / 2 for a, b in pairs]
     return [float(square.mean()) for square in squares], float(np.minimum.reduce(squares).mean())
 
 
 def not_counted(shared: Sequence[float]) -> NDArray[np.float64]:
-    """The uncounted part of what all candidates share, for each pair of images of a view."""
+    """The part of the shared noise that is not counted, for each pair of images of a view: what exceeds 8 medians.
+
+    Some light no technique finds well, such as a caustic seen in a mirror. With equal seeds all candidates have the
+    same rare bright samples of it, and chance decides whether a short pilot has one. In later rounds the candidates are
+    those still measured, and the same part is subtracted from each. So a choice among them is wrong by no more than the
+    ratio of their times.
+    """
     return np.maximum(np.array(shared) - SHARED * np.median(shared), 0)
 
 
@@ -120,7 +96,7 @@ class _Evidence:
 
 @dataclass(slots=True)
 class BlockSums:
-    """Sums over one candidate's images of all views, for the light that is missing."""
+    """Sums over one candidate's images of all views, from which `missed` is computed."""
 
     _grids: dict[int, dict[int, _Grid]] = field(default_factory=dict)  # by size and view
     _ratios: dict[int, list[float]] = field(default_factory=dict)  # by size: the ratio that ρ is the mean of, by pairs
@@ -142,7 +118,19 @@ class BlockSums:
             self._ratios.setdefault(blocks, []).append(ratio)
 
     def evidence(self, blocks: int) -> _Evidence:
-        """The means, standard errors, N and ν of the module's docstring."""
+        """The means of blocks of n pixels, their squared standard errors s², samples N and degrees of freedom.
+
+            s² = max(ρ · mean variance of a pixel / n, variance between the images) / images,    N = n · images / ρ
+
+        Pixels depend on each other where eye paths are joined to the same light paths. The variance of a block mean is
+        then ρ times that of independent pixels; ρ up to 40 was measured. One block has few pairs of images, but a
+        candidate's settings are the same everywhere. So ρ is the mean of R over all pairs, and at least 1. R is the
+        mean over the M blocks of (variance of the block mean between the two images) / (mean variance of a pixel / n).
+
+        Pairs are independent, but the blocks of one image may not be. By Satterthwaite's rule a pair has
+        2·mean(R)²/var(R) degrees of freedom, between 1 and M; s² has that times the number of pairs. Where the variance
+        between the images is the larger one, as near a light, a block has one for each pair of its own view.
+        """
         grids, ratios = list(self._grids[blocks].values()), np.array(self._ratios[blocks])
         pairs = np.array([[[float(grid.pairs)]] for grid in grids])
         independent = np.stack([np.asarray(grid.pixel_variance) for grid in grids]) / (grids[0].pixels * pairs)
@@ -158,17 +146,27 @@ class BlockSums:
         )
 
 
-def missed(tally: BlockSums, others: Sequence[BlockSums]) -> float:
-    """The charge of the module's docstring, mean over the views: relMSE that the pilot was too short to see.
+def missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
+    """The charge for light that other candidates find and this one misses, as relMSE, mean over the views.
 
-    All tallies are of the same views, in the same order.
+    For each view it is the largest over the sizes of blocks, since light may be missing in a spot or everywhere, of
+
+        mean over blocks of max over d of  N · max(0, (m_d − m)² − t²·(s² + s_d²)),    m_d > m.
+
+    m and s are the candidate's block mean and its standard error, m_d and s_d those of another candidate d, and t is
+    the limit of `_limit`. N is the smaller of the two numbers of samples, so that weak evidence against a candidate
+    does not grow with the candidate's own images. The charge is 0 up to t standard errors, and grows from there. It
+    takes 1/N for the probability of light that N samples missed. That probability may be lower, so the charge is rather
+    too small. One lucky sample charges no other candidate: the standard error of its mean is as large as the mean.
+
+    All sums are over the same views, in the same order.
     """
-    return float(np.max([_missed_in_blocks(tally, others, blocks) for blocks in BLOCKS], axis=0).mean())
+    return float(np.max([_missed_in_blocks(sums, others, blocks) for blocks in BLOCKS], axis=0).mean())
 
 
-def _missed_in_blocks(tally: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
+def _missed_in_blocks(sums: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
     """The charge of each view, (V,), for one size of blocks."""
-    own = tally.evidence(blocks)
+    own = sums.evidence(blocks)
     charge = np.zeros_like(own.mean)
     for more in (other.evidence(blocks) for other in others):
         deficit = np.maximum(more.mean - own.mean, 0)
@@ -180,7 +178,10 @@ def _missed_in_blocks(tally: BlockSums, others: Sequence[BlockSums], blocks: int
 def _limit(a: _Evidence, b: _Evidence) -> Blocks:
     """t²·(s² + s_d²): the square of the difference of two block means that chance explains, (V, B, B).
 
-    The quantile is that of `statistics.student_to_normal`, solved for t.
+    The difference has the degrees of freedom ν of Welch and Satterthwaite. t is the quantile of Student's distribution
+    at the probability with which a normal variable exceeds z = 4, by `statistics.student_to_normal` solved for t. That
+    is rather too large for small ν: 210 for ν = 2, 7.7 for ν = 8, 4.3 for ν = 64. So a single pair of images hardly
+    ever causes a charge.
     """
     variance = a.variance + b.variance
     pieces = a.variance**2 / a.freedom + b.variance**2 / b.freedom

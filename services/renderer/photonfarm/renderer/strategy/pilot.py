@@ -17,7 +17,7 @@ from photonfarm.renderer.strategy.reasons import BLACK, reasons_for
 from photonfarm.renderer.strategy.rounds import Rounds
 
 LEAST_PAIRS = 4
-"""The pairs of images in the first round, over all views: fewer would give no standard error."""
+"""The least number of pairs of images in the first round, over all views: fewer would give no standard error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Choice:
     candidate: Candidate
     measured: tuple[MeasuredCandidate, ...]  # in the order of the candidates given
     reasons: tuple[str, ...]  # sentences
-    shared: float  # relMSE of the rare bright samples that all candidates share: not in `error` (see `noise`)
+    shared: float  # relMSE of the rare bright samples that all candidates share, which `error` leaves out (see `noise`)
     views: int  # the views that were not black
     spent_s: float  # CPU time of the whole pilot
     scouting_s: float  # the part before the first measurement: kernels, and the images that give the weights
@@ -48,14 +48,16 @@ def choose(
     later: Mapping[Candidate, float] | None = None,
     clock: Callable[[], float] = time.process_time,
 ) -> Choice:
-    """The candidate of least error × time over some views, each given by a function that renders it.
+    """The candidate with the least error × time over some views; each of `renders` renders one view.
 
-    `seconds` of `clock` (CPU time) bound the pilot; its first round is always completed. It ends earlier once one
-    candidate is left that seems to miss nothing. Candidates in `keep`, and plain path tracing, which is added if it is
-    missing, are measured to the end for comparison. Images are compared at `spp`, and their time includes an image's
-    fixed part, so `spp` should be that of later use; or `later` gives for each candidate the factor from the time of
-    one image of the pilot to the time in later use until the error is the same. Raises ValueError without views, or for
-    images that are not finite.
+    The pilot takes `seconds` of `clock` (CPU time) at most, but always completes its first round. It ends earlier when
+    a single candidate is left that does not seem to miss light. Candidates in `keep` are measured to the end for
+    comparison, and so is plain path tracing, which is added if it is missing.
+
+    Images are compared at `spp` samples per pixel, and their time includes the fixed part of an image. So `spp` should
+    be that of later use. Otherwise `later` gives a factor for each candidate: the time that later use takes to the
+    error of one image of the pilot, over the time of that image. Raises ValueError without views, or for images that
+    are not finite.
     """
     views = [renders] if callable(renders) else list(renders)
     if not views:
@@ -71,7 +73,7 @@ def choose(
 
 
 def _halve(rounds: Rounds, every: Sequence[Candidate], pairs: int, kept: set[Candidate], seconds: float) -> None:
-    """Drop the worse half and measure the others twice as long, repeatedly; all have `pairs` in each view."""
+    """Drop the worse half and measure the others twice as long, repeatedly; each has `pairs` of each view before."""
     active = list(every)
     while len(active) > 1:
         ranked = sorted(active, key=rounds.cost)
@@ -86,7 +88,7 @@ def _halve(rounds: Rounds, every: Sequence[Candidate], pairs: int, kept: set[Can
 
 
 def _choice(rounds: Rounds, every: Sequence[Candidate]) -> Choice:
-    """The best of the candidates that were measured longest."""
+    """The choice of the best candidate among those that were measured longest."""
     spent, scouting = rounds.spent_s(), rounds.scouting_s
     if not rounds.weights:
         return Choice(PLAIN, (), (BLACK,), 0.0, 0, spent, scouting)
@@ -98,6 +100,6 @@ def _choice(rounds: Rounds, every: Sequence[Candidate]) -> Choice:
 
 
 def longest(candidates: Sequence[Candidate], images: Callable[[Candidate], int]) -> list[Candidate]:
-    """The candidates with the most images: among many, one with few may be best by chance."""
+    """The candidates with the most images, as one with few images may be the best by chance."""
     most = max(map(images, candidates))
     return [c for c in candidates if images(c) == most]

@@ -11,17 +11,17 @@ from photonfarm.renderer.strategy.comparison import CLEAR, MeasuredCandidate, is
 BLACK = "every view of the pilot is black: there is no light to model, so plain path tracing does"
 
 SUSPICIOUS = 0.05
-"""The share of a candidate's error inferred from light it misses above which that is examined and reported."""
+"""The share of missed light in a candidate's error above which it is examined and reported."""
 
 
 def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], shared: float) -> tuple[str, ...]:
-    """The reasons for a candidate among all that were measured.
+    """The reasons for choosing a candidate among all that were measured.
 
-    `shared`: relMSE of an image that all candidates share in rare bright samples (see `noise`).
+    `shared` is the relMSE of one image from rare bright samples that all candidates share (see `noise`).
     """
     reasons = [_against_plain(chosen, rows)]
     if alike := [str(row.candidate) for row in rows if row is not chosen and is_alike(row, chosen)]:
-        reasons.append(f"not told apart from it, within {CLEAR:g} standard errors: {', '.join(alike)}")
+        reasons.append(f"not distinguishable from it, within {CLEAR:g} standard errors: {', '.join(alike)}")
     reasons += [
         f"{row.candidate} misses light that others find: {row.missed / row.error:.0%} of its error is inferred from "
         "that, and the true one may be larger"

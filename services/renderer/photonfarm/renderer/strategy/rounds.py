@@ -52,7 +52,7 @@ class Rounds:
         self.scouting_s = 0.0
         self.weights: dict[int, F32] = {}  # by view; black views are left out
         self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
-        self._tallies = {c: BlockSums() for c in candidates}
+        self._block_sums = {c: BlockSums() for c in candidates}
         self._shared: dict[int, list[float]] = {}  # by view, of each pair
 
     # ------------------------------------------------------------------------------------------------------ rendering
@@ -87,7 +87,7 @@ class Rounds:
         self._shared.setdefault(view, []).append(shared)
         for (candidate, (a, b)), error in zip(pairs.items(), errors, strict=True):
             self._records[candidate][view].errors.append(error)
-            self._tallies[candidate].add(a, b, self.weights[view], view)
+            self._block_sums[candidate].add(a, b, self.weights[view], view)
 
     def _render(self, render: Render, candidate: Candidate, seed: int) -> F32:
         image = render(candidate, seed, self._spp)
@@ -119,7 +119,7 @@ class Rounds:
         return self._time(candidate) * self._later.get(candidate, 1.0)
 
     def _missed(self, candidate: Candidate) -> float:
-        return missed(self._tallies[candidate], [tally for c, tally in self._tallies.items() if c != candidate])
+        return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
         """The relMSE that counts, by pairs and views, (pairs, views)."""

@@ -139,7 +139,7 @@ def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> d
 
 
 def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Compare every pair of counts with the usual one at more samples. The path tracer (0, 0) may be noisy."""
+    """Compare every pair of counts with the usual pair at more samples; the path tracer, (0, 0), may be noisy."""
     scene = load(build(effort.size))
     truth = _images(scene, ALL[0], effort, TRUTH_SEEDS, effort.truth_spp)
     faults, ratios = [], []
@@ -152,7 +152,7 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
 
 
 def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Compare all lights with the even ones plus the odd ones, each switched off in place."""
+    """Compare the image of all lights with the sum of those of the even and the odd ones, switched off in place."""
     scene = load(build(effort.size))
     parameters = mi.traverse(scene)
     keys = _brightness_keys(parameters)
@@ -171,7 +171,10 @@ def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Compare radiances times 8 with the same seed, where only the exponent changes; and times 3 with other seeds."""
+    """Compare images of lights 8 times as bright with the same seed, and 3 times as bright with other seeds.
+
+    A factor of 8 changes only the exponents.
+    """
     scene = load(build(effort.size))
     before = _images(scene, ALL[0], effort, 0)
     _brighten(scene, 8)
@@ -183,15 +186,17 @@ def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], st
 
 
 _SUMS = 1e-5
-"""The largest difference of a pixel, relative to itself and the mean, that float32 sums alone can cause."""
-_NEAR, _SHARE = 1e-3, 0.9
-"""The limit of a near pixel, and the share of near pixels with one seed; in others a path met or missed an edge."""
+"""The largest relative difference of a pixel (see `_differences`) that float32 sums alone can cause."""
+_NEAR = 1e-3
+"""The relative difference below which two pixels count as near."""
+_SHARE = 0.9
+"""The share of pixels that must be near when both images have one seed; in the others a path met or missed an edge."""
 _NEAR_SCALED = {1e3: _NEAR, 1e-3: 2e-2}
-"""The limit by factor of scale: below one unit, ray offsets do not become smaller with the scene."""
+"""The same limit by scale factor: ray offsets shrink with the scene only down to a size of one unit."""
 
 
 def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
-    """Compare the cove with itself at all lengths times a factor: with the same seeds, and with others."""
+    """Compare the cove with a copy whose lengths are multiplied by a factor: with the same seeds, and with others."""
     images = _images(load(scaled(factor)(effort.size)), ALL[0], effort, 0)
     same = _images(load(scaled(1.0)(effort.size)), ALL[0], effort, 0)
     near = float(np.mean(_differences(images, same) < _NEAR_SCALED[factor]))
@@ -205,10 +210,11 @@ def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
 
 
 def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Dim the light, then move a box and the camera, in place and in the description, and compare.
+    """Compare scenes that are edited in place with scenes loaded anew: a dimmed light, then a moved box and camera.
 
-    The light must match bit by bit. Embree stores moved meshes otherwise than new ones, and Mitsuba inverts a camera's
-    transform at another precision when it loads it, so that there the last bits differ.
+    With the dimmed light the images must be equal bit by bit. With the moved box and camera the last bits differ:
+    Embree stores moved meshes in another way than new ones, and Mitsuba inverts a camera's transform with another
+    precision when it loads it.
     """
     step, new = [0.2, -0.1, 0.15], [0.2, -3.0, 1.1]
     at = mi.ScalarTransform4f().translate([-0.3, 0.2, 0.3]) @ mi.ScalarTransform4f().scale(0.2)
@@ -240,7 +246,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
 
 
 def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Render a seed twice, another between, and several at once: bit by bit equal, for each of the usual counts."""
+    """Render a seed twice with another seed between, and both at once; equal seeds must give equal bytes."""
     scene = load(build(effort.size))
     faults = []
     for settings in ALL:
@@ -259,7 +265,7 @@ def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[st
 
 
 def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
-    """Compare recorded launches bit by bit: other seeds, other numbers of samples, dimmed lights, a moved camera."""
+    """Compare recorded launches with traced ones bit by bit, after changes of seeds, samples, lights and camera."""
     scene = load(build(effort.size))
     parameters, sensor = mi.traverse(scene), scene.sensors()[0]
     key = _brightness_keys(parameters)[0]
@@ -287,7 +293,7 @@ def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
 
 
 def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str], str]:
-    """Compare the weights of real paths; see `weight_check`."""
+    """Compare the integrator's weights of traced paths with the oracle's; see `weight_check`."""
     faults, figures = [], []
     for settings in ALL:
         found = weight_check.compare_weights(build, settings, lanes=lanes)
@@ -310,7 +316,7 @@ def _images(scene: Any, settings: BdptSettings, effort: Effort, seed: int, spp: 
 
 
 def _compare(a: Images, b: Images, effort: Effort) -> tuple[BlockTest, list[str]]:
-    """The block z-test, and its faults."""
+    """The block z-test of two sets of images, and its faults."""
     tests = [block_z_test(a, b, blocks, SIGNIFICANCE, ROUNDING) for blocks in (effort.blocks, 1)]
     faults = [f"|z| is {test.z_max:.2f}, the limit {test.z_limit:.2f}" for test in tests if not test.passed]
     if not tests[0].mean_ratio_standard_error <= effort.resolution:

@@ -79,7 +79,7 @@ _PICTURES = (
 
 
 def _verdict(report: StabilityReport) -> str:
-    """The numbers of rows and scenes that pass; refusals without a row are counted separately."""
+    """The numbers of rows and scenes that pass, and separately of refused scenes that belong to no row."""
     rows, scenes = report.rows(), report.scenes()
     others = [not result.faults for result in report.results if result.row is None]
     parts = [f"**{sum(rows.values())} of {len(rows)} rows pass**, {sum(scenes.values())} of {len(scenes)} scenes"]
@@ -107,7 +107,7 @@ def _line(results: list[SceneResult]) -> str:
 
 
 def _seen(biases: Sequence[float | None]) -> str:
-    """The worst of the smallest biases that would fail."""
+    """The largest, over some results, of the smallest bias that would make a result fail."""
     if None in biases:
         return "unknown"
     worst = 100 * max(bias for bias in biases if bias is not None)
@@ -135,7 +135,7 @@ def _path_ratio(result: SceneResult) -> str:
 
 
 def _is_rounding(result: SceneResult) -> bool:
-    """Whether it passes only because of the tolerance for rounding: above the noise, and not negligible."""
+    """Whether a result passes only by the tolerance for rounding: it differs by more than noise and than ROUNDING."""
     if result.faults or result.mean_ratio is None or result.mean_ratio_standard_error is None:
         return False
     off = abs(result.mean_ratio - 1)
@@ -143,7 +143,7 @@ def _is_rounding(result: SceneResult) -> bool:
 
 
 def _rounded(scenes: Sequence[Sequence[SceneResult]]) -> str:
-    """The entries marked ° in the table, which may colour a whole picture, beside the same ratio of `path`."""
+    """The list of scenes marked ° in the table: how far the means of `bdpt` and of `path` are off by rounding."""
     if not scenes:
         return ""
     worst = [max(results, key=_deviation) for results in scenes]
@@ -160,7 +160,7 @@ def _per_cent(ratio: float | None) -> str:
 
 
 def _hard(results: Sequence[SceneResult]) -> str:
-    """What is hard, one line for each row; scenes that share a sentence share it."""
+    """What makes the scenes hard, one line for each row; scenes with the same sentence are listed once."""
     rows: dict[int, dict[str, list[str]]] = {}
     for result in results:
         if result.row is not None and result.truth != "refusal":

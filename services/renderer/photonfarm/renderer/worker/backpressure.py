@@ -1,6 +1,7 @@
 """Reasons for a worker to take no job: the disk is nearly full, or the trainer is far behind.
 
-Neither fails a job, and both end by themselves. They hold back jobs that have not begun; the job in hand is finished.
+Neither makes a job fail, and both end by themselves. They hold back jobs that have not begun; the job in hand is
+finished.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from photonfarm.shared.store.io.local import LocalStorage
 from photonfarm.shared.store.write.scene_store import Progress
 
 AHEAD_MINIMUM = 256
-"""The samples that may be committed before any is used: a trainer waits for its first few, also held-out ones."""
+"""The samples that may be committed before any is used, as a trainer first waits for some, held-out ones included."""
 
 AHEAD_LOOK_S = 5.0
-"""The seconds between counts of committed samples, each of which lists every marker."""
+"""The seconds between two counts of committed samples, since each count lists every marker."""
 
 FULL_S = 30.0
-"""How long jobs stop after a disk refused a commit, if the reserve does not tell when there is space again."""
+"""The seconds for which no job is taken after a disk refused a commit, even if it seems to have free space."""
 
 
 class DiskReserve:
@@ -40,11 +41,11 @@ class DiskReserve:
         self._refused_until = 0.0
 
     def refused(self) -> None:
-        """Report that the disk has just refused a write, whatever free space it states: quotas do not show there."""
+        """Record that the disk has just refused a write; it may do so with free space left, because of a quota."""
         self._refused_until = self._clock() + FULL_S
 
     def reason(self) -> str | None:
-        """Why no job should be taken now, or None. Raises StoreError if the store's folder is gone."""
+        """The reason why no job should be taken now, or None; raises StoreError if the store's folder is gone."""
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
         with store_errors("ask how much of the disk is free", str(self._root)):
@@ -70,8 +71,8 @@ def is_full(error: BaseException) -> bool:
 class TrainerPace:
     """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
 
-    Each scene is treated by itself, as a trainer uses the samples of one. In a scene with guides, samples that lack
-    them do not count: a trainer that needs guides cannot use these yet, and would wait for workers that wait for it.
+    Each scene is treated by itself, as a trainer uses the samples of one scene. In a scene with guides, samples without
+    them do not count: a trainer that needs guides cannot use them yet, so it and the workers would wait for each other.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class TrainerPace:
         scene_id: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the sources of both numbers; a ratio below 1 would stop for good, as no more is used than committed."""
+        """Take the sources of both numbers. A ratio below 1 would stop all jobs, as no more is used than committed."""
         self._store = store
         self._connection = connection
         self._ratio = ratio
@@ -93,7 +94,7 @@ class TrainerPace:
         self._ahead: dict[str, str] = {}
 
     def ahead(self) -> dict[str, str]:
-        """Why no job of a scene should be taken now, by the ids of such scenes. Raises redis.RedisError."""
+        """The scenes of which no job should be taken now: the reason, by scene id. Raises redis.RedisError."""
         if self._clock() >= self._due:
             self._ahead = self._look()
             self._due = self._clock() + AHEAD_LOOK_S

@@ -27,24 +27,24 @@ from photonfarm.shared.store.read.find import scene_named
 BACKOFF_S = (0.1, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 
 POLL_S = 1.0
-"""The seconds between looks for a missing store, and for signals that came while reading from the child."""
+"""The seconds between checks for a missing store, and for signals that arrive while the child's output is read."""
 
 HUNG_LINES = 8
-"""The lines of the stack of a job that the deadline ended: its innermost calls, where it hung."""
+"""The number of reported lines of the stack of a job that the deadline ended: the innermost calls, where it hung."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChildOutput:
-    """The output of a child."""
+    """What a child wrote before it ended."""
 
-    last: str  # why it ended, if it stated that
+    last: str  # its last line, which may state why it ended; "" if there is none
     job: str | None  # the job that it began last
-    hung: str  # the stack where the deadline ended that job; "" if it did not
+    hung: str  # the stack of that job if the deadline ended it; otherwise ""
     counts: JobCounts  # of the jobs that ended
 
     @classmethod
     def of(cls, text: str) -> ChildOutput:
-        """Parse a child's output: jobs begun, last words, and faulthandler's dump, the main thread at its end."""
+        """Parse a child's output: its reports of jobs, other lines, and the dump of faulthandler, main thread last."""
         written, timeout, dump = text.partition("Timeout (")
         lines = written.splitlines()
         jobs = [line.removeprefix(JOB_IN_HAND) for line in lines if line.startswith(JOB_IN_HAND)]
@@ -61,7 +61,7 @@ class ChildOutput:
 
 
 class Supervisor:
-    """Starts the child again until it has nothing left to do."""
+    """Keeps a child running until nothing is left to do."""
 
     def __init__(self, settings: WorkerSettings, command: tuple[str, ...], report: Callable[[str], None]) -> None:
         """Take the child's command line, and the function that logs events."""
@@ -73,7 +73,7 @@ class Supervisor:
         self._counts = JobCounts()
 
     def run(self) -> None:
-        """Supervise; raises the errors that a new child would meet again."""
+        """Run children one after the other; raises the errors that a new child would meet again."""
         vacant = is_vacant(self._settings.store)
         if vacant and self._settings.until_complete:
             raise StoreError(f"{self._settings.store}: there is no store; `photonfarm submit` makes one")
@@ -218,7 +218,7 @@ def _read_all(pipe: int) -> bytes:
 
 
 def _ending(code: int, output: ChildOutput, deadline_s: float) -> str:
-    """How a child ended, in words."""
+    """The sentence that states how a child ended."""
     if code < 0:
         return f"its child was ended by {signal.Signals(-code).name}"
     if output.overdue:

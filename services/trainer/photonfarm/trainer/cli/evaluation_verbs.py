@@ -76,9 +76,11 @@ def _how(
 ) -> dict[str, Any]:
     """The arguments of `compare`: every denoiser with every share of the pixels. Raises UsageError."""
     if kept and not denoisers:
-        raise click.UsageError("--kept is what untrained denoisers are given; name some with --denoiser")
+        raise click.UsageError("--kept applies only to untrained denoisers; name one with --denoiser")
     if inception and references is None:
-        raise click.UsageError("--inception is for the columns that compare with references; name these: --references")
+        raise click.UsageError(
+            "--inception is used only to compare with references; give their folder with --references"
+        )
     chosen = list(product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,))))
     return {"denoisers": chosen, "references": references, "inception": inception, **others}
 

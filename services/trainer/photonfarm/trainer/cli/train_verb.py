@@ -113,15 +113,15 @@ def train(
 ) -> None:  # fmt: skip
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
 
-    Redis, where there is one, is told how many samples have been used, for `photonfarm work --ahead`. Several processes
-    share each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
+    Redis, where there is one, gets the number of used samples, for `photonfarm work --ahead`. Several processes share
+    each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
     see the same run folder. Exits with 8 if training diverges.
     """
     from photonfarm.trainer.cli import service
 
     instead = [name for name, asked in (("--grid", grid), ("--summary", summary), ("--check", check)) if asked]
     if len(instead) > 1:
-        raise click.UsageError(f"{' and '.join(instead)} are different things to do; give one of them")
+        raise click.UsageError(f"{' and '.join(instead)} exclude each other; give one of them")
     changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
     if check:
         service.check(run)

@@ -18,10 +18,10 @@ from photonfarm.trainer.runs.settings import TrainSettings
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """The rows that arrived, and when: with the seed, this determines the order of training.
+    """The rows that arrived, and when; together with the seed they determine the order of training.
 
-    A run's checkpoint has it whole, as `following.arrived` and `following.growth`. A readable summary is metrics.jsonl,
-    of which each record has the number of draws and of arrived samples.
+    A run's checkpoint has all of it, as `following.arrived` and `following.growth`. metrics.jsonl has a summary: each
+    of its records has the number of drawn and of arrived samples.
     """
 
     rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
@@ -33,7 +33,7 @@ class Growth:
         return cls(state["arrived"].tolist(), [(drawn, arrived) for drawn, arrived in state["growth"].tolist()])
 
     def visible(self, drawn: int) -> int | None:
-        """The number of rows that had arrived when batch `drawn` was drawn; None past the log's end."""
+        """The number of rows that had arrived when batch `drawn` was drawn; None for a batch after the log's last."""
         if not self.log or drawn > self.log[-1][0]:
             return None
         place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
@@ -41,12 +41,12 @@ class Growth:
 
 
 class BatchStream:
-    """Draws batches ahead of training, while they are being read. A `script` repeats the growth of an earlier run."""
+    """Draws batches, and has them read, ahead of training. A `script` is the growth of an earlier run to repeat."""
 
     def __init__(
         self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = SINGLE_PROCESS
     ) -> None:
-        """Draw for all processes of a group, and read this one's part."""
+        """Draw batches for all processes of a group, and read this process's part of them."""
         self._feed, self._settings, self._group = feed, settings, group
         self._script = script or Growth()
         self._sampler = RoundSampler(settings.seed, settings.catch_up)
@@ -60,7 +60,7 @@ class BatchStream:
 
     @property
     def training_rows(self) -> list[int]:
-        """The visible rows that are trained on, in order of arrival."""
+        """The visible rows that are not held out, in order of arrival."""
         return self._sampler.rows
 
     @property
@@ -69,7 +69,7 @@ class BatchStream:
         return self._complete
 
     def look(self) -> None:
-        """Make arrived rows visible; with a script, only those that it lists."""
+        """Make arrived rows visible; with a script, only the rows that it lists up to this batch."""
         rows, complete = self._feed.arrivals()
         self._waiting.update((row, held) for row, held in rows if row not in self._known)
         scripted = self._script.visible(self.drawn)
@@ -91,9 +91,10 @@ class BatchStream:
         self._sampler.add([row for row in rows if not held[row]])
 
     def may_draw(self) -> bool:
-        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and enough samples to begin with.
+        """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and `minimum_samples` have arrived.
 
-        Neither limit applies once everything planned has arrived. A script is followed exactly.
+        Neither limit applies once everything planned has arrived. With a script, a batch is drawn when exactly the
+        scripted rows are visible.
         """
         scripted = self._script.visible(self.drawn)
         if scripted is not None:
@@ -105,7 +106,7 @@ class BatchStream:
         return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
 
     def draw_ahead(self, until: int) -> bool:
-        """Draw and request batches, up to `prefetch` ahead and batch number `until`; False if there is none to take."""
+        """Draw and request batches, up to `prefetch` ahead and up to batch `until`; False if no batch is requested."""
         while len(self._asked) < self._settings.prefetch and self.drawn < until:
             self.look()
             if not self.may_draw():
@@ -120,9 +121,9 @@ class BatchStream:
         self._feed.ask(self._group.part(rows))
 
     def take(self) -> TrainingBatch | None:
-        """The next drawn batch, this process' part of it read; draws of rows that are incomplete now do not count.
+        """The next drawn batch, of which this process reads its part; draws of now incomplete rows do not count.
 
-        None if no row is left in it: another batch is drawn instead, at the end.
+        None if no row of the batch is left; another batch is then drawn in its place, after the others.
         """
         batch = self._feed.take()
         self._group.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
@@ -134,7 +135,7 @@ class BatchStream:
         return None
 
     def drop(self) -> None:
-        """Drop the batches that were read ahead, so that other rows can be read; the other ranks keep theirs."""
+        """Drop this process's batches that were read ahead, so that other rows can be read; other ranks keep theirs."""
         for _ in self._asked:
             self._feed.take()
 
@@ -155,7 +156,7 @@ class BatchStream:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
+        """Continue from what `state` returned."""
         self._sampler.restore(state["sampler"])
         self.drawn = state["drawn"]
         self.growth = Growth.of(state)

@@ -1,4 +1,4 @@
-"""The choice of the next samples from a growing set: in rounds, with the least drawn ones more often."""
+"""Chooses the next samples from a growing set, in rounds that draw the least drawn samples more often."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from photonfarm.shared.core.keys import Stream, make_key
 
 
 class RoundSampler:
-    """Every round draws each row once, in random order, and a row that lags behind up to `catch_up` times more.
+    """Draws each row once a round, in random order, and a row that was drawn less often up to `catch_up` times more.
 
-    Once no rows arrive, all are drawn equally often to within one. Uniform draws from a growing set would favour the
-    early rows by r ln(n_end/n_then). Strictly the fewest-drawn first, shard by shard as they arrive, would train on the
-    new shard's rows alone until they had caught up, and a network would forget the others; so here new rows come more
-    often and never alone. A `catch_up` larger than the draws of any row gives that strict order. Deterministic in the
-    seed, the order of arrival, and the number of rows that had arrived at each draw.
+    Some time after the last arrival all rows have been drawn equally often, to within one. Two simpler ways are worse.
+    Uniform draws from a growing set would favour early rows, by r ln(n_end/n_then). Drawing the least drawn rows first
+    would train on each new shard alone until it had caught up, and the network would forget the others. Here new rows
+    come more often, but never alone; only a `catch_up` above the draws of every row gives that strict order.
+
+    Draws depend on the seed, the order of arrival, and the number of rows that had arrived at each draw, and on nothing
+    else.
     """
 
     def __init__(self, seed: int, catch_up: int) -> None:
         self._seed, self._catch_up = seed, catch_up
         self.rows: list[int] = []
         self._visits = np.zeros(0, np.int64)
-        self._joined = 0  # rows in the rounds; the others join at the next draw
+        self._joined = 0  # number of rows that take part in rounds; the others join at the next draw
         self._deck: deque[int] = deque()  # places in `rows`
         self._shuffles = 0
 
@@ -63,12 +65,12 @@ class RoundSampler:
         return tuple(self.rows[place] for place in chosen)
 
     def put_back(self, rows: Iterable[int]) -> None:
-        """Undo draws of rows that could not be used: they lag behind by as many."""
+        """Undo draws of rows that could not be used, so that these rows are drawn more often later."""
         for row in rows:
             self._visits[self.rows.index(row)] -= 1
 
     def state(self) -> dict[str, Any]:
-        """All that draws depend on besides the seed; int64 tensors for values of each row."""
+        """The state that later draws depend on, besides the seed; values of each row are int64 tensors."""
         return {
             "rows": torch.tensor(self.rows, dtype=torch.int64),
             "visits": torch.from_numpy(self._visits.copy()),
@@ -78,7 +80,7 @@ class RoundSampler:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
+        """Continue from what `state` returned."""
         self.rows = state["rows"].tolist()
         self._visits = state["visits"].numpy().copy()
         self._joined = state["joined"]
@@ -86,7 +88,7 @@ class RoundSampler:
         self._shuffles = state["shuffles"]
 
     def _round(self, first: int) -> NDArray[np.int64]:
-        """A round of the places from `first` on: once each, and those that lag behind up to `catch_up` times more."""
+        """A round of the places from `first` on: each once, and those drawn less often up to `catch_up` times more."""
         behind = self._visits.max(initial=0) - self._visits[first:]
         copies = 1 + np.minimum(behind, self._catch_up)
         return np.repeat(np.arange(first, len(self.rows)), copies)

@@ -1,4 +1,4 @@
-"""Light that lit points send on: instant radiosity from the scene's point cloud [Keller 1997], with learned visibility.
+"""Indirect light by instant radiosity [Keller 1997] from the points of the scene's cloud, with learned visibility.
 
 Each of the first points of the cloud stands for its share A of the scene's surface. It receives direct light, rendered
 with its shadows. Its reflected light goes to every other point, and from all of these to every pixel, by the form
@@ -12,7 +12,7 @@ places and normals:
 
 V = sigmoid(r(receiver) · s(sender) + b)
 
-Metals sum B₀ over the directions that their lobe mirrors; there nothing is learned.
+For metals B₀ is summed over the directions that their lobe reflects; nothing is learned there.
 
 Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
 """
@@ -33,29 +33,35 @@ COARSE = 4
 """The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
 
 GLOSSY = 0.2
-"""The directional albedo of lobes neither diffuse nor followed from which a pixel sums over one: that of metals.
+"""The directional albedo above which a pixel's glossy lobe is summed over the points; only metals exceed it.
 
-The coats of plastics and varnish took a third of a step and gained nothing.
+Glossy lobes are those that are neither diffuse nor followed by rays. Summing those of plastics and varnish took a third
+of a training step and gained nothing.
 """
 
 SHARPEST = 0.15
-"""The least roughness of such a lobe: a narrower one would fall between points."""
+"""The least roughness of a glossy lobe: a narrower lobe would fall between points."""
 
 LEAST_LOGARITHM = -60.0
-"""The least logarithm of a lobe's values: denormal numbers take processors some four times longer to multiply."""
+"""The least logarithm of a lobe's values, as processors multiply denormal numbers about four times more slowly."""
 
 CHANNELS = 9
+"""The channels of the three results of `LitPoints` together."""
 
 DIFFUSE = 1
 """The index of all diffuse light among the results of `LitPoints`."""
 
 OCTAVES = 3
+"""The number of frequencies that encode a position."""
+
 HIDDEN = 64
+"""The width of the hidden layer of the visibility networks."""
+
 FACTORS = 8
-"""The numbers of each surface whose products give its visibility."""
+"""The length of the vectors r and s, whose product gives the visibility between two surfaces."""
 
 OPEN = 2.0
-"""The initial b: before anything is learned most surfaces see each other."""
+"""The initial value of b, by which most surfaces see each other before anything is learned."""
 
 
 class LearnedVisibility(nn.Module):
@@ -76,12 +82,12 @@ class LearnedVisibility(nn.Module):
         return torch.cat([with_octaves((position - self.centre) / self._scale, OCTAVES), normal], dim=-1)
 
     def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
-        """(N, C) and (L, C) → (N, L)."""
+        """The visibility of each sender from each receiver, (N, C) and (L, C) → (N, L)."""
         return torch.sigmoid(self.receiver(receivers) @ self.sender(senders).T + self.open)
 
 
 def _factors(std: float | None = None) -> nn.Sequential:
-    """A network from a surface's numbers to its factors; `std`: the initial deviation of its last weights."""
+    """A network from a surface's features to its factors; `std` is the initial deviation of its last weights."""
     last = nn.Linear(HIDDEN, FACTORS)
     if std is not None:
         nn.init.normal_(last.weight, std=std)

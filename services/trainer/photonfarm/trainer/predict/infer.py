@@ -34,7 +34,7 @@ from photonfarm.trainer.predict.evaluation import error_of
 from photonfarm.trainer.predict.trained import TrainedRun
 
 VERB = "buffers"  # of the renderer
-NOT_JUDGED = "was trained on (it is not held out), so no error is told: the network may know its noise by heart"
+NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ def check_path(run: TrainedRun) -> None:
     if run.needs.kept:
         raise SpecError(
             f"{run.folder}: {run.settings.network.architecture} needs the noisy image of a view, which a camera path "
-            "has not; show one sample of the store, by --row"
+            "does not have; show a stored sample with --row"
         )
 
 
@@ -164,8 +164,8 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
     film = (len(frames), spec.film.height, spec.film.width)
     if (frames.scene_id, frames.depth.shape) != (run.scene_id, film):
         raise SpecError(
-            f"the buffers are of scene {frames.scene_id}, {frames.depth.shape}; the run is of scene {run.scene_id}, "
-            f"{film} of so many frames"
+            f"the buffers are of scene {frames.scene_id} and the shape {frames.depth.shape}, but the run needs scene "
+            f"{run.scene_id} and the shape {film}; make them with `photonfarm buffers --scene {run.scene_id}`"
         )
     if run.needs.photons and frames.photons is None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")

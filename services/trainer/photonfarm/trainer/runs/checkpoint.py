@@ -27,7 +27,7 @@ from photonfarm.shared.store.io.local import sync
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 FORMAT = 3
-ANEW = "without this file the run begins anew"
+ANEW = "remove it, and the run begins anew"
 METADATA = "photonfarm"
 TENSOR = "tensor"
 
@@ -66,13 +66,15 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
 def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
     """A checkpoint's content, on the CPU; nothing in it is executed.
 
-    Raises StoreError if it cannot be read; `without` states, in the message, what the run does if the file is removed.
+    Raises StoreError if it cannot be read; the message ends with `without`, which states what removing the file does.
     """
     document, tensors = _read(path, without)
     if (found := document.get("format")) != FORMAT:
-        raise StoreError(f"{path}: has format {found!r}; this version reads {FORMAT}")
+        raise StoreError(
+            f"{path}: has format {found!r}, but this version reads format {FORMAT}; train anew in another folder"
+        )
     if document.get("sha256") != _digest(tensors):
-        raise StoreError(f"{path}: is damaged: its numbers are not those that were written; {without}")
+        raise StoreError(f"{path}: is damaged, as its numbers do not match its checksum; {without}")
     state: dict[str, Any] = _together(document, tensors)
     return state
 
@@ -160,15 +162,17 @@ def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
 
     A missing key would take today's default, and make another network.
     """
-    if unsaid := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
-        raise SpecError(f"{path}: lacks {unsaid} of the network: another version's run; train anew, in another folder")
+    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+        raise SpecError(
+            f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder"
+        )
 
 
 def _option(key: str, value: Any) -> str:
     """The command-line option that sets a key to a value."""
     name = key.split(".")[-1]
     if name in OPTIONS:
-        return f"no --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
+        return f"without --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
     return f"--set {name}={'null' if value is None else value}"
 
 
@@ -187,13 +191,13 @@ def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = 
 def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:
     """Raise SpecError unless the store's plans begin with those of the checkpoint, which number the rows.
 
-    StoreError if it holds only weights, as that of a run that has not begun.
+    Raises StoreError for a checkpoint that holds only weights, such as that of a run that has not begun.
     """
     if "store" not in state:
-        raise StoreError(f"{path}: holds weights alone, and not where a run stood; without this file it begins anew")
+        raise StoreError(f"{path}: holds only weights, and not the state of a run; {ANEW}")
     before = state["store"]["plans"]
     if list(plans[: len(before)]) != before:
         raise SpecError(
-            f"{path}: was trained on the samples of {len(before)} plans that this store does not begin with; "
-            "use another run directory, or the store it was trained on"
+            f"{path}: was trained on {len(before)} plans with which this store does not begin; "
+            "use another run directory, or the store that it was trained on"
         )

@@ -1,11 +1,11 @@
 """Several processes that train one network, each on its part of every batch, as `torchrun` starts them.
 
-Rank 0 follows the store, draws, validates, writes and logs; the others read and compute at its commands. In each step
-all take the mean gradient over the joint batch, in one piece: as samples may become incomplete while they are read,
-parts may differ in length, which DistributedDataParallel does not allow. Its sending during the computation of
-gradients would gain little beside the convolutions of these networks.
+Rank 0 follows the store, draws, validates, writes and logs; the other ranks read and compute at its commands. In each
+step all ranks take the mean gradient over the joint batch, in one piece. Samples may become incomplete while they are
+read, so the parts of a batch may differ in length, and DistributedDataParallel would weigh them alike. It also sends
+gradients while others are computed, but that gains little, as these networks spend their time in convolutions.
 
-All must see the same run folder, in which the others find the checkpoint of a resumed run, and the same store.
+All processes must see the same store and the same run folder, in which ranks find the checkpoint of a resumed run.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.runs.device import AUTO, usable_device
 
 COMMAND_PATIENCE = timedelta(days=30)
-"""How long a rank waits for its next command: as long as a store may take to grow."""
+"""The longest time that a rank waits for its next command: as long as a store may take to grow."""
 
 STEP_PATIENCE = timedelta(minutes=15)
-"""How long a rank waits for the others within a step.
+"""The longest time that a rank waits for the others within a step.
 
 Reading a part of a batch may take minutes if the store is in a bucket; a rank that takes longer hangs.
 """
 
 
 class TrainingGroup(Protocol):
-    """The processes that share each batch, seen from one of them."""
+    """The group of processes that share each batch, as one of them uses it."""
 
     within_step: bool  # the others wait for this one's gradient, and take no command before they have it
 
@@ -50,7 +50,7 @@ class TrainingGroup(Protocol):
         """The rows of a batch that all processes have read together; all must call."""
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
-        """The loss over the joint batch; the weights get its gradient. `count` samples are of this process."""
+        """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
 
 
 class SingleProcess:
@@ -59,22 +59,22 @@ class SingleProcess:
     within_step = False
 
     def device(self, name: str) -> torch.device:
-        """The device that the settings name."""
+        """The device named `name`."""
         return usable_device(name)
 
     def part(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """All of the rows."""
+        """All rows: this process reads the whole batch."""
         return tuple(rows)
 
     def send(self, command: str, value: Any = None) -> None:
-        """Do nothing: there are no other ranks."""
+        """Do nothing, as there are no other ranks."""
 
     def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """The same rows."""
+        """The rows as they are: no other process reads a part of them."""
         return tuple(rows)
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:  # noqa: ARG002
-        """The loss; the weights have its gradient."""
+        """The loss as a number; the weights have its gradient already."""
         return loss.item()
 
 
@@ -91,7 +91,7 @@ class Ranks:
         self.within_step = False
 
     def device(self, name: str) -> torch.device:
-        """The device of this process; for "cuda" the one with its number on this machine."""
+        """The device of this process; for "cuda" the card with the process's local rank."""
         return usable_device(_own(name))
 
     def part(self, rows: Sequence[int]) -> tuple[int, ...]:
@@ -148,7 +148,10 @@ def processes() -> int:
 
 @contextmanager
 def leading(group: TrainingGroup) -> Iterator[None]:
-    """Run rank 0's training inside; however it ends, the others get the command to end, or notice that it is gone."""
+    """Run rank 0's training in the block, and then send the other ranks the command to end.
+
+    Within a step they take no command; they notice then that rank 0 is gone.
+    """
     try:
         yield
     finally:
@@ -168,7 +171,9 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
         yield None
         return
     if batch < size:
-        raise SpecError(f"batch = {batch}: is shared by {size} processes, and each needs a sample of it")
+        raise SpecError(
+            f"batch = {batch}: has fewer samples than the {size} processes that share it; set batch to {size} or more"
+        )
     own = usable_device(_own(device))
     if own.type == "cuda":
         torch.cuda.set_device(own)
@@ -180,8 +185,8 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
 
 
 def _own(device: str) -> str:
-    """The card of this process, if the settings name CUDA, or `auto` finds it; SpecError for a single card."""
+    """The process's own card if the settings name CUDA or `auto` finds it; raises SpecError for one named card."""
     if device.startswith("cuda:"):
-        raise SpecError(f"device = {device!r}: is one card, and {processes()} processes want one each; name cuda")
+        raise SpecError(f"device = {device!r}: names one card, but {processes()} processes need one each; give cuda")
     on_cuda = device == "cuda" or (device == AUTO and torch.cuda.is_available())
     return f"cuda:{os.environ['LOCAL_RANK']}" if on_cuda else device

@@ -59,7 +59,9 @@ def _record(line: bytes, path: Path) -> dict[str, Any]:
         _ = record["step"], record["kind"]
         return record
     except (ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path}: holds {line[:40]!r}, which is no record of a training run; take it out") from error
+        raise StoreError(
+            f"{path}: holds the line {line[:40]!r}, which is not a record of a training run; remove that line"
+        ) from error
 
 
 def read(path: Path) -> list[dict[str, Any]]:

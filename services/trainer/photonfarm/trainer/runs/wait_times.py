@@ -1,4 +1,4 @@
-"""The division of a run's time: whether rendering, reading or training is the bottleneck."""
+"""Measures what a run spends its time on, and which of rendering, reading and training is the bottleneck."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Literal
 Kind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
 """The kinds of time.
 
-They are: building network and feed; steps; validations; waiting for samples to be rendered, and to be read;
-checkpoints; and the rest, such as writing the log and drawing.
+In this order: building the network and the feed; steps; validations; waiting for samples to be rendered; waiting for
+samples to be read; writing checkpoints; and the rest, such as writing the log and drawing.
 """
 
 KINDS: tuple[Kind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
@@ -21,10 +21,10 @@ NONE: Mapping[str, float] = {}
 
 
 class Stopwatch:
-    """The seconds of a run by kind: at any moment one kind runs, so that their sum is the wall time."""
+    """Counts the seconds of a run by kind. At any moment exactly one kind is counted, so their sum is the wall time."""
 
     def __init__(self, clock: Callable[[], float], kind: Kind, ahead: float = 0.0) -> None:
-        """Begin with `kind`, at `ahead` seconds."""
+        """Begin to count `kind`, which has `ahead` seconds already."""
         self._clock, self._kind, self._since = clock, kind, clock() - ahead
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
 
@@ -62,29 +62,30 @@ class Stopwatch:
 
 
 def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
-    """The shares of the time since `before` in which training waited, for samples to be rendered, and to be read."""
+    """The shares of the time since `before` in which training waited for samples to be rendered, and to be read."""
     spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
     total = max(sum(spent.values()), 1e-9)
     return {"samples": round(spent["wait_data"] / total, 4), "reading": round(spent["wait_read"] / total, 4)}
 
 
 def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """The part that takes most of the time, by `waits`; the rest of the time is training."""
+    """The part that takes most of the time, from the shares of `waits`; the rest of the time counts as training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])
 
 
 def samples_per_used(samples: int, draws: int) -> float:
-    """The number of arrived samples for each used one: above their `--ahead`, workers skip the scene.
+    """The number of arrived samples for each used one; workers skip the scene while it is above their `--ahead`.
 
-    Used are all drawn samples, and held-out ones at once, as reported to Redis for the workers.
+    A sample counts as used once it is drawn, and a held-out one as soon as it arrives, as in the number that workers
+    read from Redis.
     """
     return samples / max(min(draws, samples), 1)
 
 
 def stated(shares: Mapping[str, float], ahead: float) -> str:
-    """Both waits, the ratio of samples and the bottleneck, as part of a line."""
+    """The shares of `waits`, the arrived samples for each used one, and the bottleneck, as part of a line."""
     return (
         f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
         f"{ahead:.2f} samples there for each used (--ahead): {bottleneck(shares)} is the bottleneck"

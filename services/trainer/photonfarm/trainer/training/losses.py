@@ -45,17 +45,21 @@ def relative_loss(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def paired_loss(prediction: Tensor, target: Tensor, weighting: Tensor | None = None) -> Tensor:
-    """The relative error of each half, with a weight from the prediction and the other half: (B, 2, H, W, 3).
+    """The relative error of each half (B, 2, H, W, 3), with weights from the prediction and the other half.
 
-    Where the prediction is far too dark, as beside lamps at first, the relative loss's weight is far too large, and a
-    few such pixels make up most of the gradient. The other half shows that they are bright. Its noise is independent of
-    this half's: E w(B) (f − A) = E w(B) · (f − I), zero for the clean image. The weight of a pixel depends on the
-    noise, and so does, for a network that cannot be right everywhere, where it is right. Ours. `weighting` are the
-    halves that give the weights, if not the target's. Raises ValueError unless there are two.
+    Where the prediction is far too dark, as beside lamps at first, the weight of the relative loss is far too large,
+    and a few such pixels dominate the gradient. The other half shows that they are bright. Its noise is independent of
+    this half's, so E w(B) (f − A) = E w(B) · (f − I), which is zero for the clean image. But the weight of a pixel
+    depends on the noise. So a network that cannot be right everywhere is right where the noise made weights large.
+
+    The loss is our own. `weighting` has the halves that give the weights; without it the target does. Raises ValueError
+    unless it has two halves.
     """
     weighting = target if weighting is None else weighting
     if weighting.shape[1] != 2:
-        raise ValueError(f"has {weighting.shape[1]} half-estimates; each of two is weighted by the other")
+        raise ValueError(
+            f"paired_loss: {weighting.shape[1]} half-estimates are given; give 2, as each one weights the other"
+        )
     prediction = prediction[:, None]
     brightness, of_other = (image.mean(dim=-1, keepdim=True) for image in (prediction.detach(), weighting.flip(1)))
     return torch.mean((prediction - target) ** 2 / (brightness**2 + of_other**2 + RELATIVE_EPSILON))

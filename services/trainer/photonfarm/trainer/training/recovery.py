@@ -17,7 +17,7 @@ from photonfarm.trainer.training.learner import DivergedError, Learner
 
 GOOD = "good.safetensors"
 NEXT = "good.next.safetensors"  # in the run's folder too, until the checkpoint that refers to it is written
-WITHOUT = "without this file the run goes on, with nothing to go back to before its next good validation"
+WITHOUT = "remove it, and the run goes on, with nothing to go back to before its next good validation"
 
 MOST = 8
 """How often a run may go back: by then the rate is 1/256, and it diverges for another reason."""

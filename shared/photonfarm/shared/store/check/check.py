@@ -123,7 +123,7 @@ class _SceneChecking:
         self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
         self._scenes = scenes
-        self._tally, self._guide_tally = CheckTotals(HalvesTest(scenes)), CheckTotals(HalvesTest(scenes))
+        self._totals, self._guide_totals = CheckTotals(HalvesTest(scenes)), CheckTotals(HalvesTest(scenes))
 
     def run(self, quarantine: Quarantine | None) -> SceneReport:
         """Check everything; set aside what is damaged, unless `quarantine` is None."""
@@ -170,9 +170,9 @@ class _SceneChecking:
         return check, rewritten
 
     def _jobs(self, scene: CheckTarget, committed: list[int]) -> None:
-        self._read(scene, committed, self._tally, scene.spec.name)
-        self._add(self._again(equal_samples(scene, self._tally)))
-        if (halves := self._tally.halves.result()) is not None and not halves.passed:
+        self._read(scene, committed, self._totals, scene.spec.name)
+        self._add(self._again(equal_samples(scene, self._totals)))
+        if (halves := self._totals.halves.result()) is not None and not halves.passed:
             self._add([Finding(Cause.HALVES_DIFFER, halves_in_words(halves), self._scene_id)])
 
     def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
@@ -182,7 +182,7 @@ class _SceneChecking:
         check = GuideCheck(guides, committed)
         found = list(check.run())
         self._add(found)
-        self._read(guides, sorted(committed), self._guide_tally, f"{guides.spec.name}, guides")
+        self._read(guides, sorted(committed), self._guide_totals, f"{guides.spec.name}, guides")
         return check.repair(quarantine, found) if quarantine else []
 
     def _read(self, scene: CheckTarget, committed: list[int], total: CheckTotals, called: str) -> None:
@@ -195,8 +195,8 @@ class _SceneChecking:
                     if found:
                         self._markers[scene.guides, job] = marker
                         self._add(self._again(found))
-            for tally in pool.tallies:
-                total.add(tally)
+            for part in pool.totals:
+                total.add(part)
         self._on_progress(called, len(committed), len(committed), total.size_bytes)
         self._add(unplanned_files(scene))
 
@@ -224,11 +224,11 @@ class _SceneChecking:
         self._findings.add(found)
 
     def _report(self, name: str | None, set_aside: list[str]) -> SceneReport:
-        tally, guides = self._tally, self._guide_tally
-        share = tally.back_facing_pixels / tally.hit_pixels if tally.hit_pixels else None
+        totals, guides = self._totals, self._guide_totals
+        share = totals.back_facing_pixels / totals.hit_pixels if totals.hit_pixels else None
         return SceneReport(
-            self._scene_id, name, tally.jobs, guides.jobs, tally.samples, tally.size_bytes + guides.size_bytes, share,
-            tally.halves.result(), self._findings.groups(), tuple(set_aside),
+            self._scene_id, name, totals.jobs, guides.jobs, totals.samples, totals.size_bytes + guides.size_bytes,
+            share, totals.halves.result(), self._findings.groups(), tuple(set_aside),
         )  # fmt: skip
 
     # ----------------------------------------------------------------------------------------------------------- repair

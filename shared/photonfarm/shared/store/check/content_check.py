@@ -1,4 +1,4 @@
-"""What the values of stored rows show: images and views that are certainly or probably wrong.
+"""The check of stored values: it finds images and views that are certainly or probably wrong.
 
 Shape letters: H W image, P pixels.
 """
@@ -49,12 +49,12 @@ class ContentCheck:
         self._spec = spec
         self._rays: NDArray[np.float32] | None = None
 
-    def radiance(self, row: int, halves: NDArray[Any], tally: CheckTotals) -> Iterator[tuple[Cause, str]]:
-        """Check the halves of a sample, (2, H, W, 3) finite, scaled as they are stored."""
-        tally.samples += 1
-        tally.halves.add(halves)
+    def radiance(self, row: int, halves: NDArray[Any], totals: CheckTotals) -> Iterator[tuple[Cause, str]]:
+        """Check the halves of a sample, (2, H, W, 3), whose values are finite and scaled as they are stored."""
+        totals.samples += 1
+        totals.halves.add(halves)
         black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
-        prints = [tally.fingerprints.add(row, values) for values in halves if largest(values)]
+        prints = [totals.fingerprints.add(row, values) for values in halves if largest(values)]
         if not prints:
             yield Cause.BLACK, "all zero"
         elif black:
@@ -63,13 +63,13 @@ class ContentCheck:
             yield Cause.EQUAL_HALVES, "A = B in every pixel"
 
     def view(
-        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, tally: CheckTotals
+        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, totals: CheckTotals
     ) -> Iterator[tuple[Cause, str]]:
-        """Check the buffers of a view: depth (H, W), normals (H, W, 3) as modelled.
+        """Check the buffers of a view: depth (H, W) and the modelled normals (H, W, 3).
 
-        Normals are not turned to the camera, so that the inside of a box or the back of a leaf is rightly seen from
-        behind; and views from inside an object are not rejected. So such pixels are only counted, and a view is
-        reported only if it shows nothing else.
+        Normals are not turned to the camera, so the inside of a box or the back of a leaf is rightly seen from behind.
+        Views from inside an object are allowed too. So such pixels are only counted, and a view is reported only if it
+        shows nothing else.
         """
         hit = depth > 0
         hits = int(np.count_nonzero(hit))
@@ -77,8 +77,8 @@ class ContentCheck:
             yield Cause.EMPTY_VIEW, "depth is 0 in every pixel"
         elif view is not None:
             behind = int(np.count_nonzero((self._cosine(normal, view) > 0) & hit.reshape(-1)))
-            tally.hit_pixels += hits
-            tally.back_facing_pixels += behind
+            totals.hit_pixels += hits
+            totals.back_facing_pixels += behind
             if behind == hits:
                 yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
 
@@ -89,9 +89,9 @@ class ContentCheck:
             yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
 
     def _cosine(self, normal: NDArray[Any], view: View) -> NDArray[np.float32]:
-        """Normal times the direction of the ray through each pixel's centre, (P,): positive where seen from behind.
+        """The cosine between each pixel's normal and the ray through its centre, (P,): positive where seen from behind.
 
-        In the camera's axes, where the rays are the same for every view.
+        It is computed in the camera's axes, in which the rays are the same for every view.
         """
         camera = Camera.of(view, self._spec)
         if self._rays is None:
@@ -104,7 +104,7 @@ class ContentCheck:
 
 
 def is_constant(half: NDArray[Any]) -> bool:
-    """Whether all pixels of (H, W, 3) are equal: then there was no noise, and the image does not depend on the seed."""
+    """Whether all pixels of an image (H, W, 3) are equal: it then has no noise, and does not depend on the seed."""
     return bool((half == half[0, 0]).all())
 
 

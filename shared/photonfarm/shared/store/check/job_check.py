@@ -86,12 +86,12 @@ class JobCheck:
         self._memory = {name: np.empty(array.shape, array.dtype) for name, array in self._arrays.items()}
         self._contents = ContentCheck(scene.spec)
 
-    def run(self, job: int, tally: CheckTotals) -> tuple[list[Finding], bytes]:
+    def run(self, job: int, totals: CheckTotals) -> tuple[list[Finding], bytes]:
         """The findings of a job, and its marker; nothing if the marker is removed in the meantime.
 
-        The totals of the job are added to `tally`.
+        The totals of the job are added to `totals`.
         """
-        self._tally = tally
+        self._totals = totals
         storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
         try:
             content = storage.read(name)
@@ -119,7 +119,7 @@ class JobCheck:
             yield self._finding(Cause.MARKER, job, _error_text(error), name)
             return
         files = {file: about for file, about in named.items() if _array_of(file) in self._arrays}  # others may be added
-        self._tally.jobs += 1
+        self._totals.jobs += 1
         shards: dict[str, Shard] = {}
         for file, about in files.items():
             yield from self._open(job, file, about, shards)
@@ -152,7 +152,7 @@ class JobCheck:
         except OSError as error:
             yield self._unreadable(job, file, error)
             return
-        self._tally.size_bytes += size
+        self._totals.size_bytes += size
         if size != about["size"]:
             yield self._finding(Cause.SIZE, job, f"has {size} bytes; {about['size']} were committed", file)
             return
@@ -173,9 +173,9 @@ class JobCheck:
     def _against_plan(
         self, rows: JobRows, files: dict[str, dict[str, Any]], own: dict[str, str], shards: dict[str, Shard]
     ) -> Iterator[Finding]:
-        """Find rows that the plan requires and the files lack, and the other way round."""
+        """Find rows that the plan requires and the files lack, and rows that the files hold and the plan lacks."""
         for file in sorted(files.keys() - own.values()):
-            yield self._finding(Cause.MARKER, rows.job, "the marker names it, and it is another job's", file)
+            yield self._finding(Cause.MARKER, rows.job, "the marker names it, but it belongs to another job", file)
         for file in sorted(own.values() - files.keys()):
             if self._scene.storage.exists(file):
                 yield self._finding(
@@ -195,7 +195,7 @@ class JobCheck:
     def _of_radiance(
         self, job: int, samples: Set[int], own: dict[str, str], held: dict[str, set[int]], unread: set[str]
     ) -> Iterator[Finding]:
-        """Find samples that are in both radiance arrays, or in none; no array has only some of them."""
+        """Find samples that are in both radiance arrays or in neither; either array may lack some samples."""
         narrow, wide = held.get("radiance", set()), held.get("radiance_wide", set())
         for row in sorted(narrow & wide & samples):
             yield self._finding(Cause.TWICE, job, "radiance has it already", own["radiance_wide"], row)
@@ -217,7 +217,7 @@ class JobCheck:
         shards: dict[str, Shard],
         rows: JobRows | None,
     ) -> Iterator[Finding]:
-        """Read every row of a kind, and look at those that are whole."""
+        """Read every row of a kind, and check the values of undamaged rows."""
         names = {_array_of(file): file for file in files}
         for i in range(self._scene.shard_rows):
             row, values = job * self._scene.shard_rows + i, {}
@@ -243,10 +243,10 @@ class JobCheck:
     def _content(self, row: int, values: dict[str, NDArray[Any]], rows: JobRows | None) -> Iterator[tuple[Cause, str]]:
         halves = values.get("radiance", values.get("radiance_wide"))
         if halves is not None:
-            yield from self._contents.radiance(row, halves, self._tally)
+            yield from self._contents.radiance(row, halves, self._totals)
         if "depth" in values and "normal" in values:
             view = None if rows is None else rows.views.get(row)
-            yield from self._contents.view(values["depth"], values["normal"], view, self._tally)
+            yield from self._contents.view(values["depth"], values["normal"], view, self._totals)
         for name in ("point_seen", "photon_seen"):
             if name in values:
                 yield from self._contents.bits(name, values[name])

@@ -23,7 +23,7 @@ class JobPool:
     """Threads that check jobs, each with memory of its own; a context manager."""
 
     def __init__(self, scene: CheckTarget, scenes: int) -> None:
-        self.tallies: list[CheckTotals] = []
+        self.totals: list[CheckTotals] = []
         self._own = threading.local()
         self._scene = scene
         self._scenes = scenes
@@ -40,7 +40,7 @@ class JobPool:
     @property
     def size_bytes(self) -> int:
         """Bytes read so far."""
-        return sum(tally.size_bytes for tally in self.tallies)
+        return sum(each.size_bytes for each in self.totals)
 
     def run(self, jobs: list[int]) -> Iterator[tuple[list[Finding], bytes]]:
         """The findings of each job, and its marker, in order."""
@@ -49,31 +49,31 @@ class JobPool:
     def _check(self, job: int) -> tuple[list[Finding], bytes]:
         if not hasattr(self._own, "checker"):
             self._own.checker = _Checker(self._scene, self._scenes)
-            self.tallies.append(self._own.checker.tally)
+            self.totals.append(self._own.checker.totals)
         found: tuple[list[Finding], bytes] = self._own.checker.run(job)
         return found
 
 
 class _Checker:
-    """Checks jobs of a scene one after the other; tells damage of the store from that of this machine's copies."""
+    """Checks jobs of a scene one after the other, and distinguishes damage of the store from damage of local copies."""
 
     def __init__(self, scene: CheckTarget, scenes: int) -> None:
-        self.tally = CheckTotals(HalvesTest(scenes))
+        self.totals = CheckTotals(HalvesTest(scenes))
         self._scene = scene
         self._scenes = scenes
         self._check = JobCheck(scene)
 
     def run(self, job: int) -> tuple[list[Finding], bytes]:
         """The findings of a job, and its marker; damaged local copies are replaced and read again first."""
-        found, marker, tally = self._run(job)
+        found, marker, totals = self._run(job)
         if self._renewed(found):
-            found, marker, tally = self._run(job)
-        self.tally.add(tally)
+            found, marker, totals = self._run(job)
+        self.totals.add(totals)
         return found, marker
 
     def _run(self, job: int) -> tuple[list[Finding], bytes, CheckTotals]:
-        tally = CheckTotals(HalvesTest(self._scenes))  # of this job alone: one that is checked once more counts once
-        return *self._check.run(job, tally), tally
+        totals = CheckTotals(HalvesTest(self._scenes))  # of this job alone: one that is checked again counts once
+        return *self._check.run(job, totals), totals
 
     def _renewed(self, found: list[Finding]) -> bool:
         """Replace the local copies of files with wrong checksums; returns whether there were any."""

@@ -24,9 +24,9 @@ DRAWN = 4
 """The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""
 
 
-def equal_samples(scene: CheckTarget, tally: CheckTotals) -> Iterator[Finding]:
+def equal_samples(scene: CheckTarget, totals: CheckTotals) -> Iterator[Finding]:
     """Samples that have a half in common. Constant halves may rightly be equal: there is no noise in them."""
-    for rows in tally.fingerprints.suspects():
+    for rows in totals.fingerprints.suspects():
         read = ((row, halves) for row in rows if (halves := _halves(scene, row)) is not None)
         first, reference = next(read, (0, None))
         if reference is None or any(is_constant(half) for half in reference):

@@ -1,12 +1,12 @@
-"""Shards, written and read row by row: the same standard files as zarr's, without its cost per row.
+"""Writes and reads shards row by row: the same standard files as zarr-python's, without its cost per row.
 
 A shard (Zarr v3 `sharding_indexed`, index at the end) is the inner chunks in any order, then per inner chunk its offset
 and length as little-endian uint64 (both 2^64 − 1 for an empty one), then the CRC-32C of that index. Each inner chunk
-is its bytes, compressed or not, then their CRC-32C. zarr-python and tensorstore are the oracles of the tests.
+is its bytes, compressed or not, then their CRC-32C. The tests compare with zarr-python and tensorstore.
 
-A row is read from the file the first time, and later copied out of a map of it, which takes two thirds of the time, as
-long as the page cache holds it. Otherwise reading is the faster of the two; and a map ends the process if its file is
-cut or its disk fails, where reading raises.
+A row is read from the file the first time. Later, while the page cache holds it, it is copied out of a map of the file,
+which takes two thirds of the time. Otherwise reading is faster. It is safer, too: if the file is cut or its disk fails,
+reading raises an error, but a map ends the process.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _EMPTY = 2**64 - 1
 _CRC_BYTES = 4
 _BLOSC_HEADER_BYTES = 16
 _FLUSH_BYTES = 4 << 20
-"""The bytes written before the disk is set to work on them, so that the sync of a commit has little left to do."""
+"""The bytes after which the disk is asked to write them, so that little is left to the sync of a commit."""
 
 _DAMAGED = (errno.EIO, errno.EBADMSG, errno.EUCLEAN)
-"""The errors by which a file system refuses a file that is there: of the disk, or of its own checksums."""
+"""The errors of a file system for a file that exists but is damaged: a disk error, or a wrong checksum of its own."""
 
 _PIECE_BYTES = 256 << 10
-"""The bytes copied at a time, and then checked while a core's own cache still holds them."""
+"""The bytes that are copied at a time, and then checked while the core's own cache still holds them."""
 
 _NO_WAIT: int | None = getattr(os, "RWF_NOWAIT", None)
-"""Read what the page cache holds, or fail. Only Linux has it; elsewhere nothing is mapped."""
+"""The flag to read only what the page cache holds. Only Linux has it; elsewhere nothing is mapped."""
 
 
 def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
@@ -52,7 +52,7 @@ def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
 
 
 class ShardWriter:
-    """One shard on its way to disk. Rows may come in any order and may be left out."""
+    """A shard that is being written. Rows may come in any order and may be left out."""
 
     def __init__(self, part: Path, array: ArraySchema, shard_rows: int) -> None:
         """Begin the file, which must be new."""
@@ -94,7 +94,7 @@ class ShardWriter:
 
 
 class Shard:
-    """One whole shard, open for reading, its index checked. Safe for several threads at once."""
+    """A complete shard, open for reading, whose index has been checked. Several threads may use it at once."""
 
     def __init__(self, path: Path, array: ArraySchema, shard_rows: int) -> None:
         """Open a shard; raises CorruptError, with the file's name, for a missing, cut or damaged file.
@@ -131,7 +131,7 @@ class Shard:
         raw_bytes = self._array.dtype.itemsize * int(np.prod(self._array.shape)) + _CRC_BYTES
         of_this_array = length >= _CRC_BYTES if self._array.compressed else length == raw_bytes
         if not ((offset <= space) & (length <= space - np.minimum(offset, space)) & of_this_array).all():
-            raise CorruptError(f"{self.path}: the index is whole, but not that of {self._array.name}")
+            raise CorruptError(f"{self.path}: the index is not damaged, but does not fit the array {self._array.name}")
         rows: list[list[int]] = index.tolist()
         return rows
 

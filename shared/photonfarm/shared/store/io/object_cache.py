@@ -46,11 +46,11 @@ class ObjectCache:
         """The cache of a store, with folder and limit from the variables; raises StoreError for an invalid one."""
         named = os.environ.get(FOLDER_VARIABLE)
         root = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "photonfarm"
-        told = os.environ.get(LIMIT_VARIABLE) or LIMIT_GB
+        given = os.environ.get(LIMIT_VARIABLE) or LIMIT_GB
         try:
-            limit_gb = float(told)
+            limit_gb = float(given)
         except ValueError as error:
-            raise StoreError(f"{LIMIT_VARIABLE} = {told!r}: a number of gigabytes is required") from error
+            raise StoreError(f"{LIMIT_VARIABLE} = {given!r}: a number of gigabytes is required") from error
         return cls(root / "objects" / hashlib.sha256(url.encode()).hexdigest()[:16], limit_gb * 1e9)
 
     def path(self, name: str, version: str | None) -> Path:

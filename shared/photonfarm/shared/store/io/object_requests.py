@@ -100,8 +100,10 @@ def _reason(error: Exception) -> str:
     """The library's error in one line, with code and message of the server's answer instead of its XML."""
     said = re.split(r"<\?xml|<Error>", _first_line(error))[0].rstrip(": ")
     answer = str(error).partition("\n\nDebug source:")[0]
-    told = [match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))]
-    return " ".join(": ".join([said, *told]).split())
+    parts = [
+        match[1] for tag in ("Code", "Message") if (match := re.search(f"<{tag}>(.*?)</{tag}>", answer, re.DOTALL))
+    ]
+    return " ".join(": ".join([said, *parts]).split())
 
 
 def _first_line(error: Exception) -> str:

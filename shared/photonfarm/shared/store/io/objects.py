@@ -11,8 +11,7 @@ folder's files, placed by a conditional put: from then on what the folder will h
 are put under their names, `zarr.json` of the folder last, which is what readers look for. A process that finds a folder
 claimed but not complete first completes it from the claim. So two submitters never mix their files; if one dies after
 its claim, the next one completes it; and if one sleeps for however long, it finds on waking that all of its files are
-there already, with the same bytes. Claims stay, so that a
-process that has slept cannot claim later.
+there already, with the same bytes. Claims stay, so that a process that has slept cannot claim later.
 """
 
 from __future__ import annotations
@@ -42,17 +41,22 @@ if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion
 
 SMALL_BYTES = 4 << 20
+"""The largest size of an object that counts as small."""
+
 TIMEOUT_S = 30.0
-"""The time limit for a request and its answer, up to SMALL_BYTES…"""
+"""The time limit of a small request, with its answer."""
+
 TRANSFER_TIMEOUT_S = 300.0
-"""…and for larger ones: a shard of 256 MB at 1 MB/s."""
+"""The time limit of a larger request: enough for a shard of 256 MB at 1 MB/s."""
 
 PUTS_AT_ONCE = 8
-"""The puts under way at once for the files of a folder: they are many and small, and each waits for an answer."""
+"""The number of puts under way at once for a folder's files, which are many and small; each put waits for an answer."""
 
 TRANSFER_TIMES = 2
+"""The attempts at a larger request."""
+
 REPLACED_TIMES = 4
-"""The attempts to fetch an object that is replaced meanwhile."""
+"""The attempts to fetch an object that another process replaces meanwhile."""
 
 WRITER = "writer"
 """The metadata field with a put's id; letters alone, as not every service takes more."""
@@ -327,5 +331,5 @@ def _pack(folder: Path, packed: Path) -> None:
 
 def _version(about: ObjectMeta) -> str:
     """A text that changes with an object's bytes."""
-    told = about["e_tag"] or f"{about['last_modified']} {about['size']}"
-    return hashlib.sha256(told.encode()).hexdigest()[:16]
+    version = about["e_tag"] or f"{about['last_modified']} {about['size']}"
+    return hashlib.sha256(version.encode()).hexdigest()[:16]

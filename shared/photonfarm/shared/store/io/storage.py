@@ -25,10 +25,10 @@ TMP = "tmp"
 """The folder of parts that are not adopted yet."""
 
 STRAY_AGE_S = 60.0
-"""Parts of a dead process of this machine are removed at this age…"""
+"""The age at which parts left by a dead process of this machine are removed."""
 
 FOREIGN_AGE_S = 86400.0
-"""…and those of other machines, whose processes cannot be checked, at this one."""
+"""The age at which parts from other machines are removed; their processes cannot be checked."""
 
 
 class Storage(Protocol):

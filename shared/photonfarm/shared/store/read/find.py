@@ -28,8 +28,9 @@ def scene_named(store: Store, text: str) -> str:
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
     found = found or [each for each in ids if _has_name(store, each, text)]
     if len(found) != 1:
-        held = f"{len(found)} scenes" if found else "no scene"
-        raise StoreError(f"{store.storage.where}: holds {held} that {text!r} stands for; it holds {', '.join(ids)}")
+        held = f"{len(found)} scenes have" if found else "no scene has"
+        known = f"give one of the ids {', '.join(ids)}" if ids else "the store has no scenes yet"
+        raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return found[0]
 
 

@@ -33,17 +33,17 @@ class Remedy(Enum):
 class Cause(Enum):
     """The causes of findings: the name in JSON, the sentence, and the remedy."""
 
-    MARKER = "marker", "a marker that cannot be read, or does not tell its job's files", Remedy.RENDER
+    MARKER = "marker", "a marker that cannot be read, or does not name its job's files", Remedy.RENDER
     NO_PLAN = "no-plan", "a marker of a job that no plan has", Remedy.RENDER
     MISSING_FILE = "missing-file", "committed, but a file is missing", Remedy.RENDER
-    SIZE = "size", "a file has another size than its marker tells", Remedy.RENDER
+    SIZE = "size", "a file has another size than its marker gives", Remedy.RENDER
     CHECKSUM = "checksum", "stored bytes are not what was committed", Remedy.RENDER
     MISSING_ROW = "missing-row", "committed, but a row is missing", Remedy.RENDER
     UNUSED_ROW = "unused-row", "a row that the plan does not use holds data", Remedy.RENDER
     NOT_FINITE = "not-finite", "a stored value is NaN or infinite", Remedy.RENDER
     UNUSED_BIT = (
         "unused-bit",
-        "a bit tells that a point or photon is seen which the scene does not have",
+        "a bit says that a point or photon is seen that the scene does not have",
         Remedy.RENDER,
     )
     EQUAL_HALVES = "equal-halves", "halves A and B of a sample are equal: one seed, used twice", Remedy.RENDER

@@ -93,8 +93,8 @@ class SceneStore:
             for name, job in last.items():
                 if job >= first_job:
                     raise CorruptError(
-                        f"{self.storage.where}/{markers.name_of(name, job)}: no plan has this job, and a new one "
-                        "would: `photonfarm store check` tells whether the last plan is missing"
+                        f"{self.storage.where}/{markers.name_of(name, job)}: no plan has this job, and a new "
+                        "plan would take its number; `photonfarm store check` reports whether the last plan is missing"
                     )
             expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:

@@ -1,4 +1,4 @@
-"""The sample points of guides: one low-discrepancy set in each pixel, and its shift."""
+"""The sample points of guides: one low-discrepancy set, shifted by another offset in each pixel."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ sequences, 2018].
 
 
 def pattern_of(light_samples: int) -> F32:
-    """The points of a pixel's samples before the shift: for each light sample, then for the BSDF, (…, 3)."""
+    """The points of a pixel before the shift, (…, 3): first those of each light sample, then those of the BSDF."""
     number = np.arange((light_samples + 1) * SUB_PIXELS)[:, None]
     return (number * np.array(STEPS) % 1).astype(np.float32)
 
 
 def shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
-    """The three numbers of a sample, for each ray."""
+    """The three random numbers of sample number `sample`, for each ray."""
     within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
     place = sample * SUB_PIXELS + within
     u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
@@ -36,15 +36,15 @@ def shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
 
 
 class PatternSampler:
-    """Three numbers in place of the integrator's sampler: one chooses a light, two a point on it."""
+    """A sampler that returns three given numbers: one to choose a light, and two to choose a point on it."""
 
     def __init__(self, u: list[Any]) -> None:
         self._u = u
 
     def next_1d(self) -> Any:
-        """The first number."""
+        """The first number, which chooses a light."""
         return self._u[0]
 
     def next_2d(self) -> Any:
-        """The other two numbers."""
+        """The other two numbers, which choose a point on the light."""
         return mi.Point2f(self._u[1], self._u[2])

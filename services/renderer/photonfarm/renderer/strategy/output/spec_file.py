@@ -1,4 +1,4 @@
-"""Settings put into a spec's TOML file, which keeps everything else byte for byte: comments, order, spaces."""
+"""Writes settings into a spec's TOML file and keeps everything else byte for byte: comments, order and spaces."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene import spec as scene
 
 BYTE_ORDER_MARK = "\ufeff"
-"""Some editors begin a file with it."""
+"""The character with which some editors begin a file."""
 
 Settings = Mapping[str, Mapping[str, int | float]]
-"""Table → key → number."""
+"""The numbers to write, by table and key."""
 
 
 def writable(name: str) -> Path:
-    """The file of a spec that may be written. Raises SpecError for a built-in one and for one that is read-only."""
+    """The file of a spec, if it may be written; raises SpecError for a built-in spec and for a read-only file."""
     file = scene.find_spec(name).resolve()
     if file.parent == (Path(scene.__file__).parent / "specs").resolve():
         raise SpecError(
@@ -36,7 +36,7 @@ def writable(name: str) -> Path:
 
 
 def write(file: Path, settings: Settings) -> None:
-    """Put settings into a TOML file; it changes at once or not at all. Raises SpecError for a file that is no TOML."""
+    """Write settings into a TOML file, all of them or none; raises SpecError for a file that is not valid TOML."""
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
     aside = file.with_name(f".{file.name}.{os.getpid()}.part")
@@ -49,7 +49,7 @@ def write(file: Path, settings: Settings) -> None:
 
 
 def put(text: str, settings: Settings, *, where: str) -> str:
-    """A TOML document with other numbers in some of its tables; everything else stays. SpecError for no valid TOML."""
+    """A TOML document with new numbers and everything else unchanged; raises SpecError if it is not valid TOML."""
     plain = text.removeprefix(BYTE_ORDER_MARK)
     mark = text[: len(text) - len(plain)]
     try:

@@ -1,4 +1,4 @@
-"""Rows that are hard for the camera, the film, or the scale of things."""
+"""Scenes that are hard because of the camera, the film, or the scale."""
 
 from __future__ import annotations
 
@@ -154,4 +154,4 @@ SCENES = (
     # Unbounded paths without any roulette end by themselves in a room that loses light, but late
     *(_depth(max_depth, rr) for max_depth in (1, 2, 3, -1) for rr in (1, 1000 if max_depth > 0 else 50)),
 )  # fmt: skip
-"""Rows 27–29, 32, 35."""
+"""The scenes of rows 27–29, 32 and 35."""

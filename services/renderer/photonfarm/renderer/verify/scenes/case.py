@@ -20,7 +20,7 @@ Images = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, slots=True)
 class BdptSettings:
-    """Technique counts of `bdpt`."""
+    """The technique counts of `bdpt`."""
 
     connections: int
     light_ratio: float
@@ -41,7 +41,7 @@ WITH_LIGHT_PATHS = tuple(settings for settings in ALL if settings.light_ratio > 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """The amount of rendering, and the required precision."""
+    """The amount of rendering and the required precision of a comparison."""
 
     size: int  # pixels, square
     blocks: int  # the image is compared in blocks × blocks
@@ -57,7 +57,7 @@ LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=384, resolution=0.
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The reference of an image."""
+    """The truth with which an image is compared."""
 
     name: str  # in words, for the table
     images: Callable[[HardScene, Effort, int], Images]  # function of a scene, an effort and a seed

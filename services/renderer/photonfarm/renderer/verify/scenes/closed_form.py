@@ -1,4 +1,4 @@
-"""Rows whose image is known in closed form; the derivation is stated with each."""
+"""Scenes whose images are known in closed form; each one states the derivation."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ def closed_sphere(size: int) -> Scene:
 
 
 def shining_sphere(size: int) -> Scene:
-    """The same, shining with radiance ½."""
+    """The closed sphere, shining with radiance ½."""
     scene = closed_sphere(size)
     scene["sphere"]["emitter"] = shining(0.5)
     return scene
 
 
 def point_in_sphere(size: int) -> Scene:
-    """The same with a point light of intensity π in its centre."""
+    """The closed sphere with a point light of intensity π in its centre."""
     return {**closed_sphere(size), "light": {"type": "point", "intensity": {"type": "rgb", "value": np.pi}}}
 
 
 def four_points_in_sphere(size: int) -> Scene:
-    """The same with four lights of a quarter each in one place, chosen with unequal probabilities."""
+    """The closed sphere with four lights in its centre, of intensity π/4 each, chosen with unequal probabilities."""
     scene = closed_sphere(size)
     for k in range(4):
         intensity = {"type": "rgb", "value": np.pi / 4}
@@ -66,7 +66,7 @@ def furnace(size: int) -> Scene:
 
 
 def glass_in_sphere(size: int) -> Scene:
-    """The shining sphere around bodies of glass, a mirror and a pane that lose nothing: radiance stays 1 everywhere."""
+    """The shining sphere around a glass ball, a mirror and a pane, which lose no light: radiance is 1 everywhere."""
     mirror = {"type": "conductor", "material": "none"}
     return {
         **shining_sphere(size),
@@ -77,7 +77,7 @@ def glass_in_sphere(size: int) -> Scene:
 
 
 def rough_furnace(size: int) -> Scene:
-    """Diffuse and rough bodies under the same sky; microfacets lose what they would scatter twice."""
+    """The furnace with rough glass and rough metal, whose microfacets lose the light that they would scatter twice."""
     rough = {"type": "roughdielectric", "alpha": 0.3, "distribution": "ggx"}
     scene = furnace(size)
     scene["rough"]["bsdf"] = rough
@@ -101,31 +101,32 @@ def over_a_plane(size: int, light: Scene) -> Scene:
 
 
 def point_over_plane(size: int) -> Scene:
-    """A point light of intensity 8 at (1, 0, 2)."""
+    """A plane below a point light of intensity 8 at (1, 0, 2)."""
     return over_a_plane(size, {"type": "point", "position": [1, 0, 2], "intensity": {"type": "rgb", "value": 8.0}})
 
 
 def point_radiance(p: Points) -> Values:
-    """L = ρ/π·I·cosθ/d²."""
+    """The radiance L = ρ/π·I·cosθ/d² of the plane under the point light."""
     r2 = np.square(p - [1, 0, 2]).sum(axis=1)
     return 0.5 / np.pi * 8 * 2 / r2**1.5
 
 
 def sun_over_plane(size: int) -> Scene:
-    """A directional light of irradiance 3."""
+    """A plane below a directional light of irradiance 3."""
     irradiance = {"type": "rgb", "value": 3.0}
     return over_a_plane(size, {"type": "directional", "direction": [1, 0, -2], "irradiance": irradiance})
 
 
 def rectangle_over_plane(size: int) -> Scene:
-    """A parallel rectangle light of half sizes 0.7, 0.4 at height 1.5, above the camera."""
+    """A plane below a parallel rectangle light of half sizes 0.7 and 0.4 at height 1.5, above the camera."""
     light = rectangle([0.7, 0.4], [0, 0, 1.5], [0, 0, -1], bsdf=grey(0.0), emitter=shining(5.0))
     return {**over_a_plane(size, light), "sensor": camera(size, [2.5, 0, 1.4], [0, 0, 0], 30)}
 
 
 def rectangle_radiance(p: Points) -> Values:
-    """L = ρ·Le·F; F is the signed sum over the four corners of the form factor of a rectangle with a corner above p.
+    """The radiance L = ρ·Le·F of the plane under the rectangle light.
 
+    F is the signed sum, over the four corners, of the form factor of a rectangle with one corner above p,
     F₁ = 1/(2π)·[A/√(1+A²)·atan(B/√(1+A²)) + B/√(1+B²)·atan(A/√(1+B²))], A = a/h, B = b/h (Howell, C-11).
     """
 
@@ -139,13 +140,13 @@ def rectangle_radiance(p: Points) -> Values:
 
 
 def ball_over_plane(size: int) -> Scene:
-    """A sphere light of radius 0.6 around (−1, 0, 2), wholly above the horizon of every point."""
+    """A plane below a sphere light of radius 0.6 around (−1, 0, 2), wholly above the horizon of every point."""
     light = {"type": "sphere", "center": [-1, 0, 2], "radius": 0.6, "bsdf": grey(0.0), "emitter": shining(5.0)}
     return over_a_plane(size, light)
 
 
 def ball_radiance(p: Points) -> Values:
-    """E = π·Le·(r/d)²·cosθ, L = ρ/π·E."""
+    """The radiance L = ρ/π·E of the plane under the sphere light, with E = π·Le·(r/d)²·cosθ."""
     d2 = np.square(p - [-1, 0, 2]).sum(axis=1)
     return 0.5 * 5 * 0.36 / d2 * 2 / np.sqrt(d2)
 
@@ -154,7 +155,7 @@ SPOT = np.array([1.0, 0.0, 2.0])
 
 
 def spot_over_plane(size: int) -> Scene:
-    """A 5° spot light of intensity 8, full up to 4°, seen from near so that its rim is in the image."""
+    """A 5° spot light of intensity 8, which is full up to 4°; the camera is near, so that the rim is in the image."""
     to_world = mi.ScalarTransform4f().look_at(origin=list(SPOT), target=[0, 0, 0], up=[0, 1, 0])
     intensity = {"type": "rgb", "value": 8.0}
     light = {"type": "spot", "to_world": to_world, "cutoff_angle": 5, "beam_width": 4, "intensity": intensity}
@@ -162,7 +163,7 @@ def spot_over_plane(size: int) -> Scene:
 
 
 def spot_radiance(p: Points) -> Values:
-    """L = ρ/π·I·f(θ)·cosθ/d², f falling linearly from 1 at 4° to 0 at 5°."""
+    """The radiance L = ρ/π·I·f(θ)·cosθ/d² of the plane, with f falling linearly from 1 at 4° to 0 at 5°."""
     offset = p - SPOT
     distance = np.linalg.norm(offset, axis=1)
     angle = np.degrees(np.arccos(np.clip(offset @ (-SPOT / np.linalg.norm(SPOT)) / distance, -1, 1)))
@@ -215,4 +216,4 @@ SCENES = (
     HardScene(36, "long-paths", "24 edges, no roulette: every vertex must be kept", shining_sphere,
               known(1 - 0.5**24, "1 − ½^24"), max_depth=24, rr_depth=1000, quick=replace(QUICK, spp=32)),
 )  # fmt: skip
-"""Rows 1–5, 8–10, 26, 36."""
+"""The scenes of rows 1–5, 8–10, 26 and 36."""

@@ -179,7 +179,7 @@ def bump_floor(size: int) -> Scene:
 
 
 def normal_floor(size: int) -> Scene:
-    """The same with a normal map."""
+    """A floor with a strong normal map in a room with an area light."""
     slope = (bumps()[..., 0] - 0.5) * 0.9
     normals = np.stack([slope, slope.T, np.sqrt(1 - slope**2 - slope.T**2)], axis=-1) * 0.5 + 0.5
     mapped = {

@@ -1,4 +1,4 @@
-"""Rows that are hard for their lights."""
+"""Scenes that are hard because of their lights."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def block_at_home(size: int) -> Scene:
 
 
 def block_far_away(size: int) -> Scene:
-    """The same with the block outside of the old bounding sphere, in the picture."""
+    """The scene of `block_at_home`, its block outside of the former bounding sphere but still in the picture."""
     return _under_sky_and_sun(size, mi.ScalarTransform4f().translate(SHIFT).translate([0, 0, 0.8]).scale(0.8))
 
 
@@ -62,7 +62,7 @@ def move_block(scene: Any) -> None:
 
 
 def point_caustic(size: int) -> Scene:
-    """The caustic of a point light under a glass ball that is out of the picture itself."""
+    """The caustic of a point light under a glass ball, which is itself out of the picture."""
     glass = {"type": "dielectric", "int_ior": 1.5}
     return {
         "type": "scene",
@@ -102,7 +102,7 @@ def mirrored_light(size: int) -> Scene:
 
 
 def unmirrored_light(size: int) -> Scene:
-    """The same box without a mirroring: it is symmetric."""
+    """The room of `mirrored_light`, its box not mirrored; as the box is symmetric, the images must be equal."""
     return _cube_light(size, mirrored=False)
 
 
@@ -225,4 +225,4 @@ SCENES = (
               hard_scenes.many_lights, PATH),
     HardScene(26, "projector", "a pattern thrown from a point", projector, PATH),
 )  # fmt: skip
-"""Rows 6, 7, 11–16, 22–26."""
+"""The scenes of rows 6, 7, 11–16 and 22–26."""

@@ -27,7 +27,7 @@ def mesh(
 
 
 def grid(name: str, cells: int, **children: Any) -> Any:
-    """2·cells² triangles of unequal sizes that look down from under the ceiling of `room`."""
+    """A mesh of 2·cells² triangles of unequal sizes that face down from under the ceiling of `room`."""
     at = np.sort(np.concatenate([[-0.3, 0.3], np.random.default_rng(5).uniform(-0.3, 0.3, cells - 1)]))
     y, x = np.meshgrid(at, at, indexing="ij")
     positions = np.stack([x, y, np.full_like(x, 1.95)], axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Rows that are hard for their surfaces."""
+"""Scenes that are hard because of their surfaces."""
 
 from __future__ import annotations
 
@@ -146,4 +146,4 @@ SCENES = (
               PATH),
     HardScene(34, "sheets", "a pane, thin principled, a cut-out mask, a blend", sheets, PATH),
 )  # fmt: skip
-"""Rows 17–21, 31, 33, 34."""
+"""The scenes of rows 17–21, 31, 33 and 34."""

@@ -11,7 +11,7 @@ import numpy as np
 from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Scene, Truth
 
 LANES = 1 << 20
-"""The most samples of one launch: bounds the memory of Mitsuba's own integrators."""
+"""The largest number of samples of one launch, which bounds the memory of Mitsuba's own integrators."""
 TRUTH_SEEDS = 1_000_000
 """The first seed of truths, above those of bdpt."""
 GRID = 24
@@ -97,7 +97,7 @@ def same_by_bdpt(build: Callable[[int], Scene], name: str) -> Truth:
 
 
 def known(value: float, name: str) -> Truth:
-    """One number for all pixels and channels."""
+    """The truth of a scene whose pixels and channels all have one value."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001 - the face of all truths
         return np.full((1, effort.size, effort.size, 3), value)
@@ -106,7 +106,7 @@ def known(value: float, name: str) -> Truth:
 
 
 def known_on_plane(radiance: Callable[[Any], Any], name: str) -> Truth:
-    """The plane z = 0, seen by the scene's camera: ``radiance`` of points [N, 3] on it is [N]."""
+    """The truth of the plane z = 0, seen by the scene's camera; ``radiance`` maps points on it, [N, 3], to [N]."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001
         sensor = load(scene.build(effort.size)).sensors()[0]

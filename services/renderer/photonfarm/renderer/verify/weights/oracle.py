@@ -1,15 +1,15 @@
-"""What the weights of one path must be, from its vertices alone: float64, numpy, none of the integrator's formulas.
+"""The right weights of paths, computed from their vertices in float64 without the integrator's formulas.
 
 A path of k edges has vertices v₀ (on the light) … v_k (the lens). The technique with s light vertices makes the first s
-of them from the light, the others from the lens, and joins the two ends. Its density is the product of the densities of
-all steps, in area measure (a light at infinity: of its direction), and its weight the share of its count times its
-density in the sum over all techniques (Veach, *Robust Monte Carlo Methods for Light Transport Simulation*, 1997,
-§8.2.2, §9.2.4, §10.2.1).
+of them from the light and the others from the lens, and joins the two ends. Its density is the product of the densities
+of all steps in area measure (for a light at infinity, of its direction). The weight of a technique is its count times
+its density, over the sum of these products of all techniques (Veach, *Robust Monte Carlo Methods for Light Transport
+Simulation*, 1997, §8.2.2, §9.2.4, §10.2.1).
 
-Of a mirror or a smooth interface both directions' densities are infinite, in a fixed proportion, and nothing joins
-there. The proportion is 1 for reflection; for refraction it is dω/dω' with dω cosθ n² = dω' cosθ' n'² (Veach 1997,
-§5.2). The integrator leaves it out (as all do who follow Georgiev): weights still sum to 1, and over a body that light
-enters and leaves alike, such as a sphere or a pane, it is 1 again.
+At a mirror or a smooth interface the densities of both directions are infinite, in a fixed ratio, and no technique
+joins two ends there. The ratio is 1 for reflection. For refraction it is dω/dω' with dω cosθ n² = dω' cosθ' n'² (Veach
+1997, §5.2). The integrator leaves this ratio out, as do all that follow Georgiev. Its weights still sum to 1, and the
+ratios multiply to 1 over a body that light enters and leaves at equal angles, such as a sphere or a pane.
 
 Shape letters: N paths, k edges; arrays by vertex have k + 1 columns, arrays by edge k.
 """
@@ -27,17 +27,17 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OraclePaths:
-    """N paths of k edges, as they lie in the scene, and the densities of single steps.
+    """N paths of k edges, with the densities of their single steps.
 
-    Columns of ends without a value (the lens and a point light have no normal) are not read.
+    Columns of path ends that have no such value are not read: the lens and a point light have no normal.
     """
 
     position: F64  # [N, k + 1, 3]
     normal: F64  # [N, k + 1, 3]: geometric
     to_light: F64  # [N, k + 1]: solid-angle density of the BSDF's sampling from the eye's side towards the light
-    to_eye: F64  # [N, k + 1]: the other way round
+    to_eye: F64  # [N, k + 1]: solid-angle density of the BSDF's sampling from the light's side towards the eye
     delta: Mask  # [N, k + 1]: scattered by a mirror or a smooth interface here
-    turn: F64  # [N, k + 1]: there, density towards the eye over that towards the light: 1 for a mirror
+    turn: F64  # [N, k + 1]: at delta vertices, density towards the eye over that towards the light; 1 for a mirror
     infinite: Mask  # [N]: the light is at infinity: v₀ stands for a direction
     distant: F64  # [N, 3]: direction to it
     hittable: Mask  # [N]: a ray can find the light
@@ -53,9 +53,9 @@ class OraclePaths:
 
 
 def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64:
-    """[k + 1]: samples of each technique for each eye path: hits, next events, connections, light tracing.
+    """The samples of each technique for each eye path, [k + 1]: hits, next events, connections, light tracing.
 
-    Light paths are not joined to the lens at their first vertex (k = 2).
+    Light paths are not joined to the lens at their first vertex, which is the case k = 2.
     """
     counts = np.full(k + 1, connection_count)
     counts[:2] = 1
@@ -65,7 +65,7 @@ def technique_counts(k: int, connection_count: float, light_ratio: float) -> F64
 
 
 def weights(paths: OraclePaths, counts: F64) -> F64:
-    """[N, k + 1]: the weight of each technique; 0 if it cannot make the path, NaN if none can."""
+    """The weight of each technique, [N, k + 1]; 0 if it cannot make the path, NaN if none can."""
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = log_densities(paths) + np.log(counts)
         weighted = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -74,10 +74,10 @@ def weights(paths: OraclePaths, counts: F64) -> F64:
 
 
 def log_densities(paths: OraclePaths) -> F64:
-    """[N, k + 1]: log of each technique's density; −∞ if it cannot make the path."""
+    """The logarithm of each technique's density, [N, k + 1]; −∞ if it cannot make the path."""
     k = paths.edges
     r2, at_light_end, at_eye_end = _edges(paths)
-    area_from_light, area_from_eye = at_eye_end / r2, at_light_end / r2  # of an edge: density per solid angle → area
+    area_from_light, area_from_eye = at_eye_end / r2, at_light_end / r2  # density per solid angle → area
     area_from_light[:, 0] = np.where(paths.infinite, at_eye_end[:, 0], area_from_light[:, 0])
     area_from_eye[:, 0] = np.where(paths.infinite, 1, area_from_eye[:, 0])
     to_light, to_eye = np.where(paths.delta, 1, paths.to_light), np.where(paths.delta, paths.turn, paths.to_eye)
@@ -104,7 +104,7 @@ def _edges(paths: OraclePaths) -> tuple[F64, F64, F64]:
 
 
 def _log_from_light(paths: OraclePaths, to_eye: F64, area: F64, cos_0: F64) -> list[F64]:
-    """Log density of the first s vertices, made from the light, for s = 0 … k."""
+    """The log densities of the first s vertices, made from the light, for s = 0 … k."""
     start = np.log(paths.emission) + np.log(np.where(paths.light_has_cosine, cos_0, 1))
     logs = [np.zeros(len(cos_0)), np.log(paths.next_event), start + area[:, 0]]
     for j in range(1, paths.edges):
@@ -113,7 +113,7 @@ def _log_from_light(paths: OraclePaths, to_eye: F64, area: F64, cos_0: F64) -> l
 
 
 def _log_from_eye(paths: OraclePaths, to_light: F64, area: F64) -> list[F64]:
-    """Log density of the last t vertices, made from the lens, for t = 0 … k + 1; the lens itself counts 1."""
+    """The log densities of the last t vertices, made from the lens, for t = 0 … k + 1; that of the lens itself is 0."""
     k = paths.edges
     logs = [np.zeros(len(area)), np.zeros(len(area)), np.log(paths.camera) + area[:, k - 1]]
     for j in range(k - 1, 0, -1):

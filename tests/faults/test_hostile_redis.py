@@ -366,7 +366,7 @@ def test_our_worker_renders_every_honest_job_and_gives_the_stranger_nothing(
     assert peak < LARGE, f"{peak / 1e6:.0f} MB at its peak"
     said = log.read_text()
     assert PASSWORD not in said
-    assert "were not names of jobs, and were thrown away" in said
+    assert "thrown away" in said
     assert "Traceback" not in said
     assert "is not of the store" in said, "strangers' jobs of unknown scenes are refused aloud"
 

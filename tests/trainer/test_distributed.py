@@ -261,7 +261,7 @@ def test_a_run_that_ends_before_there_is_a_scene_ends_for_both(make_source, tiny
 
 def test_a_batch_smaller_than_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "4")
-    with pytest.raises(SpecError, match="batch = 3: is shared by 4 processes"), ranks("cpu", 3):
+    with pytest.raises(SpecError), ranks("cpu", 3):
         pass
 
 

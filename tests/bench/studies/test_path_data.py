@@ -243,7 +243,7 @@ def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]])
 
 
 def test_more_samples_than_there_are_is_refused(roots: dict[str, tuple[Path, str]]) -> None:
-    with pytest.raises(ValueError, match="and 1000 are needed"):
+    with pytest.raises(ValueError, match="1000"):
         FirstSamples(*roots["bdpt"], 1000)
 
 

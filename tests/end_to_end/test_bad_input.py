@@ -145,7 +145,7 @@ def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_fin
 
 
 def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp_path: Path) -> None:
-    """With 64 configurations planned before, some of them held out, one more may be of either side."""
+    """If 64 configurations are planned and some of them are held out, one more may be of either side."""
     assert here("submit", "room", "--modifications", "64", "--no-queue").returncode == 0
     wanted = Request(seed=1)
     check_hold_out(load_spec("room"), tmp_path / "store", 0.125, wanted)

@@ -141,7 +141,7 @@ def test_rooms_of_several_machines_are_named_with_theirs() -> None:
 
 
 def test_what_could_not_be_measured_is_not_available() -> None:
-    """Without Inception, with one reference, without times, and without the row that times are ratios of."""
+    """Inception, a second reference, times and the row that times are ratios of are all missing."""
     bare = report(("cnn", "feature_projection"))
     for of_row in bare["evaluation"]["rows"]:
         of_row["metric_space"] |= {"feature_l1": None, "fid": None, "kid": None, "inception": None}

@@ -126,7 +126,7 @@ def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> Non
 
 
 def reports(stages: Stages) -> list[int]:
-    """When what is made last was written: the farm's preview and log, checkpoints, references and the report."""
+    """The times at which preview and log of the farm, checkpoints, references and the report were written."""
     files = [*stages.folder.glob("runs/*/checkpoint*"), *stages.folder.glob("references/*.npz")]
     files = [*sorted(files), *(stages.folder / name for name in (PREVIEW, "logs/render.log", "report/report.json"))]
     return [file.stat().st_mtime_ns for file in files]

@@ -89,7 +89,7 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
 
 @pytest.fixture
 def scene(disk: Disk, planned: Callable[..., SceneStore]) -> SceneStore:
-    """On the disk: six jobs of two samples; base and first job are there."""
+    """A scene on the disk: six jobs of two samples; base and first job are there."""
     return planned(6)
 
 
@@ -135,7 +135,7 @@ def test_a_commit_succeeds_as_soon_as_there_is_room_and_shows_nothing_before(
     stored_bytes: Bytes,
     kind: str,
 ) -> None:
-    """With room for nothing, then for one page or file more each time: it fails at each of its steps in turn."""
+    """There is room for nothing, then for one page or file more each time: each step of the commit fails in turn."""
     refused = []
     for job in (0, 1):  # the first also writes the base, and makes the markers' folder
         before = read_all(scene)
@@ -322,7 +322,7 @@ def test_a_worker_at_a_read_only_store_ends_with_a_sentence_and_loses_nothing(
 def test_a_disk_that_becomes_read_only_ends_a_worker_that_is_at_work_and_loses_nothing(
     analytic: ModuleType, disk: Disk, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    """As a file system does that meets an error. While a part is open for writing it cannot: it is tried until then."""
+    """A file system that meets an error does so. It cannot while a part is open for writing: it is tried until then."""
     log = tmp_path / "log"
     with contextlib.ExitStack() as stack:
         running = stack.enter_context(

@@ -57,7 +57,7 @@ def add(store: Store, analytic: ModuleType) -> Callable[..., SceneStore]:
 def test_no_more_is_committed_than_the_ratio_to_what_the_trainer_has_used(
     analytic: ModuleType, store: Store, add: Callable[..., SceneStore], connection: redis.Redis
 ) -> None:
-    """Of 8 samples; 2 may be committed in any case."""
+    """There are 8 samples, of which 2 may be committed in any case."""
     scene, clock = add("one", 8, 0), Clock()
     pace = TrainerPace(store, connection, 1.5, clock=clock)
     renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)

@@ -67,7 +67,7 @@ KINDS = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With a sky and a texture in it."""
+    """A folder with a sky and a texture in it."""
     mi = backend.load(threads=1)
     rng = np.random.default_rng(1)
     mi.Bitmap(rng.random((8, 16, 3), np.float32)).write(str(tmp_path / "sky.pfm"))

@@ -54,7 +54,7 @@ def frame(view: View, modification: Modification, key: str = "same", row: int = 
 
 
 def kinds_of(shape: dict[str, Any], near: float = 0.01, far: float = 100) -> np.ndarray:
-    """Of a rectangle at the origin, ±1 across, from 3 in front of it: it fills the middle and no corner."""
+    """The kinds of surface of a rectangle at the origin, ±1 across, seen from 3 in front: it fills no corner."""
     mi = backend.load(1)
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", **shape}}, optimize=False)
     spec = plain(view={**plain().view.model_dump(mode="json"), "near": near, "far": far})
@@ -211,7 +211,7 @@ def test_each_part_is_charged_with_its_own_seconds(
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory, small: Callable[..., SceneSpec]) -> Store:
-    """With four rows of the room: two views of each of two configurations."""
+    """A store with four rows of the room: two views of each of two configurations."""
     made = Store(tmp_path_factory.mktemp("rows") / "store", create=True)
     request = Request(modifications=2, views_per_modification=2)
     scene_id = made.plan(small(load_spec("room")), request, shard_rows=4).scene_id

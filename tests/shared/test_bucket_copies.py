@@ -40,7 +40,7 @@ def objects_below(url: str) -> tuple[Any, list[str]]:
 
 @pytest.fixture
 def folders_end_with_their_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in S3: SeaweedFS lists a folder that has become empty for some time."""
+    """Folders end as in S3: SeaweedFS goes on listing an empty folder for some time."""
     plain = obstore.list_with_delimiter
 
     def without_empty_ones(bucket: Any, prefix: str | None = None) -> Any:

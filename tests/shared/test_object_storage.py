@@ -21,7 +21,7 @@ planned, at_once = bucket_samples.planned, bucket_samples.at_once
 
 @pytest.fixture(params=["folder", "bucket"])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
-    """Where a store may be made."""
+    """A place where a store may be made."""
     return request.getfixturevalue("url") if request.param == "bucket" else tmp_path / "store"
 
 

@@ -26,7 +26,7 @@ planned, put, at_once = bucket_samples.planned, bucket_samples.put, bucket_sampl
 
 @pytest.mark.parametrize("size", [10, 1_000_000])
 def test_of_concurrent_conditional_puts_the_server_lets_exactly_one_win(url: str, size: int) -> None:
-    """Of three, as the server lets each loser more wait a second longer."""
+    """There are three puts, as the server lets each further loser wait a second longer."""
     bucket = from_url(url, client_options={"allow_http": True})
 
     def put(byte: int) -> bool:

@@ -41,7 +41,7 @@ def source(scene: SceneStore) -> SceneReader:
 
 
 def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
-    """Against the samples read one by one."""
+    """Compare with the samples read one by one."""
     assert batch.rows.tolist() == rows
     for place, row in enumerate(rows):
         sample = source.read(row)

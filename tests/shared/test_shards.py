@@ -308,7 +308,7 @@ def test_only_a_disk_makes_a_file_that_cannot_be_opened_damaged(
     number: int,
     raised: type[OSError],
 ) -> None:
-    """For want of descriptors, no job is to be set aside."""
+    """No job is to be set aside for want of descriptors."""
     path, array, _ = noise
 
     def failing(*_: Any) -> int:

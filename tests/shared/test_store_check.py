@@ -205,7 +205,7 @@ def test_inputs_and_base_that_cannot_be_read_are_told_and_the_rest_is_checked(
 def test_a_store_that_cannot_be_reached_ends_the_check(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else a network that fails would be a finding of each job."""
+    """A network that fails would otherwise be a finding of each job."""
 
     def failing(*_: Any) -> Any:
         raise OSError(errno.EIO, "no answer")

@@ -77,7 +77,7 @@ def test_a_plan_that_is_missing_among_others_is_found(store: Store, scene: Scene
 def test_a_plan_that_is_lost_is_told_and_none_of_its_jobs_is_set_aside(
     store: Store, scene: SceneStore, gone: str, what: str
 ) -> None:
-    """Without it they cannot be rendered again; and once it is put back, nothing is wrong."""
+    """The jobs cannot be rendered again without it; once it is put back, nothing is wrong."""
     for n in (6, 7):
         scene.plan(Request(modifications=n, views_per_modification=2))
     commit_all(scene)
@@ -101,7 +101,7 @@ def test_a_plan_that_is_claimed_and_not_written_yet_is_no_finding(store: Store, 
 def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_away(
     store: Store, scene: SceneStore
 ) -> None:
-    """As docs/store-check.md tells it."""
+    """These are the steps that docs/store-check.md gives."""
     scene.plan(Request(modifications=7, views_per_modification=2))
     commit_all(scene)
     clean, aside = data(scene), Path(store.root) / "quarantine/by-hand"

@@ -159,7 +159,7 @@ def test_a_store_that_is_gone_or_another_one_is_told_from_the_one_that_was_opene
 
 
 def test_inputs_read_as_unused_where_nothing_is_written(scene: SceneStore) -> None:
-    """And not as row 0, which is another sample's."""
+    """They do not read as row 0, which is another sample's."""
     group: Any = zarr.open_group(str(scene.folder / "plans/000000"), mode="r")
     fills = {name: group[name].fill_value for name in ("sample_modification", "sample_view", "sample_pass")}
     assert set(map(int, fills.values())) == {-1}

@@ -29,7 +29,7 @@ def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedR
 
 @pytest.fixture
 def redis_url(redis_server: EmbeddedRedis) -> str:
-    """Of an empty Redis."""
+    """The URL of an empty Redis."""
     connect(redis_server.url).flushall()
     return redis_server.url
 

@@ -121,7 +121,7 @@ def test_a_plan_that_is_lost_is_an_error_that_names_it_and_nothing_is_read_or_pl
 
 
 def scene_of(store: Store) -> SceneStore:
-    """As a new process sees it."""
+    """The scene as a new process sees it."""
     (scene,) = Store(store.root).scenes()
     return scene
 
@@ -137,7 +137,7 @@ def test_no_plan_takes_the_number_of_jobs_that_are_committed(store: Store, scene
 
 
 def test_a_plan_that_is_claimed_and_not_written_yet_is_not_there_yet(store: Store, scene: SceneStore) -> None:
-    """As it may lie in a bucket, for a moment."""
+    """A plan may lie so in a bucket for a moment."""
     (scene.folder / "plans/000001/view").mkdir(parents=True)
     (scene.folder / "plans/000001.claim").write_bytes(b"")
     (scene.folder / "plans/7").mkdir()  # not a plan's name

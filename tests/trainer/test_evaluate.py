@@ -144,7 +144,7 @@ def test_without_inception_all_else_is_measured(store: Path, trained, references
 
 
 def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references: Path) -> None:
-    """Of 2 passes of a view one half A is a quarter of its reference."""
+    """One half A of a view of 2 passes is a quarter of its reference."""
     runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
     found = compare(store, runs, references=references, most=4)
     foot = evaluation_text(found).split("\n\n")[-1]
@@ -189,7 +189,7 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
 
 
 def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
-    """Of 256 pixels one of 256 is one, and one of 257 none."""
+    """One of 256 is one pixel of 256, and one of 257 is none."""
     source = make_source(3)
     assert kept_pixels(source.read(0), source.spec, 256).sum() == kept_count(source.spec, 256) == 1
     with pytest.raises(SpecError):
@@ -246,7 +246,7 @@ def test_without_references_only_the_linear_error_is_given(store: Path, trained)
 
 
 def test_how_far_a_row_is_behind_the_first_is_taken_in_pairs(store: Path, trained) -> None:
-    """Of a run beside itself the difference is nothing at all; in general it is that of the means."""
+    """A run has no difference at all from itself; in general it is that of the means."""
     run = trained("run")
     first, same, other = compare(store, [run, run], [("none", 4)]).rows
     assert (same.behind(first).mean, same.behind(first).standard_error) == (0, 0)

@@ -121,7 +121,7 @@ def test_the_files_hold_the_table_and_every_figure(make_source, tiny, run) -> No
 
 
 def test_the_best_is_picked_by_one_half_and_all_are_told_by_the_other_in_pairs() -> None:
-    """On the second half 1, 2, 3 and 1.1, 2.1, 3.1: by pairs the difference is 0.1 exactly, though the first is lower.
+    """The second half has 1, 2, 3 and 1.1, 2.1, 3.1: by pairs the difference is exactly 0.1, though the first is lower.
 
     A cell that is lucky on the half it is picked by is not told by its luck.
     """

@@ -67,7 +67,7 @@ def random_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def nothing_installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Neither the package nor a file in torch hub's cache; the cache's folder."""
+    """The folder of torch hub's cache; neither the package nor a file in that cache is there."""
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     cache = tmp_path / "hub" / "checkpoints"

@@ -102,7 +102,7 @@ def test_a_frame_of_a_path_is_the_image_of_the_stored_sample_of_the_same_view(
 
 
 def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, trained, tmp_path: Path) -> None:
-    """Only of what is held out an error is told: what was trained on may be known with its noise."""
+    """An error is told only of what is held out: what was trained on may be known with its noise."""
     run, reader = trained("denoise_4"), SceneReader(store, scene.scene_id)
     source = StoreSource(store, scene.scene_id)
     rows = source.refresh().tolist()

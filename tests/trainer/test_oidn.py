@@ -47,7 +47,7 @@ def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is
 
 
 def test_bright_light_stays_as_bright_as_it_is(oidn: Oidn) -> None:
-    """Without its flag for HDR the package clips at 1."""
+    """The package clips at 1 without its flag for HDR."""
     rng = np.random.default_rng(0)
     albedo = np.full((64, 64, 3), 0.5, np.float32)
     normal = np.broadcast_to(np.array([0, 0, 1], np.float32), albedo.shape)

@@ -34,7 +34,7 @@ def records(run: Path, kind: str) -> list[dict[str, Any]]:
 
 
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
-    """Of rows, of which each `views` are of one configuration."""
+    """A validation of rows, of which each `views` are of one configuration."""
     values, units = np.array([*errors.values()]), tuple(bytes([row // views]) for row in errors)
     held_out = HeldOutErrors(Estimate.of(group_means(values, units)), 0.0, values, values, units)
     return Validation(step, (*errors,), held_out)
@@ -267,7 +267,7 @@ def test_what_it_goes_back_to_is_not_trained_on_from_there(make_source, tiny, ru
 def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_says_so(
     make_source, tiny, run, tmp_path, monkeypatch, capsys
 ) -> None:
-    """By chance perhaps, as nobody sees at one validation: so it does not go back on the way."""
+    """One validation cannot tell whether that is chance: so the run does not go back on the way."""
     train(make_source(24), tiny(max_steps=5), tmp_path / "five")
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})

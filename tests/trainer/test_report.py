@@ -42,7 +42,7 @@ from photonfarm.trainer.training.loop import Hooks, train
 
 
 def write_report(store, run, out, **asked):
-    """Of one run, without the times of frames, unless told otherwise."""
+    """Write a report of one run, without the times of frames, unless told otherwise."""
     return report_of(store, [run] if isinstance(run, Path) else run, out, timed=False, **asked)
 
 
@@ -267,7 +267,7 @@ def test_the_paper_s_rows_go_by_architecture_also_where_runs_are_called_by_their
 
 
 def test_passes_for_references_count_neither_as_samples_nor_as_their_cost(measured, scene, commit, tmp_path) -> None:
-    """Of 32 samples in 4 jobs, then further passes; each job of these tests takes half a second."""
+    """There are 32 samples in 4 jobs, then further passes; each job of these tests takes half a second."""
     store, runs, _ = measured
     before = write_report(store, runs[:1], tmp_path / "before")
     scene.plan(TopUp.of("+64", ["held-out=0.4"]))

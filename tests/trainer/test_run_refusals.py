@@ -85,7 +85,7 @@ def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
 
 
 def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, tiny, run) -> None:
-    """Or of a version whose settings lacked some, which would else be those of today."""
+    """A run of a version that lacked some settings is refused too: they would otherwise take today's values."""
     train(make_source(24), tiny(max_steps=1), run)
     written = json.loads((run / "settings.json").read_text())
     older = {**written, "network": {k: v for k, v in written["network"].items() if k not in ("octaves", "maxima")}}

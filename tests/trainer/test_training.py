@@ -161,7 +161,7 @@ def test_waiting_for_a_scene_ends_when_it_is_told_to(make_source, tiny, run) -> 
 def test_a_loss_that_is_not_finite_ends_a_run_with_nothing_to_go_back_to_and_keeps_the_checkpoint(
     make_source, tiny, run, recover: bool
 ) -> None:
-    """Where it is told not to recover, or goes on from a checkpoint of a version that did not."""
+    """The run is told not to recover, or goes on from a checkpoint of a version that did not."""
     train(make_source(24), tiny(max_steps=4, recover=False), run)
     state = checkpoint.load(run / CHECKPOINT)
     del state["recovery"]
@@ -183,7 +183,7 @@ def test_a_loss_that_is_not_finite_ends_a_run_with_nothing_to_go_back_to_and_kee
 
 
 def test_what_a_run_logged_up_to_its_end_stays_where_it_goes_on(make_source, tiny, run) -> None:
-    """Also a last validation that is due at no other step, and where there is nothing left to do."""
+    """A last validation stays too: one that is due at no other step, and one where nothing is left to do."""
     train(make_source(24), tiny(), run)
     ended = metrics_log.read(run / METRICS)
     assert [(r["kind"], r["step"]) for r in ended[-2:]] == [("validation", 12), ("end", 12)]

@@ -112,7 +112,7 @@ def test_light_that_a_candidate_is_too_unlikely_to_find_counts_against_it(seed: 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_cheap_candidate_that_misses_light_is_watched_until_the_time_is_up(seed: int) -> None:
-    """Of 16 pixels' light that only light paths find, a few images of plain path tracing tell little."""
+    """A few images of plain path tracing tell little of the light in 16 pixels that only light paths find."""
     clock = Clock()
 
     def view(number: int) -> Render:
@@ -135,7 +135,7 @@ def test_a_cheap_candidate_that_misses_light_is_watched_until_the_time_is_up(see
 
 @pytest.mark.slow
 def test_the_spread_holds_how_much_the_views_differ() -> None:
-    """Where light paths are twice as good in half of the views and half as good in the others, 8 views tell little."""
+    """Light paths are twice as good in half of the views and half as good in the others, so 8 views tell little."""
     clock, ratios, spreads = Clock(), [], []
     good = {PLAIN: 0.5, LIGHT: 0.05, JOINED: 0.5}
     bad = {PLAIN: 0.5, LIGHT: 0.5, JOINED: 0.5}

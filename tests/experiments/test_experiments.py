@@ -206,7 +206,7 @@ def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment,
     refused = with_size(tiny, train={**tiny.size.train, "loss": "l1"}, architectures=("light_transport",), seeds=(0,))
     stages = Stages(refused, tmp_path / "work", workers=1)
     stages.write_spec()
-    with pytest.raises(StageError, match=r"tiny: train-light_transport .* 3;"):
+    with pytest.raises(StageError, match=r"tiny: train-light_transport .* 3; .*train-light_transport"):
         stages.train()
 
 

@@ -111,7 +111,7 @@ def test_the_doctor_tells_that_a_disk_is_too_full_for_work(tmp_path: Path, monke
     assert "can be written" in doctor._writes(tmp_path / "store")
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=int(0.4e9)))
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=r"0\.4 GB"):
         doctor._writes(tmp_path / "store")
 
 

@@ -173,7 +173,7 @@ def test_merging_goes_on_while_passes_arrive_and_by_several_readers(scene: Scene
     assert_equal(first.merged(), merge_view(reader, 0))
 
 
-def test_a_view_without_a_complete_pass_is_an_error_that_says_so(scene: SceneStore) -> None:
+def test_a_view_without_a_complete_pass_is_a_store_error(scene: SceneStore) -> None:
     with pytest.raises(StoreError):
         merge_view(reader_of(scene), 1)
 

@@ -50,9 +50,7 @@ def test_a_server_that_overwrites_against_its_orders_is_refused(url: str, monkey
         Store(url, create=True)
 
 
-def test_a_server_that_refuses_or_is_not_there_is_a_store_error_that_says_so(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_refuses_or_is_not_there_is_a_store_error(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Store(url, create=True)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wrong")
     with pytest.raises(StoreError):

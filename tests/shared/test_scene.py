@@ -71,9 +71,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (ball(at=[0, float("nan"), 0]), r"objects\.0\.at\.1 = nan"),
     ],
 )
-def test_an_invalid_spec_is_refused_with_key_value_and_rule(
-    scenes: Path, described: dict[str, Any], named: str
-) -> None:
+def test_an_invalid_spec_is_refused_with_key_and_value(scenes: Path, described: dict[str, Any], named: str) -> None:
     with pytest.raises(SpecError, match=named):
         parse_spec(described, where="spec")
 

@@ -141,7 +141,7 @@ def test_each_store_has_an_id_of_its_own_which_it_keeps(store: Store, tmp_path: 
 
 
 @pytest.mark.parametrize("store_id", [None, 7, "", "0" * 31, "A" * 32])
-def test_a_store_without_an_id_is_refused_by_name(store: Store, store_id: object) -> None:
+def test_a_store_without_an_id_is_corrupt(store: Store, store_id: object) -> None:
     change(Path(store.root, "photonfarm.json"), id=store_id)
     with pytest.raises(CorruptError):
         Store(store.root)
@@ -201,7 +201,7 @@ def test_another_version_is_refused_by_all_who_open_a_store(store: Store, stated
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "2", "{}", '{"format": "photonfarm store"}', "\xff"])
-def test_a_format_document_that_is_none_is_refused_by_name(store: Store, content: str) -> None:
+def test_a_format_document_that_is_none_is_corrupt(store: Store, content: str) -> None:
     Path(store.root, "photonfarm.json").write_text(content, encoding="latin-1")
     with pytest.raises(CorruptError):
         Store(store.root)

@@ -299,5 +299,5 @@ def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_s
     train(make_source(24), tiny(max_steps=1), tmp_path / "run")
     scene.plan(Request(modifications=1), shard_rows=8)
     commit(scene, 0)
-    with pytest.raises(IncompleteError):
+    with pytest.raises(IncompleteError, match=r"none .* held out"):
         compare(scene.folder.parent.parent, [TrainedRun.load(tmp_path / "run")])

@@ -203,7 +203,7 @@ def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(make_source, ti
 def test_a_file_that_no_grid_left_is_named(make_source, tiny, run, text: str) -> None:
     run.mkdir()
     (run / "grid.json").write_text(text)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=r"grid\.json"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0,)})
 
 

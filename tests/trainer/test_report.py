@@ -128,7 +128,7 @@ def test_a_report_of_a_store_that_is_none_is_refused(make_source, tiny, run, tmp
         write_report(tmp_path / "store", run, tmp_path / "out")
 
 
-def test_a_report_without_held_out_samples_says_so(scene, commit, make_source, tiny, run, tmp_path) -> None:
+def test_a_report_without_held_out_samples_is_incomplete(scene, commit, make_source, tiny, run, tmp_path) -> None:
     source = make_source(24)
     train(source, tiny(max_steps=1), run)
     scene.plan(Request(modifications=1), shard_rows=8)

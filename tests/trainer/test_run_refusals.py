@@ -106,7 +106,7 @@ def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source
     state = checkpoint.load(run / CHECKPOINT)
     del state["settings"]["network"]["octaves"]
     checkpoint.save(run / CHECKPOINT, state)
-    with pytest.raises(SpecError):
+    with pytest.raises(SpecError, match="octaves"):
         train(make_source(24), tiny(max_steps=2), run)
 
 
@@ -128,7 +128,7 @@ def test_a_device_that_is_not_there_is_refused(make_source, tiny, run, device: s
         train(make_source(24), tiny(device=device), run)
 
 
-def test_a_full_disk_is_named(tmp_path) -> None:
+def test_a_full_disk_is_a_store_error(tmp_path) -> None:
     for name in (METRICS, "checkpoint.partial"):
         (tmp_path / name).symlink_to("/dev/full")
     with pytest.raises(StoreError):
@@ -137,7 +137,7 @@ def test_a_full_disk_is_named(tmp_path) -> None:
         checkpoint.save(tmp_path / CHECKPOINT, {})
 
 
-def test_a_run_folder_that_is_a_file_is_named(make_source, tiny, run) -> None:
+def test_a_run_folder_that_is_a_file_is_a_store_error(make_source, tiny, run) -> None:
     run.write_text("")
     with pytest.raises(StoreError):
         train(make_source(24), tiny(), run)

@@ -41,7 +41,7 @@ def common_redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedR
 
 @pytest.fixture
 def connection(common_redis: EmbeddedRedis) -> Iterator[redis.Redis]:
-    """To a Redis that is empty."""
+    """A connection to an empty Redis."""
     with connect(common_redis.url) as connected:
         connected.flushall()
         yield connected
@@ -55,7 +55,7 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture(scope="session")
 def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Of an S3 server."""
+    """The port of an S3 server."""
     with s3_server.running(tmp_path_factory.mktemp("s3")) as found:
         yield found
 

@@ -100,7 +100,7 @@ def test_what_is_held_out_is_what_training_holds_out(scene: Scene) -> None:
     keys = [sample.modification.key(scene.id) for sample in held_out]
     assert keys
     assert all(are_held_out(keys, 0.4))
-    with pytest.raises(ValueError, match="train, held-out, all"):
+    with pytest.raises(ValueError, match="held-out"):
         scene.split("test")  # type: ignore[arg-type]
 
 
@@ -116,7 +116,7 @@ def test_a_scene_grows_and_a_snapshot_does_not(tmp_path: Path) -> None:
     later = pickle.loads(pickle.dumps(scene.snapshot()))
     samples.commit(written, 1, samples.outputs(written, 1))
     assert later.rows.tolist() == [0, 1]
-    with pytest.raises(ValueError, match="does not change"):
+    with pytest.raises(ValueError, match="change"):
         later.refresh()
     assert scene.refresh() == 2
     assert [sample.row for sample in scene[1:3]] == [1, 2]

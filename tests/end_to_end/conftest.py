@@ -50,5 +50,5 @@ def small_room_in() -> Callable[[Path], Path]:
 
 @pytest.fixture
 def small_room(small_room_in: Callable[[Path], Path], tmp_path: Path) -> Path:
-    """That spec, in an empty folder."""
+    """The spec of the small room, in an empty folder."""
     return small_room_in(tmp_path)

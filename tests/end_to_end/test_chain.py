@@ -22,7 +22,7 @@ Command = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, photonfarm_in, small_room_in) -> Path:
-    """Where the farm was at work."""
+    """The folder where the farm was at work."""
     folder = tmp_path_factory.mktemp("farm")
     small_room_in(folder)
     result = photonfarm_in(folder)(*UP, timeout=400)

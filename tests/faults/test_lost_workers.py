@@ -171,7 +171,7 @@ def test_sigterm_lets_the_job_at_hand_be_finished(
 def test_a_job_that_outlasts_the_grace_is_killed_and_free_at_once(
     analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
 ) -> None:
-    """Nor does the start that was cut short count towards those after which a job is given up."""
+    """The start that was cut short does not count towards those after which a job is given up."""
     scene = planned(2)
     running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), heartbeat_ttl_s=60.0)
     connection = connect(redis_server.url)

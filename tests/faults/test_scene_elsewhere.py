@@ -79,7 +79,7 @@ def test_a_scene_that_is_not_here_costs_no_scene_that_is_loaded(
 def test_a_job_asks_for_its_own_scene_alone(
     analytic: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a bucket each scene that is listed is a request."""
+    """Each scene that is listed in a bucket costs a request."""
     here = store.plan(analytic.small_spec(), Request(modifications=2), shard_rows=2).scene_id
     asked, exists = [], store.storage.exists
     for spec in (analytic.small_spec(film={"width": width, "height": 8}) for width in (16, 24)):
@@ -88,5 +88,5 @@ def test_a_job_asks_for_its_own_scene_alone(
     renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
     assert renderer.render(here, 0)
     assert {name.split("/")[1] for name in asked if name.startswith("scenes/")} == {here}
-    with pytest.raises(QueueError, match="has no job 0 of scene 0000"):
+    with pytest.raises(QueueError):
         renderer.render("0" * 32, 0)

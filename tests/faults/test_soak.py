@@ -27,11 +27,11 @@ def test_a_farm_under_random_faults_commits_every_job_once_and_bit_for_bit(tmp_p
 
 
 def do_no_harm(scene: SceneStore, folder: Path) -> None:
-    """So that what is told below is due to what is done below."""
+    """Leave everything as it is, so that what is told below is due to what is done below."""
 
 
 def replace_marker(scene: SceneStore, folder: Path) -> None:
-    """As a commit would that does not mind one before it."""
+    """Act as a commit would that ignores the one before it."""
     part = scene.storage.part()
     part.write_text(json.dumps({**scene.marker(0), "figures": {**scene.marker(0)["figures"], "worker": "second"}}))
     scene.storage.adopt(part, name_of(scene.name, 0), replace=True)
@@ -43,7 +43,7 @@ def say_a_second_commit(scene: SceneStore, folder: Path) -> None:
 
 
 def flip_a_bit(scene: SceneStore, folder: Path) -> None:
-    """In a base file, which the reader beside it does not read."""
+    """Flip a bit in a base file, which the reader beside it does not read."""
     (file, *_) = sorted((scene.folder / "base").rglob("c.*"))
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1

@@ -252,4 +252,4 @@ def test_samples_that_lack_guides_hold_no_worker_back_from_rendering_these(
     renderer = renderer_of(old, analytic)
     for job in range(2):
         renderer.render(old.scene_id, job)
-    assert pace.ahead()[old.scene_id].startswith("4 samples are committed, and the trainer has used 0")
+    assert pace.ahead()[old.scene_id].startswith("4 samples are committed")

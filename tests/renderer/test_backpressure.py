@@ -36,9 +36,9 @@ def test_a_size_is_read_as_it_is_written(size: str, in_bytes: int) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--reserve", "5 bananas"], "'5 bananas' is not a size; write it like 500MB or 2GB"),
-        (["--ahead", "0.5"], "0.5 is not in the range x>=1"),
-        (["--job", "1"], "--job needs --scene"),
+        (["--reserve", "5 bananas"], "500MB or 2GB"),
+        (["--ahead", "0.5"], "--ahead"),
+        (["--job", "1"], "--scene"),
     ],
 )
 def test_options_that_cannot_be_are_wrong_usage(arguments: list[str], said: str) -> None:
@@ -62,7 +62,7 @@ def free_is(monkeypatch: pytest.MonkeyPatch, gigabytes: float) -> None:
 def test_no_job_is_taken_while_less_than_the_reserve_is_free(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = DiskReserve(store, 5 * 10**9)
     free_is(monkeypatch, 4.9)
-    assert "4.9 GB are free on the disk of" in disk.reason()
+    assert "4.9 GB" in disk.reason()
     assert "5 GB are to stay free (--reserve)" in disk.reason()
     free_is(monkeypatch, 5)
     assert disk.reason() is None
@@ -150,6 +150,6 @@ runpy.run_path(sys.argv[0], run_name="__main__")
         assert running.wait(240) == 0
     assert scene.missing_jobs() == []
     said = log.read_text()
-    assert "takes no jobs: the disk is full" in said
+    assert "the disk is full" in said
     assert "starting again" not in said
     assert queue_status(connect(redis_server.url)).failed == {}

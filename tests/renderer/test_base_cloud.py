@@ -60,7 +60,7 @@ def test_shapes_that_cannot_be_triangulated_are_refused() -> None:
     distance = np.linspace(-1, 1, 4, dtype=np.float32)[:, None, None, None] * np.ones((4, 4, 4, 1), np.float32)
     grid = backend.load(1).TensorXf(distance)
     loaded = scene(field={"type": "sdfgrid", "grid": grid})
-    with pytest.raises(SpecError, match=r"is a SDFGrid; only meshes, rectangles, cubes"):
+    with pytest.raises(SpecError):
         triangles_of(loaded.shapes()[0])
 
 

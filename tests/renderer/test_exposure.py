@@ -83,7 +83,7 @@ def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -
     described = cornell()
     away = described.view.model_copy(update={"look_at": described.view.look_at.model_copy(
         update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})})  # fmt: skip
-    with pytest.raises(SpecError, match=r"cornell: no exposure gives a display mean of 0.45: .* stays below 0"):
+    with pytest.raises(SpecError, match="stays below 0"):
         propose(described.model_copy(update={"view": away}), None, lambda _: None, frames=2)
 
 

@@ -1,6 +1,5 @@
 """`photonfarm measure-frames`: what kinds of surface a frame shows, and what its parts cost."""
 
-import re
 from collections.abc import Callable
 from itertools import islice, pairwise
 from pathlib import Path
@@ -55,7 +54,7 @@ def frame(view: View, modification: Modification, key: str = "same", row: int = 
 
 
 def kinds_of(shape: dict[str, Any], near: float = 0.01, far: float = 100) -> np.ndarray:
-    """Of a rectangle at the origin, ±1 across, from 3 in front of it: it fills the middle and no corner."""
+    """The kinds of surface of a rectangle at the origin, ±1 across, seen from 3 in front: it fills no corner."""
     mi = backend.load(1)
     scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle", **shape}}, optimize=False)
     spec = plain(view={**plain().view.model_dump(mode="json"), "near": near, "far": far})
@@ -212,7 +211,7 @@ def test_each_part_is_charged_with_its_own_seconds(
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory, small: Callable[..., SceneSpec]) -> Store:
-    """With four rows of the room: two views of each of two configurations."""
+    """A store with four rows of the room: two views of each of two configurations."""
     made = Store(tmp_path_factory.mktemp("rows") / "store", create=True)
     request = Request(modifications=2, views_per_modification=2)
     scene_id = made.plan(small(load_spec("room")), request, shard_rows=4).scene_id
@@ -264,24 +263,24 @@ def test_no_more_points_are_looked_for_than_are_asked_for(
 
 
 @pytest.mark.parametrize(
-    ("scene", "rows", "message"),
+    ("scene", "rows", "named"),
     [
-        ("room", ["2", "4"], r"^row 4 of scene \w+ is not complete; 4 of 4 planned rows are, which `"),
-        ("attic", ["0"], "no scene has the id or name 'attic'"),
+        ("room", ["2", "4"], "row 4"),
+        ("attic", ["0"], "'attic'"),
     ],
 )
 def test_a_row_or_a_scene_that_is_not_there_is_named(
-    tmp_path: Path, store: Store, scene: str, rows: list[str], message: str
+    tmp_path: Path, store: Store, scene: str, rows: list[str], named: str
 ) -> None:
     options = [part for row in rows for part in ("--row", row)]
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options, scene=scene))
     assert isinstance(result.exception, StoreError)
     assert result.exception.exit_code == 4
-    assert re.search(message, str(result.exception))
+    assert named in str(result.exception)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_verb_needs_rows(tmp_path: Path, store: Store) -> None:
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path))
     assert result.exit_code == 2
-    assert "Missing option '--row'" in result.output
+    assert "'--row'" in result.output

@@ -135,7 +135,7 @@ def test_a_lamp_in_a_mirror_has_its_radiance_times_the_reflectance() -> None:
 
 
 def test_a_lamp_behind_thin_glass_has_what_the_pane_lets_through() -> None:
-    """Of n = 1.5 head-on: 1 − R at each face, and all reflections between: 1 − 2R / (1 + R), R = 0.04."""
+    """The glass has n = 1.5, head-on: 1 − R at each face, and all reflections between: 1 − 2R / (1 + R), R = 0.04."""
     pane = square((0, 0, 1), (0, 0, 1), 2, bsdf={"type": "thindielectric", "int_ior": 1.5, "ext_ior": 1.0})
     found = known(scene_of(pane=pane, lamp=lamp((0, 0, 0), (0, 0, 1), 1)))
     passes = 1 - 2 * 0.04 / 1.04
@@ -169,7 +169,7 @@ def floor_and_lamp(**more: Shape) -> Any:
 
 
 def irradiance(place: Images, steps: int) -> Images:
-    """Of points (N, 3) of the floor, over the radiance, (N,): a sum over points of the lamp that the screen leaves."""
+    """The irradiance of points (N, 3) of the floor over the radiance, (N,): a sum over the lamp's unscreened points."""
     across = LAMP[1] * (2 * (np.arange(steps) + 0.5) / steps - 1)
     height = LAMP[0][1]
     total = np.zeros(len(place))
@@ -184,7 +184,7 @@ def irradiance(place: Images, steps: int) -> Images:
 
 
 def on_the_floor(view: View, of: SceneSpec) -> tuple[Images, NDArray[np.bool_]]:
-    """Where the rays of each pixel's grid meet the floor, (H, W, 16, 3), and which pixels see nothing else, (H, W)."""
+    """The points where each pixel's rays meet the floor, (H, W, 16, 3), and which pixels see nothing else, (H, W)."""
     eye, rays = grid_rays(view, of)
     distance = np.where(rays[..., 1] < 0, -eye[1] / rays[..., 1], np.inf)
     with np.errstate(invalid="ignore"):
@@ -254,7 +254,7 @@ MATERIALS: dict[str, Shape] = {
 def test_over_many_views_direct_light_gloss_and_emission_have_the_mean_of_mitsubas_path_tracer(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of its paths of two edges, along the same rays of each pixel's grid; 64 views of 64 pixels, in blocks of 4."""
+    """Mitsuba's paths have two edges, along the same rays of each grid; 64 views of 64 pixels, in blocks of 4."""
     floor = square((0, 0, 0), UP, 3, bsdf=MATERIALS[name])
     other = lamp((-1.2, 0.8, 0.5), (0, 0, -1), 0.3, np.array([1.0, 4.0, 2.0]))
     scene = scene_of(floor=floor, lamp=lamp(LAMP[0], DOWN, LAMP[1]), other=other)
@@ -279,7 +279,7 @@ def paths_of_two_edges(scene: Any, view: View, of: SceneSpec, renders: int, spp:
 
 
 def test_direct_light_seen_in_a_mirror_is_that_of_the_wall_behind_times_the_reflectance() -> None:
-    """Of the same wall and lamp, seen through where the mirror is: with a mirrored camera."""
+    """A mirrored camera sees the same wall and lamp through where the mirror is."""
     wall, light = square((0, 0, 4), (0, 0, -1), 6, bsdf=diffuse()), lamp((0, 2, 1), DOWN, 0.5)
     mirror = square((0, 0, 0), (0, 0, 1), 3, bsdf={"type": "conductor", "specular_reflectance": rgb(GREY)})
     view = View(np.array([0, 0.3, 3], np.float32), np.array([0, 0.3, 0], np.float32))
@@ -370,7 +370,7 @@ def test_specular_of_principled_materials_is_without_their_diffuse_lobe_and_that
 
 
 def test_specular_of_a_mask_counts_what_it_lets_through_and_of_a_blend_each_part() -> None:
-    """Of lobes chosen by chance, by 32 samples in each pixel: the mean of all pixels."""
+    """Lobes are chosen by chance, with 32 samples in each pixel; the mean is over all pixels."""
     masked = of_material({"type": "mask", "opacity": 0.6, "bsdf": COATED["plastic"]}).specular.mean()
     blended = of_material({"type": "blendbsdf", "weight": 0.25, "a": diffuse(), "b": {"type": "conductor"}}).specular
     assert masked == pytest.approx(0.4 + 0.6 * 0.039, abs=0.02)
@@ -578,7 +578,7 @@ def test_the_noise_of_direct_light_goes_together_with_neither_half(
 def test_the_noise_of_lit_points_goes_together_with_neither_half(
     of_many_views: Callable[[str], tuple[Images, Images, Images]],
 ) -> None:
-    """Of their mean with the image's, at a significance of 1 in 1000."""
+    """The correlation is of their mean with the image's, at a significance of 1 in 1000."""
     points, a, b = of_many_views("point_light")
     mean = noise_of(points.mean(axis=(1, 2)))
     direct, _, _ = of_many_views("direct")

@@ -80,5 +80,5 @@ def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: Load
         def buffers(self, view):
             return replace(room.buffers(view), depth=np.full((16, 24), np.nan, np.float32))
 
-    with pytest.raises(IncompleteError, match="depth of these views came out non-finite"):
+    with pytest.raises(IncompleteError):
         frames_of(spec, rest(spec), [somewhere], load=lambda _: Broken())

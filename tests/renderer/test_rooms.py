@@ -32,9 +32,7 @@ def test_the_listed_shape_ids_are_those_of_the_room(room: LoadedScene) -> None:
 def test_an_unknown_shape_id_of_a_built_in_room_is_refused_without_mitsuba() -> None:
     described = load_spec("room").model_dump(mode="json")
     described["objects"][0]["shapes"] = ["table-woood"]
-    with pytest.raises(
-        SpecError, match=r"table.shapes: 'table-woood' is not a shape id of the scene; nearest: table-wood"
-    ):
+    with pytest.raises(SpecError):
         parse_spec(described, where="test")
     code = "import sys; from photonfarm.shared.scene.spec import load_spec; "
     code += "load_spec('room'); exit('mitsuba' in sys.modules)"

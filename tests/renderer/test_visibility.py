@@ -39,7 +39,7 @@ def triangles_of(geometry: Geometry, modification: Modification) -> F64:
 
 
 def met(origin: F64, towards: F64, triangles: F64) -> Mask:
-    """Whether segments from `origin` (N, 3), as long as `towards` (N, 3), meet a triangle (F, 3, 3), (N,).
+    """Return whether segments from `origin` (N, 3), as long as `towards` (N, 3), meet a triangle (F, 3, 3), (N,).
 
     Möller and Trumbore, 1997: Cramer's rule for origin + t · towards = a + u (b − a) + v (c − a).
     """
@@ -90,7 +90,7 @@ class Looked:
 
     @property
     def position(self) -> NDArray[np.float32]:
-        """Of the points that may be seen, and the photons, (N, 3)."""
+        """The positions of the points that may be seen, and of the photons, (N, 3)."""
         position, present = rebuild(self.cloud, self.modification)
         return np.concatenate([position[present], self.photons.position[self.photons.bounce >= 0]])
 
@@ -143,7 +143,7 @@ def test_the_bits_are_those_of_brute_force_on_the_stored_triangles(looked: list[
 
 
 def graze(one: Looked, position: NDArray[np.float32]) -> Mask:
-    """Whether the oracle's answer for points (N, 3) hangs on a ten thousandth of their distance, (N,)."""
+    """Return whether the oracle's answer for points (N, 3) hangs on a ten thousandth of their distance, (N,)."""
     answers = [seen_by(one.view, one.spec, position, one.triangles, self_hit) for self_hit in (1e-5, 1e-4, 1e-3)]
     distance = np.linalg.norm(position - one.view.origin, axis=1, keepdims=True)
     for side in np.concatenate([np.eye(3), -np.eye(3)]):
@@ -200,7 +200,7 @@ def spec(near: float = 0.01, far: float = 100) -> SceneSpec:
 
 
 def sees(*position: tuple[float, float, float], bsdf: str = "diffuse", **limits: float) -> list[bool]:
-    """From (0, 0, 3), past a square at the origin, ±1 across and facing the eye."""
+    """The eye at (0, 0, 3) looks past a square at the origin, ±1 across and facing the eye."""
     mi = backend.load(1)
     scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": {"type": bsdf}}}, optimize=False)
     return seen_points(scene, ALONG_Z, spec(**limits), np.array(position, np.float32)).tolist()
@@ -215,7 +215,7 @@ def test_a_surface_hides_what_is_behind_it_and_neither_itself_nor_what_is_before
 
 
 def test_what_is_outside_the_image_is_not_seen() -> None:
-    """At z = 2, a distance of 1."""
+    """The points are at z = 2, a distance of 1."""
     edge_x, edge_y = np.tan(np.radians(30)), np.tan(np.radians(30)) * 16 / 24
     inside = [(0.999 * x, 0.999 * y, 2) for x in (-edge_x, edge_x) for y in (-edge_y, edge_y)]
     outside = [(1.001 * edge_x, 0, 2), (-1.001 * edge_x, 0, 2), (0, 1.001 * edge_y, 2), (0, -1.001 * edge_y, 2)]

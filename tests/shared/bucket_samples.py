@@ -35,7 +35,7 @@ def at_once(*actions: Callable[[], Any]) -> list[Any]:
 
 
 def put(storage: ObjectStorage, content: bytes, name: str, **how: Any) -> bool:
-    """Whether it was placed: an object of this content, by way of a file."""
+    """Place an object of this content, by way of a file, and return whether it was placed."""
     part = storage.part()
     part.write_bytes(content)
     return storage.adopt(part, name, **how)

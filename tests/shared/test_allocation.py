@@ -120,5 +120,5 @@ def test_of_a_static_scene_each_view_stands_for_itself() -> None:
 
 
 def test_a_budget_that_pays_for_nothing_is_refused_with_what_the_least_costs() -> None:
-    with pytest.raises(ValueError, match=r"^budget_s is 0\.1; one view of 2 spp costs 0\.14"):
+    with pytest.raises(ValueError, match=r"budget_s is 0\.1;.*0\.14"):
         CostModel(ROOM).best(0.1)

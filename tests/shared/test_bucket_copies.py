@@ -40,7 +40,7 @@ def objects_below(url: str) -> tuple[Any, list[str]]:
 
 @pytest.fixture
 def folders_end_with_their_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in S3: SeaweedFS lists a folder that has become empty for some time."""
+    """Folders end as in S3: SeaweedFS goes on listing an empty folder for some time."""
     plain = obstore.list_with_delimiter
 
     def without_empty_ones(bucket: Any, prefix: str | None = None) -> Any:
@@ -66,7 +66,7 @@ def test_nothing_of_a_bucket_that_was_emptied_is_taken_for_missing(url: str, sto
         lambda: scene.plan(Request(modifications=9)),
         lambda: samples.commit(scene, 1, given),
     ):
-        with pytest.raises(StoreError, match="the store is gone") as caught:
+        with pytest.raises(StoreError) as caught:
             look()
         assert not isinstance(caught.value, CorruptError)
     assert objects_below(url)[1] == [], "nothing of it is begun anew"

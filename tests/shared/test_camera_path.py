@@ -62,27 +62,25 @@ def test_an_orbit_goes_once_around_inside_the_box_of_origins_and_looks_at_the_mi
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "named"),
     [
-        ("no json", "is not a camera path in JSON"),
+        ("no json", r"path\.json"),
         (json.dumps({"frames": 3}), "views"),
         (json.dumps({"frames": 0, "views": [{"origin": [0, 0, 0], "look_at": [1, 0, 0]}]}), "frames"),
         (json.dumps({"frames": 3, "views": [{"origin": [0, 0], "look_at": [1, 0, 0]}]}), "origin"),
         (json.dumps({"frames": 3, "fps": 12, "views": [{"origin": [0, 0, 0], "look_at": [1, 0, 0]}]}), "fps"),
-        ('{"frames": 3, "views": [{"origin": [0, 0, NaN], "look_at": [1, 0, 0]}]}', "finite"),
+        ('{"frames": 3, "views": [{"origin": [0, 0, NaN], "look_at": [1, 0, 0]}]}', r"origin\.2"),
     ],
 )
-def test_a_file_that_is_no_camera_path_is_refused_with_what_is_wrong(
-    tmp_path: Path, content: str, message: str
-) -> None:
+def test_a_file_that_is_no_camera_path_is_refused_with_what_is_wrong(tmp_path: Path, content: str, named: str) -> None:
     file = tmp_path / "path.json"
     file.write_text(content)
-    with pytest.raises(SpecError, match=message):
+    with pytest.raises(SpecError, match=named):
         CameraPath.load(file)
-    with pytest.raises(SpecError, match="No such file"):
+    with pytest.raises(SpecError):
         CameraPath.load(tmp_path / "missing.json")
 
 
 def test_a_camera_that_stands_where_it_looks_at_is_refused() -> None:
-    with pytest.raises(SpecError, match="in frame 0 the camera stands where it looks at"):
+    with pytest.raises(SpecError):
         path(np.ones((1, 6), np.float32), 2)

@@ -81,7 +81,7 @@ def before(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, work: Callabl
 def test_a_commit_that_kept_files_which_a_repair_then_moves_places_its_own(
     scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
-    """Before the writer has looked again, and after that, just before its marker is placed."""
+    """The repair comes before the writer has looked again, or after that, just before its marker is placed."""
     repair = SlowRepair(scene)
     before(monkeypatch, *((scene.storage, "settle") if when == "settle" else (markers, "place")), repair.end)
     assert samples.commit(scene, 0, samples.outputs(scene, 0))
@@ -161,7 +161,7 @@ def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_c
     scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def meanwhile() -> None:
-        """Of a writer that slept as well, and whose files a repair had moved before ours were named."""
+        """Commit as another writer that slept as well, and whose files a repair had moved before ours were named."""
         rows = next(plan for plan in another.plans() if plan.number == 1)
         file = f"{rows.folder}/depth/c.0.0.0"
         about = {"size": 1, "crc32c": "00000000"}

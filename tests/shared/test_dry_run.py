@@ -217,7 +217,7 @@ def test_nothing_is_measured_where_it_is_not_wanted_or_the_request_is_wrong(
 ) -> None:
     asked = verb()
     if more.get("modifications") == 0:
-        with pytest.raises(SpecError, match="modifications = 0"):
+        with pytest.raises(SpecError):
             rehearsed(tmp_path, tmp_path / "none", **more)
     else:
         rehearsed(tmp_path, tmp_path / "none", **more)

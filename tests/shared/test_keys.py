@@ -64,5 +64,5 @@ def test_a_flat_axis_of_a_box_gives_its_one_value_exactly() -> None:
 
 
 def test_a_part_of_another_type_is_refused() -> None:
-    with pytest.raises(TypeError, match="must be str"):
+    with pytest.raises(TypeError):
         make_key(None)  # type: ignore[arg-type]

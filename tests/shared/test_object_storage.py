@@ -21,7 +21,7 @@ planned, at_once = bucket_samples.planned, bucket_samples.at_once
 
 @pytest.fixture(params=["folder", "bucket"])
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
-    """Where a store may be made."""
+    """A place where a store may be made."""
     return request.getfixturevalue("url") if request.param == "bucket" else tmp_path / "store"
 
 
@@ -55,7 +55,7 @@ def test_a_reader_waits_for_store_scene_plan_and_samples(place: str | Path) -> N
     assert (store.scenes(), reader.refresh().size) == ([], 0)
     store.add(spec)
     assert reader.refresh().size == 0
-    with pytest.raises(StoreError, match="base is not there yet"):
+    with pytest.raises(StoreError):
         reader.base()
     scene = planned(place)
     assert reader.refresh().size == 0
@@ -151,7 +151,7 @@ def test_a_bucket_that_has_lost_the_store_s_document_or_a_spec_is_refused_and_to
     obstore.delete(objects_, f"{scene.name}/spec.json")
     assert store.scene_ids() == [scene.scene_id]
     (about,) = store_status(Store(url))
-    assert "spec.json: is missing, and plans or markers of the scene are there" in str(about.error)
+    assert "spec.json" in str(about.error)
     obstore.delete(objects_, "photonfarm.json")
-    with pytest.raises(CorruptError, match=r"photonfarm\.json: is missing, and scenes are there"):
+    with pytest.raises(CorruptError):
         Store(url, create=True)

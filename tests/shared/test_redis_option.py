@@ -45,7 +45,7 @@ def test_a_password_on_the_command_line_is_wrong_usage_and_is_not_repeated(
 ) -> None:
     assert exit_code("status", "--redis", url) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE names" in said
+    assert "PHOTONFARM_REDIS_PASSWORD_FILE" in said
     assert "PHOTONFARM_REDIS_URL" in said
     assert SECRET not in said
     assert urls == []

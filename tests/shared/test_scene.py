@@ -54,50 +54,48 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("described", "sentence"),
+    ("described", "named"),
     [
-        (ball(shapes=["Bal"]), r"ball.shapes: 'Bal' is not a shape id of the scene; nearest: Ball"),
-        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"0.box: is inverted along y: min 1.0 is above max 0.0"),
-        (ball(removal_probability=1.5), r"objects.0.removal_probability = 1.5: .* less than or equal to 1"),
-        (ball(removal_probability=-0.1), r"objects.0.removal_probability = -0.1: .* greater than or equal to 0"),
-        (changed(scene={"file": "none/scene.xml"}), r"scene.file = 'none/scene.xml' is not there .* PHOTONFARM_SCENES"),
-        (changed(scene={}), r"scene: needs either file .* or builtin"),
-        (changed(scene={"builtin": "castle"}), r"scene.builtin = 'castle': .*'cornell' or 'room'"),
-        (changed(exposure=0), r"exposure = 0: .* greater than 0"),
-        (changed(film={"width": 100, "height": 64}), r"film.width = 100: .* multiple of 8"),
-        (changed(flm={}), r"flm: unknown key; nearest: film"),
-        (changed(objects=tomllib.loads(SPEC)["objects"] * 2), r"group name 'ball' twice"),
-        ({k: v for k, v in changed().items() if k != "view"}, r"view: Field required"),
-        (ball(at=[0, float("nan"), 0]), r"objects.0.at.1 = nan"),
+        (ball(shapes=["Bal"]), r"ball\.shapes: 'Bal' .*; nearest: Ball"),
+        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"0\.box: .* y"),
+        (ball(removal_probability=1.5), r"objects\.0\.removal_probability = 1\.5"),
+        (ball(removal_probability=-0.1), r"objects\.0\.removal_probability = -0\.1"),
+        (changed(scene={"file": "none/scene.xml"}), r"scene\.file = 'none/scene\.xml'"),
+        (changed(scene={}), "scene: .*file.*builtin"),
+        (changed(scene={"builtin": "castle"}), r"scene\.builtin = 'castle': .*'cornell' or 'room'"),
+        (changed(exposure=0), "exposure = 0"),
+        (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
+        (changed(flm={}), "flm: .*nearest: film"),
+        (changed(objects=tomllib.loads(SPEC)["objects"] * 2), "'ball'"),
+        ({k: v for k, v in changed().items() if k != "view"}, "view: "),
+        (ball(at=[0, float("nan"), 0]), r"objects\.0\.at\.1 = nan"),
     ],
 )
-def test_an_invalid_spec_is_refused_with_key_value_and_rule(
-    scenes: Path, described: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(SpecError, match=sentence):
+def test_an_invalid_spec_is_refused_with_key_and_value(scenes: Path, described: dict[str, Any], named: str) -> None:
+    with pytest.raises(SpecError, match=named):
         parse_spec(described, where="spec")
 
 
 @pytest.mark.parametrize(
-    ("added", "sentence"),
+    ("added", "named"),
     [
-        ('<medium type="homogeneous" id="fog"/>', "participating media are not supported"),
-        ('<bsdf type="polarizer" id="foil"/>', "polarisation is not supported"),
-        ('<shape type="obj" id="x"><string name="filename" value="gone.obj"/></shape>', "'gone.obj' is not there"),
-        ("<shape>", "not a readable Mitsuba scene file"),
+        ('<medium type="homogeneous" id="fog"/>', "fog"),
+        ('<bsdf type="polarizer" id="foil"/>', "foil"),
+        ('<shape type="obj" id="x"><string name="filename" value="gone.obj"/></shape>', r"gone\.obj"),
+        ("<shape>", r"scene\.xml"),
     ],
 )
-def test_a_scene_that_cannot_be_rendered_is_refused(scenes: Path, added: str, sentence: str) -> None:
+def test_a_scene_that_cannot_be_rendered_is_refused(scenes: Path, added: str, named: str) -> None:
     (scenes / "small/scene.xml").write_text(SCENE.replace("</scene>", added + "</scene>"))
-    with pytest.raises(SpecError, match=sentence):
+    with pytest.raises(SpecError, match=named):
         parse_spec(changed(), where="spec")
 
 
 def test_invalid_toml_and_an_unknown_name_are_refused(tmp_path: Path) -> None:
     (tmp_path / "spec.toml").write_text("name = ")
-    with pytest.raises(SpecError, match="not valid TOML"):
+    with pytest.raises(SpecError):
         load_spec(tmp_path / "spec.toml")
-    with pytest.raises(SpecError, match=r"castle: no such spec; give a \.toml file or one of"):
+    with pytest.raises(SpecError, match="cornell"):
         load_spec("castle")
 
 
@@ -129,15 +127,13 @@ def test_a_changed_copy_has_an_id_of_its_own(scenes: Path) -> None:
 
 def test_a_light_is_shapes_or_a_rectangle_and_not_both(scenes: Path) -> None:
     light = {"name": "lamp", "at": [0, 2, 0], "box": {"min": [0, 2, 0], "max": [1, 2, 1]}}
-    with pytest.raises(SpecError, match="needs either shapes"):
-        parse_spec(changed(lights=[light]), where="spec")
     lit = {**light, "rectangle": {"size": [1, 1], "radiance": [3, 3, 3]}}
     assert parse_spec(changed(lights=[lit]), where="spec").lights[0].removal_probability == 0
-    with pytest.raises(SpecError, match=r"lamp.shapes: none of Floor emits light in the scene"):
-        parse_spec(changed(lights=[{**light, "shapes": ["Floor"]}]), where="spec")
     dark = {**light, "rectangle": {"size": [1, 1], "radiance": [0, 0, 0]}}
-    with pytest.raises(SpecError, match="all ≥ 0 and one > 0"):
-        parse_spec(changed(lights=[dark]), where="spec")
+    floor = {**light, "shapes": ["Floor"]}
+    for refused, named in ((light, r"lights\.0"), (floor, r"lamp\.shapes"), (dark, "radiance")):
+        with pytest.raises(SpecError, match=named):
+            parse_spec(changed(lights=[refused]), where="spec")
 
 
 def test_a_spec_survives_json(scenes: Path) -> None:

@@ -35,7 +35,7 @@ def seconds_told(said: str) -> int:
 def test_another_store_takes_over_when_the_time_that_it_was_told_is_over(
     connection: redis.Redis, tmp_path: Path
 ) -> None:
-    """Of an owner that was killed, whose heartbeat and whose word stay behind."""
+    """The owner was killed, and its heartbeat and its word stay behind."""
     store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
     queue.serve(connection, store)
     queue.beat(connection, "killed", "elsewhere", None, ttl_s=3600)
@@ -50,7 +50,7 @@ def test_another_store_takes_over_when_the_time_that_it_was_told_is_over(
 
 
 def test_the_embedded_redis_of_a_run_remembers_its_store_and_the_time_that_is_left(tmp_path: Path) -> None:
-    """So `photonfarm up` with another store in the same --run, after one that was killed, waits no longer than that."""
+    """`photonfarm up` with another store in the --run of one that was killed waits no longer than that."""
     store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
     with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connection:
         queue.serve(connection, store)

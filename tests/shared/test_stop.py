@@ -26,7 +26,7 @@ sys.exit(0 if stop.is_set() else 1)
 
 @pytest.mark.parametrize("storm", range(4))
 def test_a_storm_of_signals_ends_a_process_as_one_does(storm: int) -> None:
-    """With a lock, about every sixth of these storms left the process waiting for itself."""
+    """About every sixth of these storms left a process with a lock waiting for itself."""
     process = subprocess.Popen([sys.executable, "-c", WAITING], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
         process.stdout.readline()

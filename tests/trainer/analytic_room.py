@@ -112,7 +112,7 @@ def render(spec: SceneSpec, modification: Modification, view: View) -> tuple[F32
 
 
 def _shift(spec: SceneSpec, modification: Modification) -> tuple[NDArray, NDArray]:
-    """Where cube and light are, from where they rest, (2, 3), and whether they are there, (2,)."""
+    """The shifts of cube and light from where they rest, (2, 3), and whether they are there, (2,)."""
     if not spec.groups:
         return np.zeros((2, 3)), np.ones(2, bool)
     return modification.translation.astype(np.float64), modification.present

@@ -94,5 +94,5 @@ def commit() -> Callable[[SceneStore, int], bool]:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """Where a training run goes."""
+    """The folder of a training run."""
     return tmp_path / "run"

@@ -21,7 +21,7 @@ class Errors:
 
 
 def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
-    """Of a run; `make` gives its source anew, as each is read once."""
+    """The held-out errors of a run; `make` gives its source anew, as each is read once."""
     run = TrainedRun.load(folder)
     with Feed(make(), run.settings.model_copy(update={"device": "cpu"}), needs=run.needs) as feed:
         rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]

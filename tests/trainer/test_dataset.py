@@ -108,9 +108,9 @@ def test_an_error_of_the_source_reaches_the_one_who_takes(make_source, tiny) -> 
     source.read = read
     with Feed(source, tiny()) as feed:
         feed.ask([1])
-        with pytest.raises(CorruptError, match="row 1"):
+        with pytest.raises(CorruptError):
             feed.take()
-        with pytest.raises(CorruptError, match="row 1"):
+        with pytest.raises(CorruptError):
             feed.arrivals()
 
 

@@ -121,7 +121,7 @@ def test_the_files_hold_the_table_and_every_figure(make_source, tiny, run) -> No
 
 
 def test_the_best_is_picked_by_one_half_and_all_are_told_by_the_other_in_pairs() -> None:
-    """On the second half 1, 2, 3 and 1.1, 2.1, 3.1: by pairs the difference is 0.1 exactly, though the first is lower.
+    """The second half has 1, 2, 3 and 1.1, 2.1, 3.1: by pairs the difference is exactly 0.1, though the first is lower.
 
     A cell that is lucky on the half it is picked by is not told by its luck.
     """
@@ -160,27 +160,27 @@ def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, t
 
 
 def test_a_grid_needs_a_configuration_for_each_half(make_source, tiny, run) -> None:
-    with pytest.raises(IncompleteError, match=r"hold_out = 0\.01: holds out fewer than two configurations"):
+    with pytest.raises(IncompleteError):
         run_grid(lambda: make_source(24), tiny(hold_out=0.01), run, AXES)
     assert not run.exists()
 
 
 def test_samples_that_are_missing_are_waited_for_elsewhere(make_source, tiny, run) -> None:
-    with pytest.raises(IncompleteError, match=r"9 of 24 planned samples are complete; .* wait for the workers"):
+    with pytest.raises(IncompleteError, match="9 of 24"):
         run_grid(lambda: make_source(24, per_look=9), tiny(), run, AXES)
 
 
 @pytest.mark.parametrize(
     ("change", "samples", "found"),
     [
-        ({"seed": 3}, 24, "has seed = 0, now 3; use another run folder"),
-        ({"max_steps": 5}, 24, "has max_steps = 12, now 5; use another run folder"),
-        ({}, 27, "has samples = 24, now 27; use another run folder"),
+        ({"seed": 3}, 24, "seed = 0, now 3"),
+        ({"max_steps": 5}, 24, "max_steps = 12, now 5"),
+        ({}, 27, "samples = 24, now 27"),
     ],
 )
 def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, samples, found) -> None:
     run_grid(lambda: make_source(24), tiny(max_steps=12), run, {"decay": (1.0,)})
-    with pytest.raises(SpecError, match=f"grid.json: {found}"):
+    with pytest.raises(SpecError, match=found):
         run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
 
 
@@ -203,19 +203,19 @@ def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(make_source, ti
 def test_a_file_that_no_grid_left_is_named(make_source, tiny, run, text: str) -> None:
     run.mkdir()
     (run / "grid.json").write_text(text)
-    with pytest.raises(StoreError, match=r"grid\.json: is not a list of grid results"):
+    with pytest.raises(StoreError, match=r"grid\.json"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0,)})
 
 
 def test_an_axis_that_cannot_be_is_named_before_anything_runs(make_source, tiny, run) -> None:
-    with pytest.raises(SpecError, match=r"the axes of the grid: decay = 1\.5: Input should be less than or equal to 1"):
+    with pytest.raises(SpecError, match=r"decay = 1\.5"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0, 1.5)})
     assert not run.exists()
 
 
 def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit, run, tmp_path, capsys) -> None:
     scene.plan(Request(modifications=16, views_per_modification=1, passes=1), shard_rows=8)
-    with pytest.raises(IncompleteError, match="0 of 16 planned samples are complete"):
+    with pytest.raises(IncompleteError):
         service.search(None, tmp_path / "store", run, "small", {})
     for job in scene.missing_jobs():
         commit(scene, job)
@@ -225,6 +225,6 @@ def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit
     assert len(found.splitlines()) == 2 + 4, "a line for each rate"
     assert "| rmsprop | 0.002 | 0.99 |" in found
     said = capsys.readouterr().err
-    assert "decay is not searched: it begins after 256 samples, and 4 are drawn" in said
+    assert "decay is not searched" in said
     assert "4 of 4: rmsprop-0.002-0.99: " in said
     assert (run / "grid.md").read_text() == found + "\n"

@@ -144,7 +144,7 @@ class Gradients:
 
 
 def gradients(rendered: Rendered, loss: Loss, targets: Tensor, clip: float | None = None) -> Gradients:
-    """Over `targets`, by the network and the loss as in training; each gradient clipped at the norm `clip`."""
+    """Gradients over `targets`, by the network and the loss as in training; each is clipped at the norm `clip`."""
     weights = list(rendered.network.parameters())
     image = rendered.network(rendered.batch.inputs)
     total = [torch.zeros_like(w, dtype=torch.float64) for w in weights]
@@ -197,7 +197,7 @@ def holds(rendered: Rendered, loss: Loss, *, shows: float = 0.25) -> None:
 
 
 def test_weights_from_the_other_half_give_the_gradient_that_they_give_with_the_clean_image(rendered) -> None:
-    """As above; the weights with the clean image are from further noisy halves, as how noisy they are matters."""
+    """The weights with the clean image are from further noisy halves, as how noisy they are matters."""
     clean_image = rendered.converged.mean(dim=(0, 2)).expand(2, -1, -1, -1)[None]
     noisy, further = rendered.noisy[: K // 2], rendered.noisy[K // 2 :]
     wanted = gradients(rendered, lambda f, told: paired_loss(f, clean_image, told), further)

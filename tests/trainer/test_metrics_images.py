@@ -51,19 +51,19 @@ def test_arrays_that_may_not_be_written_and_tensors_that_are_learned_are_shown_a
 def test_what_is_not_a_number_has_no_error_and_is_named() -> None:
     images = np.ones((3, 4, 4, 3), np.float32)
     images[2, 1, 1, 0] = np.nan
-    with pytest.raises(SpecError, match="image 2 of 3 holds values that are not numbers"):
+    with pytest.raises(SpecError, match="image 2 of 3"):
         metric_space(images)
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 3), (1, 4, 4, 4), (1, 2, 4, 4, 3)])
 def test_metrics_are_taken_of_batches_of_colour_images(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"metrics are taken of \(N, H, W, 3\)"):
+    with pytest.raises(ValueError, match="N, H, W, 3"):
         metric_space(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("metric", [mse, mssim, flip])
 def test_a_prediction_is_compared_with_one_reference_of_its_size(metric) -> None:
-    with pytest.raises(ValueError, match="each prediction is compared with the reference of its own view"):
+    with pytest.raises(ValueError, match="reference"):
         metric(torch.zeros(2, 16, 16, 3), torch.zeros(1, 16, 16, 3))
 
 
@@ -107,7 +107,7 @@ def test_an_interval_is_students_and_needs_two_groups() -> None:
     assert found.interval == pytest.approx(expected, abs=2e-3 * (expected[1] - expected[0]))
     assert PerImage.of(values, ["a"] * 4).interval is None
     assert confidence_interval(PerImage.of(values[:1]).estimate) is None
-    with pytest.raises(ValueError, match="at least one degree of freedom"):
+    with pytest.raises(ValueError, match="degree"):
         t_975(0)
 
 
@@ -160,7 +160,7 @@ def test_mssim_agrees_with_pytorch_msssim_to_five_digits() -> None:
 def test_mssim_is_1_for_equal_images_and_needs_room_for_a_window() -> None:
     images = metric_space(_pictures(2, (11, 12), 11))
     assert mssim(images, images) == pytest.approx([1, 1])
-    with pytest.raises(ValueError, match="images are 10×12 pixels; MSSIM needs at least 11×11"):
+    with pytest.raises(ValueError, match="11×11"):
         mssim(images[:, :10], images[:, :10])
 
 

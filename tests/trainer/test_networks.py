@@ -66,7 +66,7 @@ def test_relative_maxima_are_less_those_of_the_reference() -> None:
 
 
 def test_features_of_size_one_stay_so_before_any_step() -> None:
-    """From torch's own start they would shrink with each layer, far below the U-Net's other channels."""
+    """Features would shrink from torch's own start with each layer, far below the U-Net's other channels."""
     torch.manual_seed(0)
     found = LightTransportLayer(3, 6)(torch.randn(2, 500, 3), torch.randn(500, 6), torch.ones(2, 500, dtype=torch.bool))
     assert 0.8 < found[..., :32].std() < 2.5
@@ -123,7 +123,7 @@ def test_in_bfloat16_the_image_is_nearly_the_same_and_stays_float32() -> None:
 
 
 def test_pointnet_takes_points_of_which_nothing_is_the_same_in_all_samples() -> None:
-    """As photons are: all of them differ."""
+    """Photons are such points: all of them differ."""
     torch.manual_seed(0)
     made, points, visible = LightTransportLayer(5, 0), torch.randn(2, 50, 5), torch.rand(2, 50) < 0.7
     torch.testing.assert_close(made(points, torch.zeros(50, 0), visible), as_drawn(made, points, visible))

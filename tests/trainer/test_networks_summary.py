@@ -30,7 +30,7 @@ def test_the_work_of_a_u_net_grows_with_its_pixels_and_with_the_square_of_its_wi
 
 
 def test_the_point_branch_is_the_one_of_figure_1() -> None:
-    """Per point 56 → 64 and two blocks of 64 → 32 twice and 32 → 32; the maximum's half is worked once a cloud.
+    """Each point goes 56 → 64 and two blocks of 64 → 32 twice and 32 → 32; the maximum's half is worked once a cloud.
 
     Of its 56 numbers the 15 of the position change; 9 others, 32 of the descriptor and the first layer's bias are the
     same in all samples, worked once.

@@ -28,7 +28,7 @@ def batch_of(source, rows: tuple[int, ...]) -> TrainingBatch:
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
 def test_the_area_that_a_pixel_sees_of_a_plane_is_that_between_its_corners(tilt: float) -> None:
-    """Of a plane through (0, 0, 3), turned about x; corners where the rays through those of the pixel meet it."""
+    """The plane through (0, 0, 3) is turned about x; rays through the pixel's corners meet it at those of the area."""
     optics = Optics(focal_px=60.0, width=16, height=16, near=0.1, far=20.0)
     normal = np.array([0.0, math.sin(tilt), -math.cos(tilt)])
 
@@ -112,7 +112,7 @@ def test_flux_and_area_are_summed_over_the_same_pixels() -> None:
 def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_anything_is_learned(
     make_source,
 ) -> None:
-    """Against clean images in closed form, of direct light: sums over the image agree, and the wider window is near.
+    """Clean images of direct light in closed form agree with it in sums over the image, and the wider window is near.
 
     Photons are noisy, and the light quad, whose albedo is 0, is in none of it.
     """

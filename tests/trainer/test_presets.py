@@ -34,20 +34,21 @@ def test_what_is_asked_for_comes_before_what_a_preset_says(name: str) -> None:
 
 
 def test_values_that_are_not_allowed_are_refused() -> None:
-    with pytest.raises(ValidationError, match="architecture"):
-        preset("small", network={"architecture": "transformer"})
-    with pytest.raises(ValidationError, match="has descriptor = 0; feature_projection projects descriptors"):
-        preset("small", network={"architecture": "feature_projection", "descriptor": 0})
-    with pytest.raises(ValidationError, match="has photons = 'transport', which is for light_transport_photons alone"):
-        preset("small", network={"photons": "transport"})
+    for named, network in (
+        ("architecture", {"architecture": "transformer"}),
+        ("descriptor = 0", {"architecture": "feature_projection", "descriptor": 0}),
+        ("photons = 'transport'", {"photons": "transport"}),
+    ):
+        with pytest.raises(ValidationError, match=named):
+            preset("small", network=network)
 
 
 def test_the_paired_loss_needs_the_half_that_a_denoiser_is_given() -> None:
     assert preset("small", loss="paired").loss == "paired"
-    with pytest.raises(ValidationError, match="denoise_16 is given one of them"):
+    with pytest.raises(ValidationError):
         preset("small", network={"architecture": "denoise_16"}, loss="paired")
     image = torch.zeros(1, 2, 2, 3)
-    with pytest.raises(ValueError, match="1 half-estimates are given"):
+    with pytest.raises(ValueError, match="1 half"):
         paired_loss(image, image[:, None])
 
 
@@ -108,26 +109,26 @@ def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
 
 
 @pytest.mark.parametrize(
-    ("pair", "found"),
+    ("pair", "named"),
     [
-        ("widht=8", r"widht: unknown key; nearest: width"),
-        ("width=0", r"network\.width = 0: Input should be greater than or equal to 1"),
-        ("beta1=much", r"beta1 = 'much': Input should be a valid number"),
-        ("gradient_clip=1", r"gradient_clip = 1: is refused, as it biases"),
-        ('network={"width": 8}', r"network: its keys are set each by its own name, as in width=32"),
+        ("widht=8", r"widht: .*nearest: width"),
+        ("width=0", r"network\.width = 0"),
+        ("beta1=much", "beta1 = 'much'"),
+        ("gradient_clip=1", "gradient_clip = 1: .*biases"),
+        ('network={"width": 8}', "network: .*width=32"),
     ],
 )
-def test_a_setting_that_cannot_be_is_refused_with_its_rule_and_the_nearest_key(pair: str, found: str) -> None:
+def test_a_setting_that_cannot_be_is_refused_with_its_rule_and_the_nearest_key(pair: str, named: str) -> None:
     result = CliRunner().invoke(umbrella, ["train", "--set", pair])
     assert isinstance(result.exception, SpecError)
-    assert re.search(found, str(result.exception))
+    assert re.search(named, str(result.exception))
     assert result.exception.exit_code == 3
 
 
 def test_a_pair_without_a_value_is_wrong_usage() -> None:
     result = CliRunner().invoke(umbrella, ["train", "--set", "width"])
     assert result.exit_code == 2
-    assert "'width' is not KEY=VALUE" in result.output
+    assert "KEY=VALUE" in result.output
 
 
 @pytest.mark.parametrize("flags", [("--check", "--grid"), ("--grid", "--summary"), ("--check", "--summary", "--grid")])
@@ -135,7 +136,6 @@ def test_what_is_done_instead_of_training_is_one_thing(flags: tuple[str, ...], t
     result = CliRunner().invoke(umbrella, ["train", *flags, "--run", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert all(flag in result.output for flag in flags)
-    assert "exclude each other" in result.output
     assert list(tmp_path.iterdir()) == []
 
 
@@ -146,9 +146,9 @@ def test_a_grid_names_the_store_that_is_not_there_and_leaves_no_folder(
         arguments = ["train", *spec, "--grid", "--store", str(tmp_path / "stoer"), "--run", str(tmp_path / "run")]
         result = CliRunner().invoke(umbrella, arguments)
         assert isinstance(result.exception, SpecError)
-        assert f"{tmp_path / 'stoer'}: holds no scene" in str(result.exception)
+        assert str(tmp_path / "stoer") in str(result.exception)
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(SpecError, match="torchrun has started 2 processes, and a grid is one's work"):
+    with pytest.raises(SpecError, match="2 processes"):
         service.search("room", tmp_path / "stoer", tmp_path / "run", "small", {})
     assert list(tmp_path.iterdir()) == []
 
@@ -178,4 +178,4 @@ def test_the_summary_is_printed_and_nothing_else_is_done(tmp_path: Path) -> None
 def test_a_summary_needs_a_scene(tmp_path: Path) -> None:
     found = CliRunner().invoke(umbrella, ["train", "--summary", "--store", str(tmp_path / "store")])
     assert found.exit_code != 0
-    assert "name the spec of the one to summarise" in str(found.exception) + found.output
+    assert "name the spec" in str(found.exception) + found.output

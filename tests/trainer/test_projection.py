@@ -32,7 +32,7 @@ def cameras(count: int, seed: int) -> torch.Tensor:
 
 
 def is_behind(at: np.ndarray, surface: float, rule: str, ray: np.ndarray, normal: np.ndarray) -> bool:
-    """Whether a point lies behind the surface that a pixel's ray (x, y, 1) meets; all in camera coordinates."""
+    """Return whether a point lies behind the surface that a pixel's ray (x, y, 1) meets; all in camera coordinates."""
     z = at[2]
     if surface == 0:
         return False
@@ -45,7 +45,7 @@ def is_behind(at: np.ndarray, surface: float, rule: str, ray: np.ndarray, normal
 
 
 def keeps(p: int, u: int, v: int, sample: Sequence[np.ndarray], occlusion: str) -> bool:
-    """Whether a point of a sample is kept that lands in a pixel."""
+    """Return whether a point of a sample is kept that lands in a pixel."""
     position, visible, seen, camera, depth, normal = sample
     if not visible[p]:
         return False

@@ -67,7 +67,7 @@ def test_a_run_that_goes_on_with_more_steps_follows_the_schedule_of_these(make_s
 
 
 def test_the_average_is_the_running_mean_that_one_works_out_by_hand(make_source, tiny, run, tmp_path) -> None:
-    """Of the weights after each of four steps, with 0.1, 2/11, 0.2 and 0.2 of what there was before."""
+    """The mean is of the weights after each of four steps, with 0.1, 2/11, 0.2 and 0.2 of what there was before."""
     raw = []
     for steps in range(1, 5):
         train(make_source(24), tiny(max_steps=steps), tmp_path / str(steps))

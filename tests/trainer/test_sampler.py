@@ -62,7 +62,7 @@ def test_fewer_rows_than_a_batch_are_drawn_repeatedly() -> None:
 
 
 def test_nothing_can_be_drawn_before_anything_arrives() -> None:
-    with pytest.raises(ValueError, match="no row has arrived"):
+    with pytest.raises(ValueError, match="arrived"):
         RoundSampler(seed=0, catch_up=2).draw(1)
 
 

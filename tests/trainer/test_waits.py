@@ -1,4 +1,4 @@
-"""Where the time of a run goes, as it is told to who waits for it."""
+"""The waits of a run: how its time is spent, as whoever waits for it is told."""
 
 import time
 from collections.abc import Callable

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import operator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -110,7 +111,7 @@ def test_slices_share_no_configuration(root: Root) -> None:
 
 
 def test_an_arm_of_more_configurations_than_there_are_is_refused(root: Root) -> None:
-    with pytest.raises(ValueError, match="configurations have 1 views of 8 passes, and 64 are needed"):
+    with pytest.raises(ValueError, match="64"):
         Arm(*root, Share(16, 1, 1), 64)
 
 
@@ -126,8 +127,8 @@ def test_what_is_rendered_is_enough_for_every_share_and_slice() -> None:
 
 def test_what_fails_in_a_process_is_raised_here() -> None:
     assert room_study.in_processes(math.hypot, [(3.0, 4.0), (5.0, 12.0)], 1, "measured") == [5, 13]
-    with pytest.raises(ValueError, match="math domain error"):
-        room_study.in_processes(math.sqrt, [(-1.0,)], 1, "measured")
+    with pytest.raises(ZeroDivisionError):
+        room_study.in_processes(operator.truediv, [(1.0, 0.0)], 1, "measured")
 
 
 def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(root: Root, tmp_path: Path) -> None:
@@ -245,5 +246,5 @@ def test_what_all_kinds_of_networks_share_drops_out_of_their_differences() -> No
 
 
 def test_one_configuration_has_no_interval() -> None:
-    with pytest.raises(ValueError, match="two configurations"):
+    with pytest.raises(ValueError, match="two"):
         Errors(np.ones((2, 1)), UNITS[:1]).interval()

@@ -68,5 +68,5 @@ def test_what_occurs_most_is_named_first() -> None:
 
 
 def test_a_budget_that_pays_for_none_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"--budget 1: a configuration of 128-spp-1-views-1-passes costs 1\.44"):
+    with pytest.raises(ValueError, match="--budget 1"):
         noise_budget.paid(COSTS, SHARES[3], 1.0)

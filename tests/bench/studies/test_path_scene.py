@@ -48,7 +48,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[StoredSa
 
 
 def standard_error(halves: F32) -> float:
-    """Of the mean over all pixels of both halves (2, H, W, 3), whose pixels have noise of their own."""
+    """The standard error of the mean over both halves' pixels (2, H, W, 3), which have noise of their own."""
     apart = (halves[0].astype(np.float64) - halves[1]).mean(axis=-1) / 2
     return math.sqrt(float(np.sum(apart**2))) / apart.size
 

@@ -146,7 +146,7 @@ def test_networks_of_several_seeds_are_one_row_beside_what_is_known(
 
 def test_a_room_that_has_not_run_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bare").mkdir()
-    with pytest.raises(IncompleteError, match="bare: holds no trained network"):
+    with pytest.raises(IncompleteError):
         trained_runs(tmp_path / "bare")
 
 

@@ -1,4 +1,4 @@
-"""From a spec to pixels: the built-in room rendered into a store, read for training, projected, against the oracle."""
+"""The way from a spec to pixels: the built-in room rendered into a store, read, projected, against the oracle."""
 
 from dataclasses import dataclass
 

@@ -21,7 +21,7 @@ def spec() -> SceneSpec:
 
 @pytest.fixture(scope="module")
 def camera(spec: SceneSpec) -> Camera:
-    """At the origin of the world, looking along a slanted line."""
+    """A camera at the origin of the world, looking along a slanted line."""
     return Camera.of(View(np.zeros(3, np.float32), np.array([0.3, -0.2, 1.0], np.float32)), spec)
 
 

@@ -38,12 +38,6 @@ def test_all_counts_are_tried() -> None:
     assert len(COUNTS) == 3 * 4 - 2
 
 
-@pytest.mark.parametrize("connections", [1, 4])
-def test_connections_without_light_paths_are_refused(connections: int) -> None:
-    with pytest.raises((ValueError, RuntimeError), match="connections need light paths"):
-        mi.load_dict({"type": "bdpt", "connections": connections, "light_ratio": 0.0})
-
-
 # ------------------------------------------------ Several launches ------------------------------------------------
 
 

@@ -26,7 +26,7 @@ def points(seed: int, n: int, pairs: int = 1, number: int = 0, first: int = 0) -
 
 
 def is_net(xy: Any, m: int) -> bool:
-    """Whether 2^m points lie one in each of the 2^m elementary intervals 2^−a × 2^−(m−a), for every a."""
+    """Return whether 2^m points lie one in each of the 2^m elementary intervals 2^−a × 2^−(m−a), for every a."""
     for a in range(m + 1):
         column, row = (xy[:, 0] * 2**a).astype(int), (xy[:, 1] * 2 ** (m - a)).astype(int)
         if len(np.unique(column * 2 ** (m - a) + row)) != 2**m:
@@ -154,7 +154,7 @@ def on_curve(n: int, repeats: int = 1) -> Any:
 
 
 def position_on_curve(xy: Any) -> Any:
-    """Of points in [0, 1)², by taking bits in turn (x first: the lower one)."""
+    """The positions of points in [0, 1)² on the curve, by taking bits in turn (x first: the lower one)."""
     bits = 16
     ints = (np.asarray(xy, np.float64) * 2**bits).astype(np.uint64)
     code = np.zeros(len(ints), np.uint64)

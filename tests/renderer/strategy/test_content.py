@@ -123,7 +123,7 @@ def test_bounces_that_carry_next_to_nothing_are_not_stored(
 
 
 def test_photons_that_shine_in_one_configuration_are_stored_for_all() -> None:
-    """Beyond two hits lie 2.4 % of the power in one configuration of sixteen, and 0.15 % on average."""
+    """The power beyond two hits is 2.4 % in one configuration of sixteen, and 0.15 % on average."""
     dull, bright = (0.9, 0.1, 0.0, 0.0), (0.8, 0.176, 0.024, 0.0)
     wanted = PhotonSpec(paths=64, depth=4)
     near = [(0.9, 0.8, 0.7, 0.6)] * 16

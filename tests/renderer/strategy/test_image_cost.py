@@ -50,7 +50,7 @@ def test_short_images_are_repeated_until_their_times_are_known() -> None:
 
 
 def test_images_are_timed_at_the_samples_that_are_used() -> None:
-    """Up to 5 samples take half as long as those that follow, as of images that fit into the processor's cache."""
+    """The first 5 samples take half as long as those that follow, as if images fitted into the processor's cache."""
 
     def bent(candidate: Candidate, spp: int) -> float:
         return 0.002 + 0.0002 * min(spp, 5) + 0.0004 * max(spp - 5, 0)

@@ -52,7 +52,7 @@ def test_candidates_of_one_mean_are_charged_next_to_nothing_for_few_images(draw:
 
 
 def with_caustic(rng: np.random.Generator) -> NDArray[np.float64]:
-    """In a corner of 16 × 16 pixels half of the samples bring light of 2."""
+    """Half of the samples bring light of 2 in a corner of 16 × 16 pixels."""
     image = dependent(rng)
     image[:16, :16] += 2.0 * (rng.random((16, 16)) < 0.5)
     return image

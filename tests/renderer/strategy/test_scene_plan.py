@@ -58,7 +58,7 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
 
 
 def measurement(*rows: CandidateRow) -> Measurement:
-    """As of a spec with (1, 1) and 2 samples per pixel."""
+    """The measurement of a spec with (1, 1) and 2 samples per pixel."""
     default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
         film=Film(width=16, height=16), spp=2, half_s=0.1, views=3, max_depth=3,
@@ -81,7 +81,7 @@ def test_a_half_keeps_its_cost() -> None:
 
 
 def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -> None:
-    """At 2 samples (0, 1) has the least error × time: 0.08·0.10 s, plain path tracing 0.1·0.084 s.
+    """The least error × time at 2 samples is that of (0, 1): 0.08·0.10 s, against 0.1·0.084 s of plain path tracing.
 
     In the 0.1 s that 2 samples of (1, 1) take, it has 2 samples still, plain path tracing has 10 of 0.02 relMSE.
     """
@@ -168,7 +168,7 @@ def test_the_same_time_is_many_samples_of_cheap_settings() -> None:
 
 
 def test_savings_are_ratios_of_time_to_equal_error() -> None:
-    """In 0.1 s plain path tracing has 9 samples, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
+    """Plain path tracing has 9 samples in 0.1 s, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
     found = plan_of(spec_with(), measurement(), cached=False)
     assert [(s.over, s.factor) for s in found.savings] == [
         (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))), (JOINED, pytest.approx(2)),
@@ -367,5 +367,5 @@ def test_settings_that_the_content_makes_pointless_are_measured_where_the_spec_h
 def test_a_built_in_spec_is_refused_before_it_is_measured(run: Run) -> None:
     code, out, err = run("cornell", "--write")
     assert (code, out) == (3, "")
-    assert "is built in and cannot be written" in err
+    assert "built in" in err
     assert "measuring" not in err

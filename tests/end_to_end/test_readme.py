@@ -1,11 +1,14 @@
 """What README.md and the pages show: Python that runs, and commands that there are.
 
-The Python runs as it is written, on a small store and without rendering. Of commands verbs and options are parsed.
+The Python runs as it is written, on a small store and without rendering. Of commands verbs and options are parsed, and
+those of the tutorial are run, too.
 """
 
 import contextlib
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
@@ -159,3 +162,43 @@ def test_commands_are_found_behind_prompts_comments_and_other_commands() -> None
 def test_a_command_that_there_is_not_would_be_found(parse, wrong: str) -> None:
     with pytest.raises(click.UsageError):
         parse(wrong.split())
+
+
+SMALLER = {
+    "make setup": ":",  # the tests' own environment is set up
+    ". .venv/bin/activate": ":",
+    "--modifications 96": "--modifications 48",  # of 40, none is held out
+    "--train-steps 600": "--train-steps 20",
+    "--reference-views 4": "--reference-views 1",
+    "--orbit 24": "--orbit 2",
+}
+"""What the tutorial says, and what its commands are run with instead, as its own numbers take minutes."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_tutorial_leads_from_an_empty_folder_to_a_report_and_to_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "docs/tutorial.md").read_text()
+    lines = "\n".join(shell(text))
+    for said, instead in SMALLER.items():
+        assert said in lines
+        lines = lines.replace(said, instead)
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.chdir(tmp_path / "checkout")
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
+    photonfarm = f'photonfarm() {{ {sys.executable} -m photonfarm.shared.cli "$@"; }}'
+    done = subprocess.run(["bash", "-ec", f"{photonfarm}\n{lines}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+    monkeypatch.chdir("build/tutorial")
+    for left in re.findall(r"^\| `(\S+)` \|", text, re.MULTILINE):
+        assert Path(left).exists(), left
+    assert len(list(Path("out/references").iterdir())) == 1
+    assert len(list(Path("orbit").glob("frame-*.png"))) == 2
+    assert Path("orbit/path.gif").exists()
+    found = ran("\n".join(blocks("docs/tutorial.md")))
+    assert len(found["scene"]) > 48, "each further pass of a reference is one, too"
+    assert len(found["errors"]) > 0
+    assert "error of a black image on" in capsys.readouterr().out

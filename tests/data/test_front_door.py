@@ -1,9 +1,15 @@
-"""`photonfarm.data`: a scene of a store in a folder or a bucket, from the first five lines to two spawned processes."""
+"""`photonfarm.data`: a scene of a store in a folder or a bucket, from the first five lines to two spawned processes.
+
+And the public names of all three packages.
+"""
 
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
+from inspect import Signature, signature
 from pathlib import Path
+from types import ModuleType
 
 import bucket_samples
 import numpy as np
@@ -12,6 +18,8 @@ import store_samples as samples
 import torch
 
 import photonfarm.data
+import photonfarm.renderer
+import photonfarm.trainer
 from photonfarm.data import Scene, open_scene
 from photonfarm.shared.core.errors import SpecError, StoreError
 from photonfarm.shared.core.keys import seed_of
@@ -40,8 +48,33 @@ def scene(tmp_path: Path) -> Scene:
     return open_scene(tmp_path / "store", "small")
 
 
-def test_public_names() -> None:
-    assert sorted(photonfarm.data.__all__) == ["PointCloud", "Sample", "Scene", "open_scene"]
+@pytest.mark.parametrize(
+    ("package", "names"),
+    [
+        (photonfarm.data, ["PointCloud", "Sample", "Scene", "open_scene"]),
+        (photonfarm.renderer, ["load_mitsuba"]),
+        (photonfarm.trainer, ["train"]),
+    ],
+)
+def test_public_names(package: ModuleType, names: list[str]) -> None:
+    assert sorted(package.__all__) == names
+    assert all(callable(getattr(package, name)) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("function", "parameters"),
+    [
+        (photonfarm.data.open_scene, "store, scene, *, guides=None"),
+        (photonfarm.renderer.load_mitsuba, "threads=None"),
+        (photonfarm.trainer.train, "store, scene, run, *, preset='small', **settings"),
+    ],
+)
+def test_public_parameters(function: Callable[..., object], parameters: str) -> None:
+    found = [one.replace(annotation=one.empty) for one in signature(function).parameters.values()]
+    assert str(Signature(found)) == f"({parameters})"
+
+
+def test_public_members() -> None:
     assert {name for name in dir(Scene) if not name.startswith("_")} == {
         "count", "geometry", "has_guides", "id", "index", "name", "refresh", "rows", "snapshot", "spec", "split",
         "torch",

@@ -1,14 +1,26 @@
-"""The Python of README.md and of the pages runs as it is written, on a small store and without rendering."""
+"""What README.md and the pages show: Python that runs, and commands that there are.
 
+The Python runs as it is written, on a small store and without rendering. Of commands verbs and options are parsed, and
+those of the tutorial are run, too.
+"""
+
+import contextlib
 import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import click
 import pytest
 import store_samples as samples
 import torch
 
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
 from photonfarm.trainer.training.unbiasedness import judged
@@ -77,3 +89,116 @@ def test_the_network_and_the_loss_of_the_training_page_do_what_it_says() -> None
     assert network.needs.guides
     assert not network.needs.points
     assert judged(mine["weighted"]).is_unbiased
+
+
+# ------------------------------------------------------------------------------------------------------------- commands
+
+PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md") if path.name != "cli.md")]
+"""All pages but the one that is made from the commands themselves, and those of measurements."""
+
+BETWEEN = {"&&", "||", "|", "&", ";"}
+
+
+def shell(text: str) -> list[str]:
+    """The lines of a page's indented blocks without their prompts; lines that end in a backslash go on."""
+    unfenced = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return re.findall(r"^ {4}(?:\$ )?(\S.*)$", re.sub(r"\\\n\s*", " ", unfenced), re.MULTILINE)
+
+
+def commands(line: str) -> list[list[str]]:
+    """The arguments of each `photonfarm` in a line of shell."""
+    if "photonfarm " not in line:  # output, perhaps
+        return []
+    words = shlex.shlex(line, posix=True, punctuation_chars="&|;")
+    words.whitespace_split = True
+    parts = [list(part) for between, part in groupby(words, BETWEEN.__contains__) if not between]
+    return [part[part.index("photonfarm") + 1 :] for part in parts if "photonfarm" in part]
+
+
+def in_passing(text: str) -> list[list[str]]:
+    """The arguments of each `photonfarm` with a verb between backticks."""
+    return [arguments.split() for arguments in re.findall(r"`photonfarm ([a-z][^`]*)`", text)]
+
+
+@pytest.fixture
+def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
+    """The command line, which does nothing but parse, and asks for no file. Raises UsageError."""
+    monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
+    monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
+    return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_commands_of_a_page_have_verbs_and_options_that_there_are(parse, page: str) -> None:
+    text = (ROOT / page).read_text()
+    for arguments in (arguments for line in shell(text) for arguments in commands(line)):
+        parse(arguments)
+    for arguments in in_passing(text):
+        with contextlib.suppress(click.MissingParameter):
+            parse(arguments)
+
+
+MADE_UP = """
+    $ A=b photonfarm train room \\
+        --run run &                                          # photonfarm goes on
+    row 80: output of the page's
+    torchrun --nproc-per-node 2 -- photonfarm train room && photonfarm report | tee 'a # b'
+
+```python
+    photonfarm of_no_shell
+```
+"""
+
+
+def test_commands_are_found_behind_prompts_comments_and_other_commands() -> None:
+    found = [arguments for line in shell(MADE_UP) for arguments in commands(line)]
+    assert found == [["train", "room", "--run", "run"], ["train", "room"], ["report"]]
+    assert in_passing("`photonfarm store\ncheck --repair`, `photonfarm`") == [["store", "check", "--repair"]]
+    showing = {page for page in PAGES if any(map(commands, shell((ROOT / page).read_text())))}
+    assert showing > {"README.md", "docs/tutorial.md"}
+
+
+@pytest.mark.parametrize("wrong", ["fly", "store fly", "work --fly", "store check --fly", "train --batch x", "submit"])
+def test_a_command_that_there_is_not_would_be_found(parse, wrong: str) -> None:
+    with pytest.raises(click.UsageError):
+        parse(wrong.split())
+
+
+SMALLER = {
+    "make setup": ":",  # the tests' own environment is set up
+    ". .venv/bin/activate": ":",
+    "--modifications 96": "--modifications 48",  # of 40, none is held out
+    "--train-steps 600": "--train-steps 20",
+    "--reference-views 4": "--reference-views 1",
+    "--orbit 24": "--orbit 2",
+}
+"""What the tutorial says, and what its commands are run with instead, as its own numbers take minutes."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_tutorial_leads_from_an_empty_folder_to_a_report_and_to_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (ROOT / "docs/tutorial.md").read_text()
+    lines = "\n".join(shell(text))
+    for said, instead in SMALLER.items():
+        assert said in lines
+        lines = lines.replace(said, instead)
+    (tmp_path / "checkout").mkdir()
+    monkeypatch.chdir(tmp_path / "checkout")
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
+    photonfarm = f'photonfarm() {{ {sys.executable} -m photonfarm.shared.cli "$@"; }}'
+    done = subprocess.run(["bash", "-ec", f"{photonfarm}\n{lines}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+    monkeypatch.chdir("build/tutorial")
+    for left in re.findall(r"^\| `(\S+)` \|", text, re.MULTILINE):
+        assert Path(left).exists(), left
+    assert len(list(Path("out/references").iterdir())) == 1
+    assert len(list(Path("orbit").glob("frame-*.png"))) == 2
+    assert Path("orbit/path.gif").exists()
+    found = ran("\n".join(blocks("docs/tutorial.md")))
+    assert len(found["scene"]) > 48, "each further pass of a reference is one, too"
+    assert len(found["errors"]) > 0
+    assert "error of a black image on" in capsys.readouterr().out

@@ -179,7 +179,15 @@ def test_noisy_targets_give_the_gradient_of_the_clean_image_for_every_weight_ten
     holds(rendered, LOSSES[name])
 
 
-@pytest.mark.parametrize(("architecture", "name"), [("guided", "linear"), ("guided_transport_photons", "relative")])
+@pytest.mark.parametrize(
+    ("architecture", "name"),
+    [
+        ("guided", "linear"),
+        ("guided_transport", "relative"),
+        ("guided_photons", "relative"),
+        ("guided_transport_photons", "relative"),
+    ],
+)
 def test_so_they_do_for_networks_that_are_told_of_light(seen, architecture: Architecture, name: str) -> None:
     """Direct light, gloss, lit points and photons are noisy, and have seen nothing of the targets' noise."""
     holds(of_architecture(seen, architecture), LOSSES[name], shows=0.5)  # little is left to learn, and to pull

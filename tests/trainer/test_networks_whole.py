@@ -337,7 +337,17 @@ def test_a_scene_without_photons_is_refused_where_they_are_needed(make_source) -
 # ------------------------------------------------------------------------------------------------------------- training
 
 
-@pytest.mark.parametrize("architecture", ["cnn", "feature_projection", "light_transport_photons", "denoise_4"])
+@pytest.mark.parametrize(
+    "architecture",
+    [
+        "cnn",
+        "feature_projection",
+        "light_transport_photons",
+        "guided_transport",
+        "guided_transport_photons",
+        "denoise_4",
+    ],
+)
 def test_a_run_of_any_architecture_goes_on_to_the_same_weights_to_the_bit(
     make_source, tiny, tmp_path: Path, architecture: str
 ) -> None:

@@ -25,6 +25,16 @@ def test_the_papers_presets_are_what_the_supplement_states() -> None:
         assert settings.network.maxima == "absolute"  # Fig. 1
 
 
+def test_the_preset_paper_is_the_supplement_to_the_letter() -> None:
+    settings = preset("paper")
+    network = {"architecture": "light_transport", "width": 64, "maxima": "absolute", "octaves": 0, "demodulation": None}
+    projection = {"occlusion": "window", "occlusion_tolerance": 1e-3}
+    assert settings.network.model_dump(include={*network, *projection}) == network | projection
+    optimiser = {"optimiser": "adam", "learning_rate": 5e-4, "schedule": "epochs", "decay": 0.99, "average": 0.0}
+    others = {"loss": "linear", "batch": 32, "recover": False}
+    assert settings.model_dump(include={*optimiser, *others}) == optimiser | others
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_what_is_asked_for_comes_before_what_a_preset_says(name: str) -> None:
     found = preset(name, network={"architecture": "cnn"}, batch=5)

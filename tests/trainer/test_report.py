@@ -19,14 +19,15 @@ from matplotlib.figure import Figure
 
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
+from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import Store, store_status
 from photonfarm.shared.store.read.find import Query
-from photonfarm.shared.store.read.merge import merge_views
-from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.shared.store.read.merge import MergedView, merge_views
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into, rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
-from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report import write_report as report_of
@@ -149,8 +150,10 @@ def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene,
     settings = json.loads((run / SETTINGS).read_text())
     (run / SETTINGS).write_text(json.dumps({**settings, "device": "cuda"}))
     write_report(store, run, tmp_path / "out")
-    (row,) = json.loads((tmp_path / "out/report.json").read_text())["evaluation"]["rows"]
+    figures = json.loads((tmp_path / "out/report.json").read_text())
+    (row,) = figures["evaluation"]["rows"]
     assert row["linear_mse"]["standard_error"] is None
+    assert figures["val_mse_metric"] is figures["val_mssim"] is None, "without references"
     assert "NaN" not in (tmp_path / "out/report.json").read_text()
     assert "held-out error of light_transport</div>" in (tmp_path / "out/report.html").read_text(), "no interval"
 
@@ -204,6 +207,31 @@ def test_several_runs_and_denoisers_stand_beside_the_published_figures(measured,
         assert (tmp_path / "out" / name).stat().st_size > 0, "what the Markdown shows lies beside it"
     weights = rows["light_transport"]["metric_space"]["inception"]
     assert (weights is None) or (weights["sha256"] in text)
+    assert_figures_in_front(figures, store, scene.scene_id, runs[0], references)
+
+
+def assert_figures_in_front(figures, store: Path, scene_id: str, run: Path, references: Path) -> None:
+    """The first network's on the held-out views, in the metric space: MSE less the references' noise, and MSSIM."""
+    assert list(figures)[:2] == ["val_mse_metric", "val_mssim"], "for programs that compare reports"
+    source = StoreSource(store, scene_id)
+    complete = source.refresh().tolist()
+    held_out = [row for row, held in zip(complete, rows_held_out(source, complete, 0.4), strict=True) if held]
+    rows = held_out[::2]  # the two passes of a view follow each other
+    assert len(rows) == figures["evaluation"]["units"] > 1
+    images = images_of(TrainedRun.load(run), source, rows)
+    merged = [MergedView.read(references / f"{key.hex()}.npz") for key in source.view_keys(rows)]
+    halves = [np.array([getattr(view, half) for view in merged], np.float32) for half in ("half_a", "half_b")]
+    shown, a, b, mean = (metric_space(pictures) for pictures in (images, *halves, (halves[0] + halves[1]) / 2))
+    assert figures["val_mse_metric"] == pytest.approx(mse(shown, a, b).mean(), rel=1e-5)
+    assert figures["val_mssim"] == pytest.approx(mssim(shown, mean).mean(), rel=1e-5)
+
+
+def images_of(run: TrainedRun, source: StoreSource, rows: list[int]) -> F32:
+    """A run's images of some rows, exposed."""
+    geometry, cloud = source.base()
+    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, run.needs)
+    read_into(batch, source, rows, run.needs, cloud)
+    return run.predictor(source.spec, (geometry, cloud), "cpu")(batch)
 
 
 def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_the_axis(measured, monkeypatch) -> None:

@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -49,6 +50,7 @@ from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import Architecture, TrainSettings, preset
+from photonfarm.trainer.runs.user_code import is_own
 from photonfarm.trainer.training.loop import train
 
 if TYPE_CHECKING:
@@ -221,9 +223,16 @@ def code() -> str:
     return " ".join([*(tree[:12] for tree in trees), *mark])
 
 
+def code_of(settings: TrainSettings) -> str:
+    """`code`, and a digest of each module that holds a network or loss of a user's own."""
+    own = [name for name in (settings.network.architecture, settings.loss) if is_own(name)]
+    files = [Path(str(import_module(name.partition(":")[0]).__file__)) for name in own]
+    return " ".join([code(), *(hashlib.sha256(file.read_bytes()).hexdigest()[:8] for file in files)])
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A network to be trained, in a folder named by `name`, all settings and `code`."""
+    """A network to be trained, in a folder named by `name`, all settings and `code_of` these."""
 
     source: Callable[[], SampleSource]  # another process can be given it
     settings: TrainSettings
@@ -233,7 +242,7 @@ class Run:
     @property
     def folder(self) -> Path:
         """The folder that it is trained in."""
-        digest = hashlib.sha256(f"{self.settings.model_dump_json()} {code()}".encode()).hexdigest()[:8]
+        digest = hashlib.sha256(f"{self.settings.model_dump_json()} {code_of(self.settings)}".encode()).hexdigest()[:8]
         return self.within / f"{self.name}-{self.settings.seed}-{digest}"
 
     def is_at_its_end(self) -> bool:

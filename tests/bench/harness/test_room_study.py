@@ -25,6 +25,7 @@ from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.runs.settings import preset
 
 SIZE, SLOTS = 8, 8
 Root = tuple[Path, str]
@@ -146,6 +147,20 @@ def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(
     assert not (runs[0].folder / "metrics.jsonl").exists(), "left as it was"
     assert runs[1].trained().settings.seed == 1
     assert runs[1].seconds() > 0
+
+
+def test_a_run_of_a_users_own_network_is_another_once_its_module_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = tmp_path / "mine_of_runs.py"
+    module.write_text("first = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    network = {"architecture": f"{module.stem}:Own"}
+    own, ours = (Run(lambda: None, preset("small", network=of), tmp_path, "few") for of in (network, {}))
+    before = own.folder, ours.folder
+    module.write_text("second = 2")
+    assert own.folder != before[0]
+    assert ours.folder == before[1]
 
 
 # ------------------------------------------------------------------------------------------------------------- errors

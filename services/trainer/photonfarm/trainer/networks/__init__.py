@@ -18,6 +18,7 @@ from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
+from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.settings import NetworkSettings
@@ -37,10 +38,10 @@ ARCHITECTURES: dict[str, NetworkKind] = {
     "light_transport": NetworkKind(LightTransport, Needs()),
     "light_transport_photons": NetworkKind(LightTransportPhotons, Needs(photons=True)),
     "guided": NetworkKind(Guided, Needs(points=False, guides=True)),
-    "guided_transport": NetworkKind(partial(Guided, transport=True), Needs(guides=True)),
+    "guided_transport": NetworkKind(partial(Guided, transport=LitPoints), Needs(guides=True)),
     "guided_photons": NetworkKind(partial(Guided, photons=True), Needs(points=False, photons=True, guides=True)),
     "guided_transport_photons": NetworkKind(
-        partial(Guided, transport=True, photons=True), Needs(photons=True, guides=True)
+        partial(Guided, transport=LitPoints, photons=True), Needs(photons=True, guides=True)
     ),
     "denoise_1": NetworkKind(Denoiser, Needs(points=False, kept=1)),
     "denoise_4": NetworkKind(Denoiser, Needs(points=False, kept=4)),

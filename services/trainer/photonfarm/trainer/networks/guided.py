@@ -42,18 +42,25 @@ def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
-    With `transport` its inputs include the light that lit points send on to each pixel, by diffuse reflection and by
-    other lobes, and the diffuse part is added to the image. With `photons` they include the light that photons,
-    reflected before, bring to diffuse surfaces, which is added if lit points are not.
+    With `transport`, a kind of lit points, its inputs include the light that these send on to each pixel, by diffuse
+    reflection and by other lobes, and the diffuse part is added to the image. With `photons` they include the light
+    that photons, reflected before, bring to diffuse surfaces, which is added if lit points are not.
     """
 
     def __init__(
-        self, settings: NetworkSettings, frame: SceneFrame, *, transport: bool = False, photons: bool = False
+        self,
+        settings: NetworkSettings,
+        frame: SceneFrame,
+        *,
+        transport: type[LitPoints] | None = None,
+        photons: bool = False,
+        further: int = 0,
     ) -> None:
+        """Take `further` channels of a kind of guided network beside those of transport, photons and guides."""
         photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
-        further = (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
+        further += (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
         super().__init__(settings, frame, further=further + GUIDE_CHANNELS)
-        self.lit_points = LitPoints(frame, settings.lit_points) if transport else None
+        self.lit_points = transport(frame, settings.lit_points) if transport else None
         self.photon_light = photon_light
 
     def forward(self, inputs: Inputs) -> Tensor:

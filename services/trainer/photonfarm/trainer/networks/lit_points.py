@@ -96,7 +96,10 @@ def _factors(std: float | None = None) -> nn.Sequential:
 
 
 class LitPoints(nn.Module):
-    """The radiance of white diffuse surfaces, and of lobes over their albedo, by the light of lit points."""
+    """The radiance of white diffuse surfaces, and of lobes over their albedo, by the light of lit points.
+
+    Other kinds override `form_factors`, `leaving` or `arriving`.
+    """
 
     albedo: Tensor
     normal: Tensor
@@ -146,18 +149,34 @@ class LitPoints(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """The points' B₀ without occlusion, and their B₀ + B₁ with occlusion, (H, W, 3) each."""
         at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
-        facing = functional.normalize(facing, dim=-1)
-        factors = self._form_factors(at, facing, source)
-        senders = self.visibility.surfaces(source, self.normal)
-        between = self._form_factors(source, self.normal, source) * self.visibility(senders, senders)
-        seen = factors * self.visibility(self.visibility.surfaces(at, facing), senders)
-        found = torch.cat([factors @ sent, seen @ (sent + reflects * (between @ sent))], dim=-1)
+        found = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, reflects, sent), dim=-1)
         height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
         coarse = found.reshape(1, height, width, 6).permute(0, 3, 1, 2)
         fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear")[0].permute(1, 2, 0)
         return fine[..., :3], fine[..., 3:]
 
-    def _form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
+    def arriving(
+        self, at: Tensor, facing: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """B₀ without occlusion and B₀ + B₁ with it, at surfaces (N, 3) with normals `facing` (N, 3): (N, 3) each.
+
+        The points are at `source` and reflect and send so much, (L, 3) each.
+        """
+        factors, leaving = self.form_factors(at, facing, source), self.leaving(source, reflects, sent)
+        surfaces = self.visibility.surfaces
+        seen = factors * self.visibility(surfaces(at, facing), surfaces(source, self.normal))
+        return factors @ sent, seen @ leaving
+
+    def leaving(self, source: Tensor, reflects: Tensor, sent: Tensor) -> Tensor:
+        """B₀ + B₁ of each point, (L, 3)."""
+        return sent + reflects * (self.between(source) @ sent)
+
+    def between(self, source: Tensor) -> Tensor:
+        """F ∘ V between the points, (L, L)."""
+        senders = self.visibility.surfaces(source, self.normal)
+        return self.form_factors(source, self.normal, source) * self.visibility(senders, senders)
+
+    def form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
         """cos θ cos θ′ A / (π r²) between surfaces (N, 3) with normals `facing` (N, 3) and each point, (N, L)."""
         leaves, squared = self._between(at, source)
         cosines = (facing @ source.T - (facing * at).sum(-1, keepdim=True)).clamp(min=0) * leaves

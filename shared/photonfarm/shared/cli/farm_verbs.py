@@ -125,9 +125,18 @@ def top_up(
 @json_option
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Show what is planned, committed, queued and failed."""
-    from photonfarm.shared.cli import show
+    from photonfarm.shared.cli import show_status
+    from photonfarm.shared.farm.status import check_read, queue_of
+    from photonfarm.shared.store import Store, store_status
 
-    show.status(store, redis_url, as_json)
+    opened = Store(store)
+    scenes = store_status(opened)
+    if as_json:
+        show_status.document(scenes, queue_of(opened, redis_url), store)
+    else:
+        show_status.scenes(scenes)  # before Redis is asked, which may not answer
+        show_status.queue(queue_of(opened, redis_url), scenes, store)
+    check_read(scenes)
 
 
 @click.command()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -163,10 +163,25 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
-    from photonfarm.shared.farm.up import run_farm
+    from photonfarm.shared.cli.show_up import FarmTalk
+    from photonfarm.shared.farm.up import run_farm, trainer_arguments
 
     try:
-        run_farm(spec, store, request, **options)
+        if options["train_steps"]:
+            trainer = {name: options[name] for name in ("run", "train_steps", "hold_out")}
+            _check_arguments(trainer_arguments(spec, **trainer))
+        run_farm(spec, store, request, FarmTalk(), **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
+
+
+def _check_arguments(arguments: list[str]) -> None:
+    """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
+    root = click.get_current_context().find_root()
+    verb = cast(click.Group, root.command).get_command(root, arguments[0])
+    if verb is None:
+        raise click.UsageError(
+            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
+        )
+    verb.make_context(arguments[0], arguments[1:], parent=root).close()

@@ -59,16 +59,19 @@ def submit(
 ) -> None:
     """Plan samples of SPEC and queue them; what is planned already is not planned again."""
     from photonfarm.shared.cli import show
+    from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.scene.spec import NamedSpec
 
+    named = NamedSpec.load(spec)
+    result: submission.Submission
     if dry_run:
-        from photonfarm.shared.farm.dry_run import rehearse
-
         log = partial(click.echo, err=True)
-        show.dry_run(rehearse(spec, store, request, measure=not no_measure, log=log, shard_rows=shard_rows), as_json)
+        result = dry.rehearse(named, store, request, measure=not no_measure, log=log, shard_rows=shard_rows)
     else:
         url = None if no_queue else redis_url
-        show.submission(submission.submit(spec, store, url, request, retry=retry, shard_rows=shard_rows), as_json)
+        result = submission.submit(named, store, url, request, retry=retry, shard_rows=shard_rows)
+    show.submission(result, as_json)
 
 
 @click.command("top-up")
@@ -112,8 +115,10 @@ def top_up(
     """  # noqa: D301 - click wants the character
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.scene.spec import NamedSpec
 
-    result = submission.top_up(spec, store, None if no_queue else redis_url, spp, where=where, **options)
+    url = None if no_queue else redis_url
+    result = submission.top_up(NamedSpec.load(spec), store, url, spp, where=where, **options)
     show.submission(result, as_json)
     noun = "pass" if result.passes == 1 else "passes"
     click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)

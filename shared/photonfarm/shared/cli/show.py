@@ -107,7 +107,9 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
 
 
 def submission(result: Submission, as_json: bool) -> None:
-    """Print the outcome of a submission."""
+    """Print the outcome of a submission, or of a dry run of one."""
+    from photonfarm.shared.farm.dry_run import DryRun
+
     if as_json:
         print_json(asdict(result))
         return
@@ -115,6 +117,8 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(
             f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
         )
+        if isinstance(result, DryRun) and result.planned:
+            _cost(result)
         return
     queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
     click.echo(
@@ -126,11 +130,8 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
-def dry_run(result: DryRun, as_json: bool) -> None:
-    """Print what a request would plan, its size and cost, and a better use of the same cost."""
-    submission(result, as_json)
-    if as_json or not result.planned:
-        return
+def _cost(result: DryRun) -> None:
+    """Print the size and the cost of what would be planned, and a better use of the same cost."""
     size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"
     if result.core_s is None or result.wall_s is None:
         click.echo(size)

@@ -23,7 +23,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import spp_per_pass
-from photonfarm.shared.scene.spec import SCENES_VARIABLE, find_spec, load_spec
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5
@@ -91,11 +91,11 @@ def run_farm(
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(spec, store, redis.url, request, retry=True, shard_rows=shard_rows)
+        planned = submit(NamedSpec.load(spec), store, redis.url, request, retry=True, shard_rows=shard_rows)
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references := train_steps > 0 and reference_views > 0:
             where = (f"held-out={hold_out}", f"views=first:{reference_views}")
-            added = top_up(spec, store, redis.url, str(reference_spp), where=where, retry=True)
+            added = top_up(NamedSpec.load(spec), store, redis.url, str(reference_spp), where=where, retry=True)
             talk.say(f"{added.planned} passes more for references, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows

@@ -21,8 +21,8 @@ from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.farm.upgrade import upgrade
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.queue import connect
-from photonfarm.shared.queue.job import open_queue, queued_names
+from photonfarm.shared.queue import connect, open_queue
+from photonfarm.shared.queue.entries import queued_names
 from photonfarm.shared.scene.spec import GuideSpec, NamedSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.store.format.declarations import GUIDES

@@ -20,6 +20,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import NamedSpec
 from photonfarm.shared.store import JobWriter, SceneStore, Store
 
 WRITER = "writer of job"  # how a JobWriter's thread is named
@@ -121,7 +122,7 @@ def keep_account(pipe: Any, store: Path, url: str) -> None:
 def planned(store: Path, url: str, count: int, options: argparse.Namespace) -> SceneStore:
     """A new store with a number of whole jobs, which are queued: every sample has a configuration of its own."""
     request = Request(modifications=count * options.rows)
-    submission = submit(options.spec, store, url, request, shard_rows=options.rows)
+    submission = submit(NamedSpec.load(options.spec), store, url, request, shard_rows=options.rows)
     return Store(store).scene(submission.scene_id)
 
 

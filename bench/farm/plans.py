@@ -73,9 +73,11 @@ Steps = Iterable[tuple[str, Callable[[], Any]]]
 def submit(options: argparse.Namespace) -> Steps:
     from photonfarm.shared.farm import submission
     from photonfarm.shared.plan.request import Request
+    from photonfarm.shared.scene.spec import NamedSpec
 
     request = Request(modifications=options.samples // options.views, views_per_modification=options.views)
-    yield "submit", lambda: submission.submit(options.spec, options.folder / "store", options.redis, request)
+    store = options.folder / "store"
+    yield "submit", lambda: submission.submit(NamedSpec.load(options.spec), store, options.redis, request)
 
 
 def reconcile(options: argparse.Namespace) -> Steps:

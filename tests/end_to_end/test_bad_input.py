@@ -16,7 +16,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec import NamedSpec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
@@ -158,7 +158,7 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
     """Configurations of `room`, views of the static `cornell`; three of them, so that one side is empty often."""
     request = Request(modifications=3, passes=2)
     root = tmp_path / "store"
-    scene = Store(root, create=True).scene(submit(spec, root, None, request).scene_id)
+    scene = Store(root, create=True).scene(submit(NamedSpec.load(spec), root, None, request).scene_id)
     renderer = ShardRenderer(Store(root), worker="test", load=analytic.AnalyticScene.load)
     for job in scene.missing_jobs():
         renderer.render(scene.scene_id, job)

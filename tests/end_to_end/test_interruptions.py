@@ -15,6 +15,7 @@ import pytest
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
 pytestmark = [
@@ -148,7 +149,7 @@ def test_work_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trac
     tmp_path: Path, endless_room: Path, number: signal.Signals
 ) -> None:
     with EmbeddedRedis(tmp_path / "redis") as redis:
-        submit(str(endless_room), tmp_path / "store", redis.url, Request(modifications=4))
+        submit(NamedSpec.load(str(endless_room)), tmp_path / "store", redis.url, Request(modifications=4))
         worker = started(tmp_path, "work", PHOTONFARM_REDIS_URL=redis.url)
         wait_for_native_code(tmp_path)
         told = time.monotonic()

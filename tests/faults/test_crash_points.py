@@ -16,7 +16,7 @@ from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, job_name, open_queue, put_back, queue_status, reconcile
-from photonfarm.shared.queue.job import queued_names, running_names, taken_names
+from photonfarm.shared.queue.entries import queued_names, running_names, taken_names
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """

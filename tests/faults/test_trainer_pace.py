@@ -13,7 +13,7 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.shared.cli import show
+from photonfarm.shared.cli.farm_verbs import status
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status, report_consumed
@@ -123,7 +123,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
             report_consumed(connection, new.scene_id, 8)
             analytic.wait_for(lambda: not new.missing_jobs(), 60)
             analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id}, 60)
-            show.status(store.root, redis_server.url, as_json=False)
+            status.callback(store.root, redis_server.url, as_json=False)
             assert len(ahead.committed_jobs()) == 3
             report_consumed(connection, ahead.scene_id, 6)
             assert running.wait(120) == 0

@@ -13,7 +13,7 @@ from photonfarm.renderer.worker.heartbeat import HeartbeatThread
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.shared import queue
-from photonfarm.shared.cli import show
+from photonfarm.shared.cli.farm_verbs import status
 from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
@@ -103,12 +103,12 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 
-    show.status(root, redis_server.url, as_json=True)
+    status.callback(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert cause["cause"].startswith("IncompleteError: half A of sample … ")
     assert (cause["failed"], cause["set_aside"]) == (2, 1)
     assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
-    show.status(root, redis_server.url, as_json=False)
+    status.callback(root, redis_server.url, as_json=False)
     shown = capfd.readouterr().out
     assert "photonfarm submit --retry" in shown
     assert f"2 × {cause['cause']}" in shown
@@ -122,7 +122,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
         analytic.AnalyticScene.broken = False
     assert render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
     assert not render_job(root, scene.scene_id, 0, load=analytic.AnalyticScene.load)[0]
-    show.status(root, redis_server.url, as_json=True)
+    status.callback(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert [job["name"] for job in cause["jobs"]] == names[1:], "what has been committed since has not failed"
     assert queue.reconcile(Store(root), connection, retry_failed=True) == 1
@@ -193,15 +193,15 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
     heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
     heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
     heart.start()
-    show.status(tmp_path / "store", redis_server.url, as_json=False)
+    status.callback(tmp_path / "store", redis_server.url, as_json=False)
     said = capsys.readouterr().out
     assert "gone.xml is not there" in said
     assert "the disk is full" in said
     assert "stranger" not in said
-    show.status(tmp_path / "store", redis_server.url, as_json=True)
+    status.callback(tmp_path / "store", redis_server.url, as_json=True)
     assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
     heart.end()
-    show.status(tmp_path / "store", redis_server.url, as_json=False)
+    status.callback(tmp_path / "store", redis_server.url, as_json=False)
     assert "takes no jobs" not in capsys.readouterr().out
     queue.bury(connection, "ada")
 

@@ -20,6 +20,7 @@ from photonfarm.shared.farm.dry_run import DryRun, measured_costs, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.shared.scene.spec import NamedSpec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.format.schema import bytes_of_rows
 
@@ -58,7 +59,7 @@ def rehearsed(folder: Path, store: Path, told: list[str] | None = None, **option
     shard_rows = options.pop("shard_rows", None)
     request = Request.of(**{"modifications": 6, "views_per_modification": 2, **options})
     log = (told if told is not None else []).append
-    return rehearse(str(spec), store, request, measure=measure, log=log, shard_rows=shard_rows)
+    return rehearse(NamedSpec.load(str(spec)), store, request, measure=measure, log=log, shard_rows=shard_rows)
 
 
 def run(spec: Path, store: Path, *more: str) -> Result:
@@ -111,7 +112,7 @@ def test_of_a_grown_request_only_what_is_new_counts(
     always = {**samples.small_spec().objects[0].model_dump(), "removal_probability": 0.0}  # no two are equal
     spec = spec_file(tmp_path, objects=[always])
     request = {"modifications": 6, "views_per_modification": 2}
-    store.plan(dry_run.load_spec(spec), dry_run.Request(**request))
+    store.plan(load_spec(spec), dry_run.Request(**request))
     found = rehearsed(tmp_path, Path(store.root), spec=spec, **grown)
     assert (found.planned, found.extent) == (samples_, extent)
     assert asked.exists() == (samples_ > 0)  # nothing costs nothing
@@ -256,7 +257,7 @@ def test_of_a_static_scene_the_command_speaks_of_samples_alone(tmp_path: Path, v
 def test_where_samples_are_planned_the_command_says_why_it_suggests_nothing(tmp_path: Path, verb: Verb) -> None:
     verb()
     spec, store = spec_file(tmp_path), Store(tmp_path / "store", create=True)
-    store.plan(dry_run.load_spec(spec), dry_run.Request(modifications=1, views_per_modification=2))
+    store.plan(load_spec(spec), dry_run.Request(modifications=1, views_per_modification=2))
     lines = run(spec, Path(store.root)).stdout.splitlines()
     assert lines[2] == "no suggestion: another half_spp would render the 2 planned samples again"
     assert run(spec, Path(store.root), "--modifications", "1").stdout.endswith(

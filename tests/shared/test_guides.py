@@ -21,9 +21,9 @@ from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.farm.upgrade import upgrade
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.queue import connect
-from photonfarm.shared.queue.job import open_queue, queued_names
-from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.queue import connect, open_queue
+from photonfarm.shared.queue.entries import queued_names
+from photonfarm.shared.scene.spec import GuideSpec, NamedSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.store.format.declarations import GUIDES
 from photonfarm.shared.store.write.guides import NOISY, rounded
@@ -357,7 +357,7 @@ def test_without_redis_guides_are_asked_for_and_the_error_says_so(store: Store, 
 
 def test_submitting_an_older_scene_again_asks_for_guides_too(store: Store, scene: SceneStore, tmp_path: Path) -> None:
     (tmp_path / "small.json").write_text(samples.small_spec(guides={"light_samples": 4}).model_dump_json())
-    result = submit(str(tmp_path / "small.json"), store.root, None, REQUEST)
+    result = submit(NamedSpec.load(str(tmp_path / "small.json")), store.root, None, REQUEST)
     assert (result.planned, result.planned_before) == (0, 10)
     assert scene.guides.settings() == GuideSpec(light_samples=4)
 

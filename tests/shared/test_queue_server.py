@@ -22,6 +22,7 @@ from photonfarm.shared.farm import submission
 from photonfarm.shared.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, open_queue, queue_status, reconcile, with_password_of
+from photonfarm.shared.scene.spec import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene
@@ -82,10 +83,10 @@ def test_who_lacks_a_name_or_a_password_is_told_which_and_nobody_to_start_a_serv
         connect(with_password_of(tmp_path / "password", url))
     request = Request(modifications=1)
     with pytest.raises(QueueError) as refused:
-        submission.submit("cornell", store.root, url, request)
+        submission.submit(NamedSpec.load("cornell"), store.root, url, request)
     assert "redis-server" not in str(refused.value)
     with pytest.raises(QueueError, match="redis-server"):
-        submission.submit("cornell", store.root, "redis://127.0.0.1:1/0", request)
+        submission.submit(NamedSpec.load("cornell"), store.root, "redis://127.0.0.1:1/0", request)
 
 
 def test_the_password_of_a_plain_redis_goes_with_the_user_that_it_has(tmp_path: Path) -> None:

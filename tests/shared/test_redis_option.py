@@ -5,9 +5,10 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.cli import show
 from photonfarm.shared.cli.main import main
+from photonfarm.shared.farm import status
 from photonfarm.shared.queue import has_password
+from photonfarm.shared.store import Store
 
 SECRET = "hunter2"
 WITH = [
@@ -26,10 +27,11 @@ WITHOUT = ["redis://h:1/0", "redis://ada@h:1/0", "unix:///run/redis", "redis://[
 def urls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """The URLs that `status` is called with, in a folder of its own."""
     found: list[str] = []
-    monkeypatch.setattr(show, "status", lambda _store, url, _as_json: found.append(url))
+    monkeypatch.setattr(status, "queue_of", lambda _store, url: found.append(url) or status.NoQueue("not asked"))
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.delenv("PHOTONFARM_REDIS_PASSWORD_FILE", raising=False)
     monkeypatch.chdir(tmp_path)
+    Store(tmp_path / "store", create=True)
     return found
 
 

@@ -7,8 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from photonfarm.shared.cli.show import ANSWER_S
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.status import ANSWER_S
 from photonfarm.shared.store import Store
 
 

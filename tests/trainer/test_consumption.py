@@ -34,7 +34,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
                 time.sleep(0.01)
 
         connection.set(f"rq:photonfarm:consumed:{SCENE_ID}", 7)
-        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID, print) as count:
             time.sleep(0.3)
             wait_for(7)  # of the session before: this one knows nothing yet
             count(40, 100)
@@ -48,7 +48,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
 def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 3600)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID, print) as count:
             count(120, 48)
         assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
 
@@ -66,42 +66,43 @@ def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
 
 
 def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    said: list[str] = []
     monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
         connection = connect(server.url)
         serve(connection, Store(tmp_path / "other", create=True))
-        with service._reported(server.url, made(tmp_path), SCENE_ID) as count:
+        with service._reported(server.url, made(tmp_path), SCENE_ID, said.append) as count:
             count(40, 100)
             time.sleep(0.3)
         assert consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
-    assert capsys.readouterr().err.count("this Redis serves the store") == 1
+    (line,) = said
+    assert "this Redis serves the store" in line
 
 
 @pytest.mark.parametrize("url", [None, "redis://127.0.0.1:1/0", "nonsense"])
 def test_without_a_redis_training_goes_on(url: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 0.01)
-    with service._reported(url, made(tmp_path), SCENE_ID) as count:
+    with service._reported(url, made(tmp_path), SCENE_ID, print) as count:
         count(1, 1)
         time.sleep(0.1)
 
 
-def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(
-    tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(tmp_path: Path, run: Path) -> None:
+    said: list[str] = []
     with EmbeddedRedis(tmp_path / "redis") as server:
-        service.run("cornell", tmp_path / "none", run, "small", {"max_seconds": 0.3}, server.url)
-    said = capsys.readouterr().err
-    assert "waiting for a store" in said
-    assert "step 0" in said
+        asked = ("cornell", tmp_path / "none", run, "small", {"max_seconds": 0.3}, server.url)
+        service.run(*asked, log=said.append, on_record=print)
+    assert any("waiting for a store" in line for line in said)
+    assert any("step 0" in line for line in said)
     assert not (tmp_path / "none").exists()
 
 
 def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._reported(server.url, tmp_path / "store", SCENE_ID) as count:
+        with service._reported(server.url, tmp_path / "store", SCENE_ID, print) as count:
             count(1, 1)
             time.sleep(0.1)
             made(tmp_path)

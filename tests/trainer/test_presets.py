@@ -67,7 +67,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainSettings]:
     """The settings that training was started with."""
     found: list[TrainSettings] = []
 
-    def run(spec, store, run, preset_name, changes, redis_url) -> None:
+    def run(spec, store, run, preset_name, changes, redis_url, **_) -> None:
         found.append(settings_of(preset_name, changes))
 
     monkeypatch.setattr(service, "run", run)
@@ -159,7 +159,7 @@ def test_a_grid_names_the_store_that_is_not_there_and_leaves_no_folder(
         assert str(tmp_path / "stoer") in str(result.exception)
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(SpecError, match="2 processes"):
-        service.search("room", tmp_path / "stoer", tmp_path / "run", "small", {})
+        service.search("room", tmp_path / "stoer", tmp_path / "run", "small", {}, print)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -14,7 +14,7 @@ import torch
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.estimate import Estimate, group_means
-from photonfarm.trainer.cli import service
+from photonfarm.trainer.cli import show
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
@@ -172,7 +172,7 @@ def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_whi
 def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     make_source, tiny, run, tmp_path, capsys
 ) -> None:
-    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=service._log_record))
+    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=show.record))
     without = train(make_source(48), tiny(**TOO_HIGH, recover=False), tmp_path / "without")
     assert outcome.step == 30
     assert outcome.last_error < 1e-3 * without.last_error
@@ -271,7 +271,7 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     train(make_source(24), tiny(max_steps=5), tmp_path / "five")
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
-    train(make_source(24), tiny(), run, Hooks(on_record=service._log_record))
+    train(make_source(24), tiny(), run, Hooks(on_record=show.record))
     told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
     assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
     (found,) = records(run, "recovered")

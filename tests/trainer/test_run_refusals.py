@@ -175,7 +175,7 @@ def test_another_scene_than_that_of_the_run_is_refused_before_it_is_waited_for(
 ) -> None:
     train(make_source(24), tiny(max_steps=1), run)
     with pytest.raises(SpecError, match=make_source(1).spec.scene_id):
-        service.run("cornell", tmp_path / "store", run, "small", {})
+        service.run("cornell", tmp_path / "store", run, "small", {}, log=print, on_record=print)
 
 
 def test_a_batch_that_no_memory_holds_is_refused(make_source, tiny, run) -> None:

@@ -13,7 +13,7 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.shared.scene.spec import load_spec
-from photonfarm.trainer.cli import service
+from photonfarm.trainer.cli import service, show
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.growth import Growth
 from photonfarm.trainer.runs import checkpoint, metrics_log
@@ -208,8 +208,8 @@ def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny,
 
 
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
-    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=service._log_record))
-    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=service._log_record))
+    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=show.record))
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=show.record))
     changed = [record for record in metrics_log.read(run / METRICS) if record["kind"] == "changes"]
     wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
     assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]
@@ -237,20 +237,19 @@ def test_who_reads_the_log_while_it_is_cut_has_it_whole(tmp_path) -> None:
     assert [record["step"] for record in metrics_log.read(path)] == [1, 2, 4]
 
 
-def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path, capsys) -> None:
-    began = time.monotonic()
-    service.run(None, tmp_path / "store", run, "small", {"max_seconds": 0.3})
+def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path) -> None:
+    told, began = [], time.monotonic()
+    service.run(None, tmp_path / "store", run, "small", {"max_seconds": 0.3}, log=told.append, on_record=told.append)
     assert time.monotonic() - began < 5
-    first, *said = capsys.readouterr().err.splitlines()
+    first, *said = told
     assert first == f"training on {described(usable_device('auto'))}"
     assert any("no scene" in line for line in said)
 
 
-def test_the_service_says_which_scene_it_waits_for(scene, run, capsys) -> None:
-    store = scene.folder.parent.parent
-    service.run("cornell", store, run, "small", {"max_seconds": 0.3})
-    said = capsys.readouterr().err
-    assert f"waiting for scene {load_spec('cornell').scene_id}" in said
+def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:
+    store, said = scene.folder.parent.parent, []
+    service.run("cornell", store, run, "small", {"max_seconds": 0.3}, log=said.append, on_record=said.append)
+    assert any(f"waiting for scene {load_spec('cornell').scene_id}" in str(line) for line in said)
 
 
 def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run, monkeypatch) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.trainer.cli import service
+from photonfarm.trainer.cli import show
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, waits
@@ -69,7 +69,7 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     train(make_source(24), tiny(max_steps=1), tmp_path / "before")  # a process' first run takes as long to begin
     source = make_scarce(60, lot=12, patience=30)
     scarce = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, poll_seconds=0.02)
-    train(source, scarce, run, Hooks(on_record=service._log_record, on_draws=source.count))
+    train(source, scarce, run, Hooks(on_record=show.record, on_draws=source.count))
     records = metrics_log.read(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     waited = [r["seconds"]["wait_data"] for r in told if r["step"] % 5 == 0]

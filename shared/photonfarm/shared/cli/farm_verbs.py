@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -59,16 +59,19 @@ def submit(
 ) -> None:
     """Plan samples of SPEC and queue them; what is planned already is not planned again."""
     from photonfarm.shared.cli import show
+    from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.scene.spec import NamedSpec
 
+    named = NamedSpec.load(spec)
+    result: submission.Submission
     if dry_run:
-        from photonfarm.shared.farm.dry_run import rehearse
-
         log = partial(click.echo, err=True)
-        show.dry_run(rehearse(spec, store, request, measure=not no_measure, log=log, shard_rows=shard_rows), as_json)
+        result = dry.rehearse(named, store, request, measure=not no_measure, log=log, shard_rows=shard_rows)
     else:
         url = None if no_queue else redis_url
-        show.submission(submission.submit(spec, store, url, request, retry=retry, shard_rows=shard_rows), as_json)
+        result = submission.submit(named, store, url, request, retry=retry, shard_rows=shard_rows)
+    show.submission(result, as_json)
 
 
 @click.command("top-up")
@@ -112,8 +115,10 @@ def top_up(
     """  # noqa: D301 - click wants the character
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.scene.spec import NamedSpec
 
-    result = submission.top_up(spec, store, None if no_queue else redis_url, spp, where=where, **options)
+    url = None if no_queue else redis_url
+    result = submission.top_up(NamedSpec.load(spec), store, url, spp, where=where, **options)
     show.submission(result, as_json)
     noun = "pass" if result.passes == 1 else "passes"
     click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)
@@ -125,9 +130,18 @@ def top_up(
 @json_option
 def status(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Show what is planned, committed, queued and failed."""
-    from photonfarm.shared.cli import show
+    from photonfarm.shared.cli import show_status
+    from photonfarm.shared.farm.status import check_read, queue_of
+    from photonfarm.shared.store import Store, store_status
 
-    show.status(store, redis_url, as_json)
+    opened = Store(store)
+    scenes = store_status(opened)
+    if as_json:
+        show_status.document(scenes, queue_of(opened, redis_url), store)
+    else:
+        show_status.scenes(scenes)  # before Redis is asked, which may not answer
+        show_status.queue(queue_of(opened, redis_url), scenes, store)
+    check_read(scenes)
 
 
 @click.command()
@@ -154,10 +168,25 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
-    from photonfarm.shared.farm.up import run_farm
+    from photonfarm.shared.cli.show_up import FarmTalk
+    from photonfarm.shared.farm.up import run_farm, trainer_arguments
 
     try:
-        run_farm(spec, store, request, **options)
+        if options["train_steps"]:
+            trainer = {name: options[name] for name in ("run", "train_steps", "hold_out")}
+            _check_arguments(trainer_arguments(spec, **trainer))
+        run_farm(spec, store, request, FarmTalk(), **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
+
+
+def _check_arguments(arguments: list[str]) -> None:
+    """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
+    root = click.get_current_context().find_root()
+    verb = cast(click.Group, root.command).get_command(root, arguments[0])
+    if verb is None:
+        raise click.UsageError(
+            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
+        )
+    verb.make_context(arguments[0], arguments[1:], parent=root).close()

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import click
@@ -19,8 +17,6 @@ from photonfarm.shared.scene.spec import SceneSpec, shape_ids
 if TYPE_CHECKING:
     from photonfarm.shared.farm.dry_run import DryRun
     from photonfarm.shared.farm.submission import Submission
-    from photonfarm.shared.queue import Failure, FailureCause, QueueStatus
-    from photonfarm.shared.store import Store
 
 
 class CheckResult(Protocol):
@@ -43,18 +39,13 @@ class CheckResult(Protocol):
         """The exit code of the command if this check fails; 0 if the check is optional."""
 
 
-ANSWER_S = 5.0
-"""How long `status` waits for an answer of Redis; workers wait longer."""
-
-IDLE_SHOWN = 10
-"""The most idle workers whose reasons are printed."""
-
-
-def _json(document: Any) -> None:
+def print_json(document: Any) -> None:
+    """Print JSON for programs."""
     click.echo(json.dumps(document, indent=2))
 
 
-def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
+def print_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
+    """Print rows of text as a table, with a head or without one."""
     table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
     for row in rows:
         table.add_row(*map(markup.escape, row))
@@ -69,10 +60,11 @@ def _table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
 def scene(spec: SceneSpec, as_json: bool) -> None:
     """Print a checked spec: its id, its settings, its movable groups."""
     if as_json:
-        _json({"scene_id": spec.scene_id, "bytes_per_sample": bytes_per_sample(spec), **spec.model_dump(mode="json")})
+        sizes = {"bytes_per_sample": bytes_per_sample(spec)}
+        print_json({"scene_id": spec.scene_id, **sizes, **spec.model_dump(mode="json")})
         return
     t, source = spec.transport, spec.scene
-    _table(
+    print_table(
         (
             ("name", spec.name),
             ("scene id", spec.scene_id),
@@ -91,7 +83,7 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
     )  # fmt: skip
     if spec.groups:
         click.echo()
-        _table(
+        print_table(
             (
                 (g.name, str(len(shape_ids(g))), f"{g.removal_probability:g}", _box(g.box.min, g.box.max))
                 for g in spec.groups
@@ -115,14 +107,18 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
 
 
 def submission(result: Submission, as_json: bool) -> None:
-    """Print the outcome of a submission."""
+    """Print the outcome of a submission, or of a dry run of one."""
+    from photonfarm.shared.farm.dry_run import DryRun
+
     if as_json:
-        _json(asdict(result))
+        print_json(asdict(result))
         return
     if result.dry_run:
         click.echo(
             f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
         )
+        if isinstance(result, DryRun) and result.planned:
+            _cost(result)
         return
     queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
     click.echo(
@@ -134,11 +130,8 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
-def dry_run(result: DryRun, as_json: bool) -> None:
-    """Print what a request would plan, its size and cost, and a better use of the same cost."""
-    submission(result, as_json)
-    if as_json or not result.planned:
-        return
+def _cost(result: DryRun) -> None:
+    """Print the size and the cost of what would be planned, and a better use of the same cost."""
     size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"
     if result.core_s is None or result.wall_s is None:
         click.echo(size)
@@ -174,177 +167,6 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:,.1f} h"
 
 
-# --------------------------------------------------------------------------------------------------------------- status
-
-
-def status(store: str | Path, redis_url: str, as_json: bool) -> None:
-    """Print the store's scenes, and the queue if Redis answers.
-
-    Raises StoreError at the end if a scene or a marker cannot be read, or a marker belongs to no plan.
-    """
-    from photonfarm.shared.core.errors import StoreError
-    from photonfarm.shared.store import Store, store_status
-
-    opened = Store(store)
-    scenes = [asdict(scene) for scene in store_status(opened)]
-    _status(opened, scenes, redis_url, as_json)
-    unread = []
-    if unreadable := [s["error"] for s in scenes if s["error"]]:
-        unread.append(f"{len(unreadable)} of {len(scenes)} scenes cannot be read: {'; '.join(unreadable)}")
-    unread += [f"scene {s['scene_id']}: {_unread_markers(s)}" for s in scenes if s["markers_unreadable"]]
-    unread += [f"scene {s['scene_id']}: {_lost_plan(s)}" for s in scenes if s["markers_without_plan"]]
-    if unread:
-        raise StoreError("; ".join(unread))
-
-
-def _unread_markers(scene: Mapping[str, Any]) -> str:
-    """The message about a scene's unreadable markers."""
-    return (
-        f"{scene['markers_unreadable']} of {_markers(scene)} markers cannot be read, and size, core time and "
-        f"redrawn leave them out: {scene['marker_error']}; `photonfarm store check` names each"
-    )
-
-
-def _lost_plan(scene: Mapping[str, Any]) -> str:
-    """The message about a scene's markers whose jobs no plan has."""
-    return (
-        f"{scene['markers_without_plan']} of {_markers(scene)} markers are of jobs that no plan has; "
-        "`photonfarm store check` tells whether the last plan is missing"
-    )
-
-
-def _markers(scene: Mapping[str, Any]) -> int:
-    """The number of a scene's markers, including those of guides."""
-    return int(scene["jobs_committed"] + scene["guide_jobs"])
-
-
-def _status(opened: Store, scenes: list[dict[str, Any]], redis_url: str, as_json: bool) -> None:
-    from photonfarm.shared import queue
-
-    if as_json:
-        found, _ = _queue_status(opened, redis_url)
-        causes = queue.causes(_still_missing(opened, found.failed)) if found else []
-        _json({"scenes": scenes, "queue": found and _queue_document(found, causes, opened.root)})
-        return
-    _scenes(scenes)  # before Redis is asked, which may not answer
-    found, absent = _queue_status(opened, redis_url)
-    if found is None:
-        click.echo(f"queue: {absent}")
-        return
-    _queue(opened, found, {s["scene_id"]: s["name"] for s in scenes})
-
-
-def _queue_status(opened: Store, redis_url: str) -> tuple[QueueStatus | None, str]:
-    """The status of the queue; or None, and the reason why Redis gives none."""
-    from photonfarm.shared import queue
-    from photonfarm.shared.core.errors import QueueError
-
-    try:
-        with queue.connect(redis_url, only_s=ANSWER_S) as connection:
-            queue.check_served(connection, opened)
-            return queue.queue_status(connection), ""
-    except QueueError as error:
-        return None, str(error)
-
-
-def _scenes(scenes: Sequence[Mapping[str, Any]]) -> None:
-    with_guides = any(s["views_guided"] is not None for s in scenes)
-    _table(
-        (
-            (
-                s["name"], s["scene_id"], f"{s['samples_complete']}/{s['samples_planned']}",
-                f"{s['jobs_committed']}/{s['jobs_planned']}", *([_guided(s)] if with_guides else []),
-                f"{s['size_bytes'] / 1e6:.1f} MB", f"{s['core_s']:.0f} s", str(s["redrawn"]),
-            )
-            for s in scenes
-            if not s["error"]
-        ),
-        ("scene", "id", "samples", "jobs", *(["guides"] if with_guides else []), "size", "core time", "redrawn"),
-    )  # fmt: skip
-    for s in scenes:
-        if s["error"]:
-            click.echo(f"{s['name']} {s['scene_id']}: cannot be read: {s['error']}")
-        if s["markers_unreadable"]:
-            click.echo(f"{s['name']} {s['scene_id']}: {_unread_markers(s)}")
-        if s["markers_without_plan"]:
-            click.echo(f"{s['name']} {s['scene_id']}: {_lost_plan(s)}")
-    click.echo()
-
-
-def _guided(scene: Mapping[str, Any]) -> str:
-    """How many of a scene's planned views have guides, as text."""
-    if scene["views_guided"] is None:
-        return "none"
-    return f"{scene['views_guided']}/{scene['views_planned']} views"
-
-
-def _queue(opened: Store, found: QueueStatus, names: Mapping[str, str]) -> None:
-    from photonfarm.shared import queue
-
-    causes = queue.causes(_still_missing(opened, found.failed))
-    failed, aside = sum(len(cause.jobs) for cause in causes), sum(cause.set_aside for cause in causes)
-    click.echo(
-        f"queue: {found.queued} queued, {found.running} running, {found.workers} workers, {failed} failed"
-        + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
-    )
-    for line in _idle_lines(found, names):
-        click.echo(f"  {line}")
-    for cause in causes:
-        click.echo(f"  {len(cause.jobs)} × {cause.cause}")
-        click.echo(f"      to repeat one: {queue.repeating_command(opened.root, cause.example)}")
-
-
-def _idle_lines(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
-    """Why scenes of the store are not rendered, by the workers' reports, which strangers may have written."""
-    for scene_id, reasons in found.idle_reports.left.items():
-        if scene_id in names:
-            reason = next(iter(reasons.values()))
-            yield f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
-    paused = found.idle_reports.paused
-    for worker, reason in list(paused.items())[:IDLE_SHOWN]:
-        yield f"worker {worker} takes no jobs: {reason}"
-    if len(paused) > IDLE_SHOWN:
-        yield f"and {len(paused) - IDLE_SHOWN} workers more"
-
-
-def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
-    """The failures of this store's jobs that are still not committed."""
-    from photonfarm.shared.core.errors import CorruptError
-    from photonfarm.shared.queue import RenderArguments
-
-    scene_ids, missing = set(store.scene_ids()), {}
-    for name, failure in failed.items():
-        job = RenderArguments.of(name)
-        with contextlib.suppress(CorruptError):  # of a scene whose spec is damaged
-            if job.scene_id in scene_ids and not store.scene(job.scene_id).is_done(job.job):
-                missing[name] = failure
-    return missing
-
-
-def _queue_document(found: QueueStatus, causes: Iterable[FailureCause], store: str | Path) -> dict[str, Any]:
-    from photonfarm.shared.queue import repeating_command
-
-    return {
-        "queued": found.queued,
-        "running": found.running,
-        "workers": found.workers,
-        "left": found.idle_reports.left,
-        "paused": found.idle_reports.paused,
-        "failures": [
-            {
-                "cause": cause.cause,
-                "failed": len(cause.jobs),
-                "set_aside": cause.set_aside,
-                "jobs": [
-                    {"name": name, **asdict(failure), "command": repeating_command(store, name)}
-                    for name, failure in cause.jobs.items()
-                ],
-            }
-            for cause in causes
-        ],
-    }
-
-
 # --------------------------------------------------------------------------------------------------------------- doctor
 
 
@@ -359,5 +181,5 @@ def findings(found: Iterable[CheckResult], as_json: bool) -> int:
             mark = "[green]ok[/]  " if finding.works else ("[red]FAIL[/]" if finding.exit_code else "[yellow]none[/]")
             console.print(f"{mark} [bold]{finding.name}[/]: {markup.escape(finding.detail)}", highlight=False)
     if as_json:
-        _json([{"name": f.name, "works": f.works, "detail": f.detail} for f in seen])
+        print_json([{"name": f.name, "works": f.works, "detail": f.detail} for f in seen])
     return code

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
-from photonfarm.shared.store.read.merge import MergedView
+from photonfarm.shared.store.read.merge import WrittenView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
 
 if TYPE_CHECKING:
@@ -140,25 +140,16 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
         click.echo(f"no sample fits{near}", err=True)
 
 
-def merged(views: Iterable[tuple[str, MergedView]], folder: Path, least: int, as_json: bool) -> None:
-    """Write merged views of at least `least` passes into `folder`, which is created, and print a line for each.
+def merged(view: WrittenView) -> None:
+    """Print a line about a merged view."""
+    passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
+    error = f"standard error of a value {view.standard_error:.2g} (RMS)"
+    click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
 
-    Raises StoreError if there is no such view, or if they cannot be written.
-    """
-    written = []
-    for key, view in views:
-        file = folder / f"{key}.npz"
-        view.write(file)
-        mean, error = float(view.mean.mean()), float((view.standard_error**2).mean() ** 0.5)
-        written.append({"view": key, "passes": view.passes, "mean": mean, "standard_error": error, "file": str(file)})
-        if not as_json:
-            passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
-            click.echo(f"{file}: {passes}, mean {mean:.4g}, standard error of a value {error:.2g} (RMS)")
-    if as_json:
-        click.echo(json.dumps(written, indent=2))
-    if not written:
-        what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
-        raise StoreError(f"{what}; `photonfarm store find` shows what there is")
+
+def merged_document(views: Iterable[WrittenView]) -> None:
+    """Print merged views as JSON."""
+    click.echo(json.dumps([asdict(view) for view in views], indent=2))
 
 
 def _sample(sample: FoundSample, store: str | Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.core.errors import StoreError
 
 
 def scene_option(command: click.decorators.FC) -> click.decorators.FC:
@@ -121,13 +122,22 @@ def merge(
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.store import Store
     from photonfarm.shared.store.read.find import Query, scene_named
-    from photonfarm.shared.store.read.merge import merge_views
+    from photonfarm.shared.store.read.merge import merge_views, write_views
 
     opened = Store(store)
     query = Query.of(modification=modification, view=view, row=row)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
-    show_store.merged(merged, out, least, as_json)
+    written = []
+    for each in write_views(merged, out):
+        written.append(each)
+        if not as_json:
+            show_store.merged(each)
+    if as_json:
+        show_store.merged_document(written)
+    if not written:
+        what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
+        raise StoreError(f"{what}; `photonfarm store find` shows what there is")
 
 
 @click.command()

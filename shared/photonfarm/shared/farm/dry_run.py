@@ -14,7 +14,7 @@ from photonfarm.shared.farm.submission import Submission
 from photonfarm.shared.plan.allocation import Allocation, CostModel
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import NamedSpec, SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.format.schema import bytes_of_rows
 from photonfarm.shared.store.io.storage import is_vacant
@@ -50,7 +50,7 @@ class DryRun(Submission):
 
 
 def rehearse(
-    spec: str,
+    named: NamedSpec,
     store: str | Path,
     request: Request,
     *,
@@ -62,12 +62,11 @@ def rehearse(
 
     `log` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
-    loaded = load_spec(spec)
-    found = _counted(loaded, request, store, shard_rows)
-    costs = measured_costs(spec) if measure and found.planned else None
+    found = _counted(named.spec, request, store, shard_rows)
+    costs = measured_costs(named.name) if measure and found.planned else None
     if isinstance(costs, str):
         log(f"cost and time are not known: {costs}")
-    return with_costs(found, loaded, request, costs) if isinstance(costs, SampleCosts) else found
+    return _priced(found, named.spec, request, costs) if isinstance(costs, SampleCosts) else found
 
 
 def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
@@ -99,33 +98,23 @@ def measured_costs(spec: str) -> SampleCosts | str:
         return f"`photonfarm {name}` said {error}"
 
 
-def with_costs(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
+def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
     """What would be planned, with its cost, and the suggestion.
 
     There is no suggestion if some samples of the request are planned already: another half_spp makes another scene, in
     which all of them would be rendered again.
     """
-    of, spp = found.extent, 2 * spec.transport.half_spp
+    of, spp, static = found.extent, 2 * spec.transport.half_spp, not spec.groups
     core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
     timed = replace(found, costs=costs, core_s=core_s, wall_s=core_s / found.cores)
     if found.planned_before:
         return timed
-    reduction, better = _best(spec, wanted, costs)
-    worth = reduction >= WORTH_A_CHANGE
-    return replace(timed, reduction=reduction, suggestion=_suggested(better, spec) if worth else None)
-
-
-def _best(spec: SceneSpec, wanted: Request, costs: SampleCosts) -> tuple[float, Allocation]:
-    """The best allocation of the request's cost, after the share of the excess error that it saves, at least 0."""
-    terms = CostModel.of(costs, static=not spec.groups)
-    spp = 2 * spec.transport.half_spp
     asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
-    if not spec.groups:
+    if static:
         asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
-    found = terms.best(terms.seconds(asked))
-    return max(0.0, 1 - terms.excess(found) / terms.excess(asked)), found
-
-
-def _suggested(of: Allocation, spec: SceneSpec) -> Suggestion:
-    modifications, views = (of.modifications, of.views) if spec.groups else (None, None)
-    return Suggestion(of.spp // 2, modifications, views, of.samples)
+    reduction, better = CostModel.of(costs, static=static).improved(asked)
+    if reduction < WORTH_A_CHANGE:
+        return replace(timed, reduction=reduction)
+    modifications, views = (None, None) if static else (better.modifications, better.views)
+    suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
+    return replace(timed, reduction=reduction, suggestion=suggestion)

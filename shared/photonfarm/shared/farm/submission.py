@@ -1,4 +1,4 @@
-"""Plan and queue samples, given a spec's name and a few numbers."""
+"""Plan and queue samples, given a spec and a few numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec import SceneSpec, find_scene, find_spec, load_spec
+from photonfarm.shared.scene.spec import NamedSpec
 from photonfarm.shared.store import Store
 
 
@@ -36,7 +36,7 @@ class TopUpSubmission(Submission):
 
 
 def submit(
-    spec: str,
+    named: NamedSpec,
     store: str | Path,
     redis_url: str | None,
     request: Request,
@@ -49,17 +49,15 @@ def submit(
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
     QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
-    loaded = load_spec(spec)
     opened = Store(store, create=True)
-    opened.add(loaded).guides.want(loaded.guides)
-    planned = opened.plan(loaded, request, shard_rows=shard_rows)
+    opened.add(named.spec).guides.want(named.spec.guides)
+    planned = opened.plan(named.spec, request, shard_rows=shard_rows)
     queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
-    scenes = _folder_for_workers(loaded, spec)
-    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=scenes)
+    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 
 
 def top_up(
-    spec: str,
+    named: NamedSpec,
     store: str | Path,
     redis_url: str | None,
     spp: str,
@@ -72,14 +70,14 @@ def top_up(
 
     `spp` and `where` are as `TopUp.of` takes them. Raises what `submit` does.
     """
-    loaded, wanted = load_spec(spec), TopUp.of(spp, where)
+    scene_id, wanted = named.spec.scene_id, TopUp.of(spp, where)
     opened = Store(store)
-    if loaded.scene_id not in opened.scene_ids():
+    if scene_id not in opened.scene_ids():
         raise SpecError(
-            f"{spec}: {store} has no samples of scene {loaded.scene_id} that could be topped up; `photonfarm submit` "
+            f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; `photonfarm submit` "
             "plans the first ones"
         )
-    planned = opened.scene(loaded.scene_id).plan(wanted, dry_run=dry_run)
+    planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
     queued = None if redis_url is None or dry_run else queue_missing(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
@@ -88,8 +86,8 @@ def top_up(
         planned.known,
         queued,
         dry_run,
-        spp_per_pass=spp_per_pass(loaded),
-        passes=wanted.passes(loaded),
+        spp_per_pass=spp_per_pass(named.spec),
+        passes=wanted.passes(named.spec),
     )
 
 
@@ -116,13 +114,3 @@ def queue_missing(
         raise QueueError(
             f"{str(error).rstrip('.')}. {stored}, and idle workers will find it; --no-queue {verb} without Redis"
         ) from error
-
-
-def _folder_for_workers(loaded: SceneSpec, spec: str) -> str | None:
-    """The spec's folder, if its scene file is found there alone: workers have the store, and not the spec's file."""
-    if loaded.scene.file is not None:
-        try:
-            find_scene(loaded.scene.file, spec)
-        except SpecError:
-            return str(find_spec(spec).absolute().parent)
-    return None

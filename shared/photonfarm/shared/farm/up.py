@@ -8,14 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
-
-import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from typing import Any, Protocol
 
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError, store_errors
@@ -26,11 +23,10 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import spp_per_pass
-from photonfarm.shared.scene.spec import SCENES_VARIABLE, find_spec, load_spec
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec, load_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5
-PLAIN_LINE_S = 15.0  # between progress lines where there is no terminal for bars
 STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives this one 10 s
 AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
 
@@ -39,10 +35,37 @@ Count = tuple[int, int]
 """The number committed, and the number planned."""
 
 
+@dataclass(frozen=True, slots=True)
+class FarmProgress:
+    """How far rendering and training are."""
+
+    samples: Count
+    passes: Count  # further ones, of views that have samples
+    step: int
+    steps: int
+    note: str  # the last held-out error, in words
+
+
+class Talk(Protocol):
+    """Where a farm says what it does."""
+
+    def say(self, line: str) -> None:
+        """Say a sentence."""
+
+    def progress(self, steps: int) -> AbstractContextManager[Callable[[FarmProgress, bool], None]]:
+        """A function that shows progress towards so many training steps, and is told when it shows the last."""
+
+
+def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
+    """The trainer's verb with its arguments."""
+    return ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
+
+
 def run_farm(
     spec: str,
     store: str | Path,
     request: Request,
+    talk: Talk,
     *,
     workers: int,
     run: Path,
@@ -58,38 +81,34 @@ def run_farm(
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
     with them.
 
-    Settings that the trainer would refuse are refused before anything is written: SpecError for a hold-out that leaves
-    one side empty, click's UsageError for the others. After any interruption the same call resumes, as the store and
-    the trainer's checkpoints remain.
+    A hold-out that leaves one side empty is refused before anything is written, by a SpecError. After any interruption
+    the same call resumes, as the store and the trainer's checkpoints remain.
     """
-    training = ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
     if train_steps:
-        _check_arguments(training)
         check_hold_out(load_spec(spec), store, hold_out, request)
-    console = Console(stderr=True, highlight=False)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(spec, store, redis.url, request, retry=True, shard_rows=shard_rows)
-        console.print(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        planned = submit(NamedSpec.load(spec), store, redis.url, request, retry=True, shard_rows=shard_rows)
+        talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references := train_steps > 0 and reference_views > 0:
             where = (f"held-out={hold_out}", f"views=first:{reference_views}")
-            added = top_up(spec, store, redis.url, str(reference_spp), where=where, retry=True)
-            console.print(f"{added.planned} passes more for references, {added.planned_before} planned before")
+            added = top_up(NamedSpec.load(spec), store, redis.url, str(reference_spp), where=where, retry=True)
+            talk.say(f"{added.planned} passes more for references, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
-        console.print(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
+        talk.say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
-            verbs["trainer"] = training
-        running = stack.enter_context(_processes(verbs, environment, run, console))
+            verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=hold_out)
+        running = stack.enter_context(_processes(verbs, environment, run, talk))
         preview = ["preview", spec, "--out", str(out / "preview.html")]
         try:
-            _watch(running, _Farm(scene, run, train_steps), redis, console)
+            _watch(running, _Farm(scene, run, train_steps), redis, talk)
             if train_steps:
                 beside: list[str] = []
                 if references:
@@ -103,17 +122,6 @@ def run_farm(
             _call(preview, environment)  # the samples rendered so far can still be looked at
             raise
         _call(preview, environment)
-
-
-def _check_arguments(arguments: list[str]) -> None:
-    """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
-    root = click.get_current_context().find_root()
-    verb = cast(click.Group, root.command).get_command(root, arguments[0])
-    if verb is None:
-        raise click.UsageError(
-            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
-        )
-    verb.make_context(arguments[0], arguments[1:], parent=root).close()
 
 
 @contextmanager
@@ -141,7 +149,7 @@ def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
 
 @contextmanager
 def _processes(
-    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, console: Console
+    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, talk: Talk
 ) -> Iterator[dict[str, Process]]:
     """Run each verb as a process of its own; at the end all are asked to stop at once, and waited for together."""
     running: dict[str, Process] = {}
@@ -152,7 +160,7 @@ def _processes(
     finally:
         alive = [process for process in running.values() if process.poll() is None]
         if alive:
-            console.print("stopping; a job in hand that is not nearly done will be rendered again")
+            talk.say("stopping; a job in hand that is not nearly done will be rendered again")
             _stop(alive)
 
 
@@ -196,15 +204,16 @@ class _Farm:
         self.step = 0
         self.note = ""
 
-    def look(self) -> tuple[Count, Count]:
-        """Count the samples and the further passes of their views; updates `step` and `note` from the trainer's log."""
+    def look(self) -> FarmProgress:
+        """Count the samples and the further passes of their views, and read the trainer's log."""
         for record in self._records():
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
                 self.note = f", held-out error {stated(record['error'], record['standard_error'])}"
         found = self.scene.progress()
         passes = found.committed_passes, found.planned_passes
-        return (found.committed_samples - passes[0], found.planned_samples - passes[1]), passes
+        samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
+        return FarmProgress(samples, passes, self.step, self.steps, self.note)
 
     def _records(self) -> list[dict[str, Any]]:
         """The trainer's log, read whole each time, as a trainer that resumes removes the records it will repeat."""
@@ -213,24 +222,13 @@ class _Farm:
         return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
-def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, console: Console) -> None:
+def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, talk: Talk) -> None:
     """Show progress until every process has ended; raises IncompleteError as soon as one has failed."""
-    last_line = started = time.monotonic()
-    with _bars(console) as bars:
-        samples = bars.add_task("samples", total=None)
-        passes = bars.add_task("further passes", total=None, visible=False)
-        steps = bars.add_task("training steps", total=farm.steps, visible=farm.steps > 0)
+    with talk.progress(farm.steps) as show:
         while True:
             redis.keep_running()
             alive = any(process.poll() is None for process in running.values())
-            counts = farm.look()
-            for bar, (committed, planned) in zip((samples, passes), counts, strict=True):
-                bars.update(bar, completed=committed, total=planned, visible=bar == samples or planned > 0)
-            bars.update(steps, completed=farm.step, description=f"training steps{farm.note}")
-            now = time.monotonic()
-            if not console.is_terminal and (now - last_line > PLAIN_LINE_S or not alive):
-                last_line = now
-                console.print(f"{now - started:4.0f} s  {_line(farm, *counts)}")
+            show(farm.look(), not alive)
             for name, process in running.items():
                 if process.poll():
                     log = farm.run / f"{name}.log"
@@ -240,17 +238,6 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, co
             time.sleep(POLL_S)
 
 
-def _line(farm: _Farm, samples: Count, passes: Count) -> str:
-    """The progress in words."""
-    further = f"  further passes {passes[0]}/{passes[1]}" if passes[1] else ""
-    return f"samples {samples[0]}/{samples[1]}{further}  steps {farm.step}/{farm.steps}{farm.note}"
-
-
 def _tail(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
     return lines[-1] if lines else "nothing"
-
-
-def _bars(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal)

@@ -121,6 +121,11 @@ class CostModel:
             raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {self.seconds(Allocation(1, 1, 1, 2))}")
         return min(found, key=self.excess)
 
+    def improved(self, asked: Allocation) -> tuple[float, Allocation]:
+        """The best allocation of what another one costs, after the share of that one's excess that it saves, ≥ 0."""
+        found = self.best(self.seconds(asked))
+        return max(0.0, 1 - self.excess(found) / self.excess(asked)), found
+
     def _affordable(self, budget_s: float) -> Iterator[Allocation]:
         """One pass of 2, 4, 8 … 1024 spp for each number of views, with all configurations that the budget pays for."""
         for views in range(1, self.most_views + 1):

@@ -18,6 +18,7 @@ rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of
 from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
+from photonfarm.shared.queue.entries import put_back, take
 from photonfarm.shared.queue.failures import (
     FAILED,
     FAILURES_ALLOWED,
@@ -35,19 +36,9 @@ from photonfarm.shared.queue.failures import (
 )
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
 from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
-from photonfarm.shared.queue.job import (
-    FUNCTION,
-    OVERDUE,
-    QUEUE,
-    STARTS,
-    RenderArguments,
-    RenderJob,
-    job_name,
-    open_queue,
-    put_back,
-    take,
-)
+from photonfarm.shared.queue.job import FUNCTION, OVERDUE, QUEUE, STARTS, RenderArguments, job_name
 from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
+from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
 
 __all__ = [
@@ -66,6 +57,7 @@ __all__ = [
     "IdleReports",
     "OtherStoreError",
     "QueueStatus",
+    "QueueWorker",
     "RenderArguments",
     "RenderJob",
     "beat",

@@ -11,27 +11,21 @@ from itertools import islice
 
 import redis
 from redis import Redis
-from rq import Queue
-from rq.job import Job
-from rq.worker_registration import REDIS_WORKER_KEYS, WORKERS_BY_QUEUE_KEY
 
 from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.queue.entries import queued_names, running_names, taken_names
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
 from photonfarm.shared.queue.idle_workers import IdleReports, read_idle_reports
-from photonfarm.shared.queue.job import (
-    FAILURE_TTL_S,
-    FUNCTION,
-    OVERDUE,
-    QUEUE,
-    RQ_TIMEOUT_S,
-    STARTS,
+from photonfarm.shared.queue.job import OVERDUE, STARTS, job_name
+from photonfarm.shared.queue.rq_adapter import (
+    EXECUTIONS,
+    JOB,
+    RESULTS,
+    WORKERS,
+    WORKERS_OF_QUEUE,
     RenderQueue,
-    job_name,
     open_queue,
-    queued_names,
-    running_names,
-    taken_names,
 )
 from photonfarm.shared.queue.served_store import serve
 from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
@@ -51,9 +45,9 @@ _logged: dict[str, str] = {}
 """Why scenes were skipped, by scene id: an idle worker looks every few seconds, and logs each reason once."""
 
 _KINDS: dict[str, Kind] = {
-    "rq:job:": "hash",
-    "rq:executions:": "zset",
-    "rq:results:": "stream",
+    JOB: "hash",
+    EXECUTIONS: "zset",
+    RESULTS: "stream",
     STARTS: "counter",
     OVERDUE: "counter",
     FAILURES: "counter",
@@ -136,7 +130,7 @@ def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) ->
     ]
     if wanted:
         beyond = [name for scene_id, names in held.items() for name in names[shares[scene_id] :]]
-        _withdraw(queue, beyond[: max(len(queued) + len(wanted) - limit, 0)])
+        queue.withdraw(beyond[: max(len(queued) + len(wanted) - limit, 0)])  # they stay in the store
         _enqueue(queue, wanted)
     return len(wanted)
 
@@ -176,31 +170,10 @@ def _shares(demand: Mapping[str, int], limit: int) -> dict[str, int]:
     return shares
 
 
-def _withdraw(queue: RenderQueue, names: Sequence[str]) -> None:
-    """Remove jobs from the queue, the last ones of their scene; they stay in the store."""
-    with queue.connection.pipeline(transaction=False) as pipeline:
-        for name in names:
-            pipeline.lrem(queue.key, -1, name)
-            pipeline.unlink(Job.key_for(name))
-        pipeline.execute()
-
-
 def _enqueue(queue: RenderQueue, jobs: Sequence[tuple[str, int]]) -> None:
     names = [job_name(scene_id, job) for scene_id, job in jobs]
     remove_others(queue.connection, {before + name: kind for name in names for before, kind in _KINDS.items()})
-    data = [
-        Queue.prepare_data(
-            FUNCTION,
-            kwargs={"scene_id": scene_id, "job": job},
-            timeout=RQ_TIMEOUT_S,
-            result_ttl=0,  # nothing remains of a finished job: it has its marker
-            failure_ttl=FAILURE_TTL_S,
-            description=f"{scene_id} job {job}",
-            job_id=job_name(scene_id, job),
-        )
-        for scene_id, job in jobs
-    ]
-    queue.enqueue_many(data)
+    queue.add(jobs)
 
 
 def _tidy(queue: RenderQueue, alive: set[str]) -> None:
@@ -212,7 +185,7 @@ def _tidy(queue: RenderQueue, alive: set[str]) -> None:
         if _text(name) not in alive:
             queue.connection.lrem(queue.intermediate_queue_key, 0, name)
     queue.failed_job_registry.cleanup()
-    forget_dead_workers(queue.connection, WORKERS_BY_QUEUE_KEY % QUEUE, REDIS_WORKER_KEYS)
+    forget_dead_workers(queue.connection, WORKERS_OF_QUEUE, WORKERS)
 
 
 def _text(name: bytes) -> str:

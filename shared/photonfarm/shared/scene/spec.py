@@ -10,6 +10,7 @@ import json
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -406,3 +407,25 @@ def find_spec(name: str) -> Path:
         if (folder / f"{name}.toml").is_file():
             return folder / f"{name}.toml"
     raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(BUILTIN_ROOMS)}")
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSpec:
+    """A checked spec under the name that a user gives it."""
+
+    name: str  # as `load_spec` takes it
+    spec: SceneSpec
+    scenes: str | None
+    """The folder that workers must have in PHOTONFARM_SCENES, if the scene file is found beside the spec alone: workers
+    have the store, and not the spec's file."""
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """The spec of a name, as `load_spec` reads it; raises SpecError."""
+        spec = load_spec(name)
+        if spec.scene.file is not None:
+            try:
+                find_scene(spec.scene.file, name)
+            except SpecError:
+                return cls(name, spec, str(find_spec(name).absolute().parent))
+        return cls(name, spec, None)

@@ -1,7 +1,6 @@
-"""The worker's child: an RQ worker that keeps its scenes loaded, and runs our jobs alone.
+"""The worker's child: a worker on the queue that keeps its scenes loaded.
 
-It adds what RQ lacks: a deadline that also ends native code, recycling, and filling the queue when idle. It leaves out
-what RQ has too much of: commands over pub/sub, scheduled jobs, maintenance that loads strangers' jobs.
+It adds what RQ lacks: a deadline that also ends native code, recycling, and filling the queue when idle.
 """
 
 from __future__ import annotations
@@ -13,14 +12,11 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import redis
 from redis import Redis
-from rq import SimpleWorker
-from rq.serializers import JSONSerializer
-from rq.worker.base import StopRequested, WorkerStatus
 
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.backpressure import DiskReserve, TrainerPace, is_full
@@ -37,14 +33,11 @@ from photonfarm.shared.core.errors import (
     SceneNotHereError,
     StoreError,
 )
-from photonfarm.shared.queue import RenderArguments, RenderJob
+from photonfarm.shared.queue import QueueWorker, RenderArguments, RenderJob
 from photonfarm.shared.store import SceneStore, Store
 
 STARTS_ALLOWED = 5
 """The starts of one job without an end after which it counts as failed: it kills its workers."""
-
-RQ_WORKER_TTL_S = 120
-"""The seconds, and one minute more, after which RQ forgets a worker killed while idle; our own heartbeat decides."""
 
 POLL_S = 0.2
 """The seconds between looks at an empty queue."""
@@ -89,21 +82,13 @@ def _end_with_supervisor() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-class RenderWorker(SimpleWorker):
-    """RQ's in-process worker, with our jobs only, a heartbeat, a deadline, and a loop that fills the queue."""
+class RenderWorker(QueueWorker):
+    """A worker that renders, with a heartbeat and a deadline, and fills the queue when idle."""
 
     def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, pipe: int | None = None) -> None:
         """Prepare without registering; `pipe` is a file descriptor that the supervisor reads, if there is one."""
-        self._queue = queue.open_queue(connection)
-        super().__init__(
-            [self._queue],
-            name=f"{settings.name}-{os.getpid()}-{time.time_ns():x}",
-            connection=connection,
-            job_class=RenderJob,
-            serializer=JSONSerializer,
-            log_job_description=False,
-            worker_ttl=RQ_WORKER_TTL_S,
-        )
+        name = f"{settings.name}-{os.getpid()}-{time.time_ns():x}"
+        super().__init__(connection, name, job_ttl_s=int(settings.deadline_s) + 60)
         self._settings = settings
         self._store = store
         self._fatal: PhotonfarmError | None = None
@@ -121,49 +106,21 @@ class RenderWorker(SimpleWorker):
         self._talk = WorkerLog(settings)
         self._pipe = pipe
         self._counts = JobCounts()
+        self._done = 0
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
         self._heart.start()
-        self.bootstrap(logging_level="WARNING")
-        self._install_signal_handlers()
-        done = 0
-        try:
-            while not self._stop_requested:
-                self.heartbeat()
-                job = self._take()
-                if job is None:
-                    if self._fill_or_finish():
-                        return 0
-                    continue
-                self.execute_job(job, self._queue)
-                done += 1
-                if self._fatal:
-                    raise self._fatal
-                worn = done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
-                if worn or self._tainted:
-                    return RECYCLED
-        except StopRequested:
-            pass
-        finally:
-            with contextlib.suppress(redis.RedisError):
-                self._heart.end()
-                self.teardown()
-        return RECYCLED  # for a supervisor that is not to stop itself
+        code = self.work_on()
+        return RECYCLED if code is None else code  # asked to stop: for a supervisor that is not to stop itself
 
-    def subscribe(self) -> None:
-        """Do nothing: by RQ's commands any client of Redis could stop workers and jobs, and nothing needs them."""
-
-    def run_maintenance_tasks(self) -> None:
-        """Do nothing: `reconcile` does the maintenance, without loading strangers' jobs."""
-
-    def get_heartbeat_ttl(self, job: RenderJob) -> int:  # noqa: ARG002
-        """How long RQ's own records of a running job last, in seconds."""
-        return int(self._settings.deadline_s) + 60
+    def on_end(self) -> None:
+        """Remove the heartbeat."""
+        self._heart.end()
 
     # ---------------------------------------------------------------------------------------------------- taking a job
 
-    def _take(self) -> RenderJob | None:
+    def next_job(self) -> RenderJob | None:
         """Take the next job; None if there was none for a while, or none should be taken."""
         queue.serve(self.connection, self._store)
         held_back = self._disk.reason()
@@ -189,6 +146,10 @@ class RenderWorker(SimpleWorker):
         for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
             del self._not_here[scene_id], self._look_again[scene_id]
         return {**ahead, **{scene_id: str(error) for scene_id, error in self._not_here.items()}}
+
+    def on_idle(self) -> int | None:
+        """Fill the queue; 0 if nothing is left to do."""
+        return 0 if self._fill_or_finish() else None
 
     def _fill_or_finish(self) -> bool:
         """Fill the queue from the store, as there is no coordinator; True if there is nothing left to wait for.
@@ -228,16 +189,23 @@ class RenderWorker(SimpleWorker):
 
     # ------------------------------------------------------------------------------------------------------------- jobs
 
-    def execute_job(self, job: RenderJob, queue: Any) -> None:
+    def on_job(self, job: RenderJob, run: Callable[[], None]) -> None:
         """Run one job under a heartbeat and a deadline."""
-        self.set_state(WorkerStatus.BUSY)  # if it is asked to stop from here on, RQ ends the job first
         self._failed = False
         began = time.monotonic()
         with self._heart.working(job.id), self._talk.timing(job.id):
             self._count_start(job)
-            super().execute_job(job, queue)
+            run()
             self._settle(job.id)
         self._count(job.id, time.monotonic() - began)
+
+    def on_done(self) -> int | None:
+        """Raise the error that the next job would meet as well; RECYCLED if a successor should go on."""
+        self._done += 1
+        if self._fatal:
+            raise self._fatal
+        worn = self._done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+        return RECYCLED if worn or self._tainted else None
 
     def _count(self, name: str, seconds: float) -> None:
         """Report the jobs so far to the supervisor, which outlives this process, however it ends."""
@@ -275,30 +243,30 @@ class RenderWorker(SimpleWorker):
         else:
             queue.forget_failures_of(self.connection, name)
 
-    def handle_exception(self, job: RenderJob, kind: type[BaseException], error: BaseException, trace: Any) -> None:  # noqa: ARG002
+    def on_failure(self, name: str, error: BaseException) -> None:
         """Decide the consequences of a failed job: for the job, for this worker, or none."""
-        if self._is_committed(job.id):
-            log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", job.id, error)
+        if self._is_committed(name):
+            log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", name, error)
             return
         self._failed = True
         what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"
         known = isinstance(error, PhotonfarmError | redis.RedisError)
-        log.warning("job %s %s: %s", job.id, what, error, exc_info=None if known else error)
+        log.warning("job %s %s: %s", name, what, error, exc_info=None if known else error)
         if is_full(error):
             self._disk.refused()
         elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
-            scene_id = job.id.rpartition("-")[0]
+            scene_id = name.rpartition("-")[0]
             self._not_here[scene_id] = error
             self._look_again[scene_id] = time.monotonic() + NOT_HERE_S
             log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
         elif (fatal := self._fatal_of(error)) is not None:
             self._fatal = fatal
             with contextlib.suppress(redis.RedisError):
-                queue.put_back(self._queue, job.id)
+                queue.put_back(self._queue, name)
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)
             with contextlib.suppress(redis.RedisError):
-                self._record(job.id, f"{type(error).__name__}: {error}")
+                self._record(name, f"{type(error).__name__}: {error}")
 
     def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
         """The error that the next job would meet as well; if the store is gone, whatever error the job had."""

@@ -11,16 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import click
 from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.shared.core.estimate import stated
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.scene.spec import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
-from photonfarm.trainer.runs import wait_times as waits
 from photonfarm.trainer.runs.run_folder import held
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
 
@@ -42,12 +39,15 @@ def run(
     preset_name: str,
     changes: dict[str, Any],
     redis_url: str | None = None,
+    *,
+    log: Callable[[str], None],
+    on_record: Callable[[dict[str, Any]], None],
 ) -> None:
     """Train on one scene of a store, until the settings' end or SIGTERM; both leave a checkpoint.
 
     The time spent waiting for a scene, its base and its samples counts. With a Redis, the used samples are reported to
     workers. Under torchrun, rank 0 does all this, and the other ranks train with it until it ends; all need the same
-    folder.
+    folder. `log` takes sentences about the service, `on_record` each record of the run's log.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
@@ -63,8 +63,9 @@ def run(
             assist(partial(StoreSource, store), settings, folder, ours)
             return
         with leading(group):
-            click.echo(f"training on {described(device, settings.network.precision)}", err=True)
-            _lead(load_spec(spec).scene_id if spec else None, store, folder, settings, redis_url, stop, group)
+            log(f"training on {described(device, settings.network.precision)}")
+            scene_id = load_spec(spec).scene_id if spec else None
+            _lead(scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
 
 
 def _lead(
@@ -75,6 +76,8 @@ def _lead(
     redis_url: str | None,
     stop: Stop,
     group: TrainingGroup,
+    log: Callable[[str], None],
+    on_record: Callable[[dict[str, Any]], None],
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.trainer.data.store_source import StoreSource
@@ -90,32 +93,32 @@ def _lead(
     with _sign_of_life(folder), event_files(folder) as board:
         began = time.monotonic()
         if is_vacant(store):
-            click.echo(f"waiting for a store and a scene in {store}", err=True)
+            log(f"waiting for a store and a scene in {store}")
         scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
         if scene_id is None:
-            click.echo(f"{store}: no scene to train on has come; nothing was trained", err=True)
+            log(f"{store}: no scene to train on has come; nothing was trained")
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             there = scene_id in Store(store).scene_ids()
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
-            click.echo(f"waiting for scene {scene_id}, {lacks}", err=True)
-        with _reported(redis_url, store, scene_id) as on_draws:
-            logs = [_log_record, *([board.record] if board else [])]
+            log(f"waiting for scene {scene_id}, {lacks}")
+        with _reported(redis_url, store, scene_id, log) as on_draws:
+            followers = [on_record, *([board.record] if board else [])]
             outcome = train(
                 source,
                 settings,
                 folder,
                 Hooks(
                     stop=stop,
-                    on_record=lambda record: [log(record) for log in logs],
+                    on_record=lambda record: [follow(record) for follow in followers],
                     on_draws=on_draws,
                     on_images=board.pictures if board else None,
                     waited=waited,
                     group=group,
                 ),
             )
-    click.echo(f"ended at step {outcome.step}: {outcome.reason}", err=True)
+    log(f"ended at step {outcome.step}: {outcome.reason}")
 
 
 def check(folder: Path) -> None:
@@ -154,7 +157,14 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     return f"{head}\n{table(summary(scene, network))}"
 
 
-def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, changes: dict[str, Any]) -> str:
+def search(
+    spec: str | None,
+    store: str | Path,
+    folder: Path,
+    preset_name: str,
+    changes: dict[str, Any],
+    log: Callable[[str], None],
+) -> str:
     """Run, or resume, a grid search over optimisers, rates and decays on a complete store; returns its table.
 
     Keys that `changes` sets are not searched. Raises SpecError without a spec, unless the store has one scene, for a
@@ -173,7 +183,6 @@ def search(spec: str | None, store: str | Path, folder: Path, preset_name: str, 
         wanted = f" {spec}" if spec else ""
         raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):
-        log = partial(click.echo, err=True)
         axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
         if settings.schedule == "cosine":
             axes["decay"] = (settings.decay,)
@@ -246,13 +255,15 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _reported(redis_url: str | None, store: str | Path, scene_id: str) -> Iterator[Callable[[int, int], None]]:
+def _reported(
+    redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], None]
+) -> Iterator[Callable[[int, int], None]]:
     """A callback for draws and samples of training; a thread reports the used ones to Redis regularly, and at the end.
 
     Each sample counts once, and held-out ones as soon as they are visible. A missing Redis or store is ignored; if the
     Redis serves another store, that is logged once.
     """
-    reporter = _ConsumptionReporter(redis_url, store, scene_id)
+    reporter = _ConsumptionReporter(redis_url, store, scene_id, log)
     ended = threading.Event()
 
     def keep_reporting() -> None:
@@ -272,8 +283,8 @@ def _reported(redis_url: str | None, store: str | Path, scene_id: str) -> Iterat
 class _ConsumptionReporter:
     """Reports a scene's used samples to Redis."""
 
-    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str) -> None:
-        self._url, self._root, self._scene_id = redis_url, store, scene_id
+    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], None]) -> None:
+        self._url, self._root, self._scene_id, self._log = redis_url, store, scene_id, log
         self._store: Store | None = None  # opened with the first numbers: there may be no store before training begins
         self._used: int | None = None  # a resumed run knows it only once it has begun
         self._connection: Redis | None = None
@@ -296,39 +307,7 @@ class _ConsumptionReporter:
             queue.report_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
-                click.echo(f"no worker is told what is used: {error}", err=True)
+                self._log(f"no worker is told what is used: {error}")
             self._refused = True
         except (QueueError, RedisError, StoreError):
             pass
-
-
-def _log_record(record: dict[str, Any]) -> None:
-    if record["kind"] == "changes":
-        changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in record["changes"].items())
-        click.echo(f"goes on from step {record['step']} with {changed}", err=True)
-    if record["kind"] == "loss":
-        click.echo(f"loss {record['loss']} is unbiased: {record['verdict']}", err=True)
-    if record["kind"] == "recovered":
-        click.echo(f"step {record['step']}: {_recovered(record)}", err=True)
-    if record["kind"] == "validation":
-        there = f"on {record['held_out']} of {record['samples']} samples; "
-        click.echo(
-            f"step {record['step']}: held-out error {stated(record['error'], record['standard_error'])} "
-            f"({stated(record['shown_error'], None)} up to white) {there}"
-            + waits.stated(record["waits"], record["samples_per_used"]),
-            err=True,
-        )
-
-
-def _recovered(record: dict[str, Any]) -> str:
-    """Why a run went back, and to which step."""
-    errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
-    if errors is None:
-        found = "the loss is not finite"
-    elif errors["now"] is None:
-        found = "the held-out error is not finite"
-    else:
-        found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
-    if record["cause"] == "end":
-        return f"{found}; ends with {back_to}"
-    return f"{found}; goes on from {back_to}, at {record['rate_factor']:g} of the rate"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -117,17 +118,18 @@ def train(
     each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
     see the same run folder. Exits with 8 if training diverges.
     """
-    from photonfarm.trainer.cli import service
+    from photonfarm.trainer.cli import service, show
 
     instead = [name for name, asked in (("--grid", grid), ("--summary", summary), ("--check", check)) if asked]
     if len(instead) > 1:
         raise click.UsageError(f"{' and '.join(instead)} exclude each other; give one of them")
+    log = partial(click.echo, err=True)
     changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
     if check:
         service.check(run)
     elif grid:
-        click.echo(service.search(spec, store, run, preset, changes))
+        click.echo(service.search(spec, store, run, preset, changes, log))
     elif summary:
         click.echo(service.summarise(spec, store, preset, changes))
     else:
-        service.run(spec, store, run, preset, changes, redis_url)
+        service.run(spec, store, run, preset, changes, redis_url, log=log, on_record=show.record)

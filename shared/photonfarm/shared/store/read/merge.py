@@ -83,6 +83,17 @@ class MergedView:
             return cls(int(stored["passes"]), *images)
 
 
+@dataclass(frozen=True, slots=True)
+class WrittenView:
+    """A merged view in a file of its own, in figures."""
+
+    view: str  # its content key
+    passes: int
+    mean: float  # of all values
+    standard_error: float  # of a value, as the root of its mean square
+    file: str
+
+
 class Moments:
     """Exact sums over passes of one view. Merge those of several workers with `update`, in any order."""
 
@@ -213,6 +224,18 @@ def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tup
         if len(reader.rows_of_view(view_row)) < least:
             continue
         yield reader.view_key(row).hex(), merge_view(reader, view_row)
+
+
+def write_views(views: Iterable[tuple[str, MergedView]], folder: Path) -> Iterator[WrittenView]:
+    """Write merged views, given with their content keys, into a folder, which is made; yields each once it is written.
+
+    Raises StoreError if the disk refuses.
+    """
+    for key, view in views:
+        file = folder / f"{key}.npz"
+        view.write(file)
+        error = float((view.standard_error**2).mean() ** 0.5)
+        yield WrittenView(key, view.passes, float(view.mean.mean()), error, str(file))
 
 
 def merge_view(reader: SceneReader, view_row: int) -> MergedView:

@@ -1,0 +1,43 @@
+"""What `train` prints while it trains."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from photonfarm.shared.core.estimate import stated
+from photonfarm.trainer.runs import wait_times as waits
+
+
+def record(of: dict[str, Any]) -> None:
+    """Print what people want to know of a record of a run's log, if anything."""
+    if of["kind"] == "changes":
+        changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in of["changes"].items())
+        click.echo(f"goes on from step {of['step']} with {changed}", err=True)
+    if of["kind"] == "loss":
+        click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
+    if of["kind"] == "recovered":
+        click.echo(f"step {of['step']}: {_recovered(of)}", err=True)
+    if of["kind"] == "validation":
+        there = f"on {of['held_out']} of {of['samples']} samples; "
+        click.echo(
+            f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
+            f"({stated(of['shown_error'], None)} up to white) {there}"
+            + waits.stated(of["waits"], of["samples_per_used"]),
+            err=True,
+        )
+
+
+def _recovered(record: dict[str, Any]) -> str:
+    """Why a run went back, and to which step."""
+    errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
+    if errors is None:
+        found = "the loss is not finite"
+    elif errors["now"] is None:
+        found = "the held-out error is not finite"
+    else:
+        found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
+    if record["cause"] == "end":
+        return f"{found}; ends with {back_to}"
+    return f"{found}; goes on from {back_to}, at {record['rate_factor']:g} of the rate"

@@ -128,7 +128,7 @@ def _end_with_parent() -> None:
 class ChosenSamples(StoreSource):
     """Samples of a store that are chosen once, to be trained on, and one that is held out.
 
-    A trainer wants one to look at. Whoever derives from it sets `rows`.
+    A trainer wants one to look at. Whoever derives from it sets `chosen`.
     """
 
     def __init__(self, root: str | Path, scene_id: str, share: float) -> None:
@@ -137,7 +137,7 @@ class ChosenSamples(StoreSource):
         complete = super().refresh().tolist()
         held_out = rows_held_out(self, complete, share)
         self.trainable = [row for row, held in zip(complete, held_out, strict=True) if not held]
-        self.rows: list[int] = []
+        self.chosen: list[int] = []
         self._looked_at = [row for row, held in zip(complete, held_out, strict=True) if held][:1]
         self._told = False
         if not self._looked_at:
@@ -145,17 +145,14 @@ class ChosenSamples(StoreSource):
 
     def refresh(self) -> NDArray[np.int64]:
         """The chosen samples at the first call, and the one that is held out; none after it."""
-        new = [] if self._told else [*self.rows, *self._looked_at]
+        new = [] if self._told else [*self.chosen, *self._looked_at]
         self._told = True
         return np.array(new, np.int64)
 
-    def taken_back(self) -> NDArray[np.int64]:
-        """None is."""
-        return np.empty(0, np.int64)
-
+    @property
     def planned(self) -> int:
         """The number of samples that were chosen, and the one that is held out."""
-        return len(self.rows) + 1
+        return len(self.chosen) + 1
 
 
 def add_options(parser: argparse.ArgumentParser, name: str) -> None:

@@ -48,8 +48,8 @@ class FirstSamples(ChosenSamples):
     def __init__(self, root: Path, scene_id: str, samples: int) -> None:
         """Raises ValueError where the store has too few."""
         super().__init__(root, scene_id, HELD_OUT)
-        self.rows = self.trainable[:samples]
-        if len(self.rows) < samples:
+        self.chosen = self.trainable[:samples]
+        if len(self.chosen) < samples:
             raise ValueError(f"{root} has {len(self.trainable)} samples to train on, and {samples} are needed")
 
 
@@ -134,7 +134,7 @@ def _first_rows(source: StoreSource) -> dict[bytes, int]:
 
 def _halves(source: StoreSource, rows: Sequence[int], exposure: float) -> F32:
     """(N, 2, H, W, 3) exposed linear radiance."""
-    read = (source.read_batch([row])[0] for row in rows)
+    read = (source.read_samples([row])[0] for row in rows)
     return np.stack([sample.radiance.astype(np.float32) * np.float32(exposure * sample.scale) for sample in read])
 
 

@@ -39,8 +39,8 @@ from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, f
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
-from photonfarm.trainer.data.store_source import RawSample, StoreSource
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons, units_of
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
@@ -263,7 +263,7 @@ class Stage:
         """The views of some samples, rendered anew."""
         shines, pairs = lamps(self.spec), []
         for index, row in enumerate(rows):
-            (sample,) = source.read_batch([row])
+            (sample,) = source.read_samples([row])
             moved = relit(sample.modification, sample_modification(self.spec, SEED, index), shines)
             pairs.append((self.look(sample.modification, sample.view), self.look(moved, sample.view)))
         return Views(self.spec, self.base, tuple(pairs), tuple(units_of(source, rows)))

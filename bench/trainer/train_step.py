@@ -227,7 +227,7 @@ def reading(where: tuple[Path, str], settings: TrainSettings, size: int) -> Read
     def one_round() -> float:
         began = time.perf_counter()
         for i in range(0, len(rows), settings.batch):
-            source.read_batch(rows[i : i + settings.batch])
+            source.read_samples(rows[i : i + settings.batch])
         return (time.perf_counter() - began) * 1e3 / len(rows)
 
     one_round()

@@ -93,7 +93,7 @@ def slowed(plain: Callable[..., Any], seconds: float) -> Callable[..., Any]:
 
 def test_a_run_that_waits_for_reading_says_so(make_source, tiny, run) -> None:
     source: Any = make_source(24)
-    source.read_batch = slowed(source.read_batch, 0.3)
+    source.read_samples = slowed(source.read_samples, 0.3)
     train(source, tiny(validate_every=100), run)
     last = metrics_log.read(run / METRICS)[-1]
     assert bottleneck(waits(last["seconds"])) == "reading"

@@ -58,18 +58,18 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
 
 
 def configurations(arm: Arm) -> set[bytes]:
-    return set(arm.modification_keys(arm.rows))
+    return set(arm.modification_keys(arm.chosen))
 
 
 @pytest.mark.parametrize("spp", [2, 4, 16])
 def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
     arm, source = Arm(*root, Share(spp, 1, 1), 4), StoreSource(*root)
     complete = source.refresh().tolist()
-    (key,) = arm.view_keys(arm.rows[:1])
+    (key,) = arm.view_keys(arm.chosen[:1])
     passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
-    (sample,) = arm.read_batch(arm.rows[:1])
+    (sample,) = arm.read_samples(arm.chosen[:1])
 
-    read = source.read_batch(passes)
+    read = source.read_samples(passes)
     expected = np.mean([one.radiance.astype(np.float64) * one.scale for one in read], axis=0)
     assert len(read) == spp // 2
     np.testing.assert_allclose(sample.radiance.astype(np.float64) * sample.scale, expected, rtol=1e-6)
@@ -78,18 +78,18 @@ def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: 
 def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view(root: Root) -> None:
     arm = Arm(*root, Share(2, 2, 2), 5)
     assert len(configurations(arm)) == 5
-    assert len(set(arm.view_keys(arm.rows))) == 10
-    assert len(arm.rows) == len(set(arm.rows)) == 20
-    first, second = (arm.read_batch([row])[0].radiance.copy() for row in arm.rows[:2])
-    assert arm.view_keys(arm.rows[:1]) == arm.view_keys(arm.rows[1:2])
+    assert len(set(arm.view_keys(arm.chosen))) == 10
+    assert len(arm.chosen) == len(set(arm.chosen)) == 20
+    first, second = (arm.read_samples([row])[0].radiance.copy() for row in arm.chosen[:2])
+    assert arm.view_keys(arm.chosen[:1]) == arm.view_keys(arm.chosen[1:2])
     assert np.any(first != second), "two passes of one view"
 
 
 def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) -> None:
     arm = Arm(*root, Share(2, 1, 1), 30)
-    assert not any(rows_held_out(arm, arm.rows, HELD_OUT))
+    assert not any(rows_held_out(arm, arm.chosen, HELD_OUT))
     new = arm.refresh().tolist()
-    assert new[:-1] == arm.rows
+    assert new[:-1] == arm.chosen
     assert rows_held_out(arm, new[-1:], HELD_OUT) == [True], "one for the trainer to look at"
     assert not len(arm.refresh())
 

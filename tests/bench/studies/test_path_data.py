@@ -217,7 +217,7 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str
 
 
 def views(source: FirstSamples) -> list[bytes]:
-    return source.view_keys(source.rows)
+    return source.view_keys(source.chosen)
 
 
 def test_both_kinds_are_trained_on_the_same_views(roots: dict[str, tuple[Path, str]]) -> None:
@@ -236,9 +236,9 @@ def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]])
     source = FirstSamples(*roots["path"], 4 * SAMPLES)
     references = References.of(Store(roots["bdpt"][0]), small_spec(), 16, HELD_OUT)
     assert len(references.rows) > 1
-    assert not set(source.modification_keys(source.rows)) & set(references.units)
+    assert not set(source.modification_keys(source.chosen)) & set(references.units)
     *trained_on, looked_at = source.refresh().tolist()
-    assert trained_on == source.rows
+    assert trained_on == source.chosen
     assert are_held_out(source.modification_keys([looked_at]), HELD_OUT) == [True]
 
 

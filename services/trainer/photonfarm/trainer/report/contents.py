@@ -170,7 +170,7 @@ class _CloseLook:
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []
         for row in references.keys() & images.keys():
-            (sample,) = source.read_batch([row])
+            (sample,) = source.read_samples([row])
             read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
             a, b = references[row].half_a, references[row].half_b
             views.append(HeldOutView(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))

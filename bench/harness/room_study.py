@@ -143,6 +143,11 @@ class ChosenSamples(StoreSource):
         if not self._looked_at:
             raise ValueError(f"{root}: none of {len(complete)} samples is held out")
 
+    def follow_guides(self) -> None:
+        """Read guides too; the reader begins anew for them, and looks at what is there once more."""
+        super().follow_guides()
+        super().refresh()
+
     def refresh(self) -> NDArray[np.int64]:
         """The chosen samples at the first call, and the one that is held out; none after it."""
         new = [] if self._told else [*self.chosen, *self._looked_at]

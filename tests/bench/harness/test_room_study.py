@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from analytic_scene import AnalyticScene, small_spec
 from numpy.typing import NDArray
+from store_samples import commit_guides
 
 from bench.harness import room_study
 from bench.harness.contents import Pool, commit
@@ -20,6 +22,7 @@ from bench.harness.room_study import HELD_OUT, References, Run
 from bench.studies.budget_arms import HALF_SPP, Arm, Share, requests
 from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
@@ -92,6 +95,18 @@ def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) 
     assert new[:-1] == arm.chosen
     assert rows_held_out(arm, new[-1:], HELD_OUT) == [True], "one for the trainer to look at"
     assert not len(arm.refresh())
+
+
+def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_path: Path) -> None:
+    scene = Store(shutil.copytree(root[0], tmp_path / "store")).scene(root[1])
+    scene.guides.want(GuideSpec())
+    for job in scene.missing_jobs():
+        commit_guides(scene, job)
+    arm = Arm(tmp_path / "store", root[1], Share(2, 1, 1), 4)
+    arm.follow_guides()
+    rows = arm.refresh().tolist()
+    assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
+    assert all(sample.guides is not None for sample in arm.read_samples(rows))
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -175,19 +175,19 @@ def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     )
 
 
-def opened(told: argparse.Namespace, size: str) -> tuple[Path, Store]:
+def opened(options: argparse.Namespace, size: str) -> tuple[Path, Store]:
     """The folder of a study of this size and plan seed, and its store; looks at `code` before time goes by."""
     tell(f"code {code()}")
-    folder = told.work / f"{size}-plan-{told.plan_seed}"
+    folder = options.work / f"{size}-plan-{options.plan_seed}"
     folder.mkdir(parents=True, exist_ok=True)
     return folder, Store(folder / "store", create=True)
 
 
-def settings_of(told: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
+def settings_of(options: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
     """The preset `small` from a seed, judged after its last step alone."""
     return preset(
-        "small", network={"architecture": told.architecture}, seed=seed, max_steps=told.steps, hold_out=hold_out,
-        recover=False, validate_every=told.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
+        "small", network={"architecture": options.architecture}, seed=seed, max_steps=options.steps, hold_out=hold_out,
+        recover=False, validate_every=options.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
 
 
@@ -328,13 +328,13 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def document(settings: TrainSettings, told: argparse.Namespace, references: References) -> dict[str, Any]:
+def document(settings: TrainSettings, options: argparse.Namespace, references: References) -> dict[str, Any]:
     """What a study's JSON says beside its figures."""
     return {
         "settings": settings.model_dump(mode="json"),
         "code": code(),
-        "seeds": told.seeds,
-        "plan_seed": told.plan_seed,
+        "seeds": options.seeds,
+        "plan_seed": options.plan_seed,
         "reference_spp": references.spp,
         "reference_noise": references.noise(references.spp),
         "units": [unit.hex() for unit in references.units],

@@ -90,16 +90,18 @@ class Planned:
     counts: dict[Share, int]  # configurations
 
 
-def planned(name: str, told: argparse.Namespace) -> Planned:
+def planned(name: str, arguments: argparse.Namespace) -> Planned:
     """Costs are as they were measured first. Raises SpecError, and ValueError where a share buys nothing."""
     spec = spec_of(name)
-    folder, store = room_study.opened(told, f"{name}-{spec.scene_id[:8]}-{told.budget:g}-{len(told.seeds)}")
+    folder, store = room_study.opened(
+        arguments, f"{name}-{spec.scene_id[:8]}-{arguments.budget:g}-{len(arguments.seeds)}"
+    )
     file = folder / "costs.json"
     if not file.is_file():
         (costs,) = in_processes(measured_costs, [(room_study.named_room(name),)], 1, f"{name}: measured costs")
         write_whole(file, costs.json())
     costs = SampleCosts.read(file.read_text())
-    return Planned(name, spec, folder, store, costs, {share: paid(costs, share, told.budget) for share in SHARES})
+    return Planned(name, spec, folder, store, costs, {share: paid(costs, share, arguments.budget) for share in SHARES})
 
 
 def measured_costs(room: SceneSpec) -> SampleCosts:
@@ -118,28 +120,28 @@ def paid(costs: SampleCosts, share: Share, budget: float) -> int:
     return int(budget / one)
 
 
-def measured_room(number: int, plan: Planned, told: argparse.Namespace) -> Room:
+def measured_room(number: int, plan: Planned, arguments: argparse.Namespace) -> Room:
     """Samples, networks and errors of one room, which has a number among all."""
-    held_out = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
-    asked: list[Request | TopUp] = [*requests(plan.counts, len(told.seeds), told.plan_seed), held_out]
-    room_study.render(plan.spec, plan.store, asked, told.processes)
-    references = References.of(plan.store, plan.spec, told.reference_spp)
-    networks = {share: runs(share, plan, told) for share in SHARES}
-    room_study.train_all([run for of_share in networks.values() for run in of_share], told.processes)
+    held_out = TopUp.of(str(arguments.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
+    asked: list[Request | TopUp] = [*requests(plan.counts, len(arguments.seeds), arguments.plan_seed), held_out]
+    room_study.render(plan.spec, plan.store, asked, arguments.processes)
+    references = References.of(plan.store, plan.spec, arguments.reference_spp)
+    networks = {share: runs(share, plan, arguments) for share in SHARES}
+    room_study.train_all([run for of_share in networks.values() for run in of_share], arguments.processes)
     arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
     shown = [(arm.allocation, arm.shown) for arm in arms]
     errors = RoomErrors.of(plan.name, plan.costs.relative_variance, shown, number)
     return Room(plan.name, plan.spec, plan.costs, references, arms, errors)
 
 
-def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
+def runs(share: Share, plan: Planned, arguments: argparse.Namespace) -> list[Run]:
     """The runs of one share of the budget, one from each seed."""
     found = []
-    for number, seed in enumerate(told.seeds):
-        slice_ = number, len(told.seeds)
+    for number, seed in enumerate(arguments.seeds):
+        slice_ = number, len(arguments.seeds)
         source = partial(Arm, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
-        name = f"{share}-{number}-of-{len(told.seeds)}"
-        found.append(Run(source, settings_of(told, seed), plan.folder, name))
+        name = f"{share}-{number}-of-{len(arguments.seeds)}"
+        found.append(Run(source, settings_of(arguments, seed), plan.folder, name))
     return found
 
 
@@ -233,7 +235,7 @@ def in_range(low: float, high: float, grid: F64) -> str:
     return f"{low:.3g}{below} … {high:.3g}{' or more' if high == grid[-1] else ''}"
 
 
-def room_part(room: Room, found: Fit, told: argparse.Namespace) -> str:
+def room_part(room: Room, found: Fit, arguments: argparse.Namespace) -> str:
     """The page's part on one room."""
     costs, film = room.costs, room.spec.film
     return f"""## {room.name}
@@ -250,19 +252,20 @@ with references of {room.references.spp} spp.
 
 {pairs_table(room)}
 
-{optimum(room, found, told.budget)}"""
+{optimum(room, found, arguments.budget)}"""
 
 
-def page(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
+def page(arguments: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
     """The tables as Markdown."""
-    settings = settings_of(told, told.seeds[0])
-    parts = "\n\n".join(room_part(room, found, told) for room in rooms)
+    settings = settings_of(arguments, arguments.seeds[0])
+    parts = "\n\n".join(room_part(room, found, arguments) for room in rooms)
+    seeds = room_study.counted(len(arguments.seeds), "seed")
     kappas, rhos = in_range(*found.kappa_range, KAPPAS), in_range(*found.rho_range, RHOS)
     return f"""# What a budget of core-seconds is best spent on
 
-Every arm is charged {told.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
+Every arm is charged {arguments.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
 samples per pixel (spp) of a pass. For each arm alike {room_study.described(settings)}.
-{room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples, each with other configurations.
+{seeds}, of weights and of the order of samples, each with other configurations.
 
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
 {2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
@@ -270,7 +273,7 @@ charged what it would cost rendered at once, by a line through the times of two 
 below, relative to squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), is that of the
 passes. Passes of a view are samples of their own. **MSE** is in the metric space, the references' noise taken out;
 **linear MSE** in exposed linear radiance.
-{of_intervals(len(told.seeds))}
+{of_intervals(len(arguments.seeds))}
 
 **The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
 b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is
@@ -285,11 +288,11 @@ searched, "or more", "or less", the constant is bounded on one side only, and it
 {parts}"""
 
 
-def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
+def document(arguments: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
     """The figures of noise_budget.json."""
-    settings = settings_of(told, told.seeds[0])
+    settings = settings_of(arguments, arguments.seeds[0])
     of_rooms = {
-        room.name: room_study.document(settings, told, room.references)
+        room.name: room_study.document(settings, arguments, room.references)
         | {
             "costs": asdict(room.costs),
             "arms": [
@@ -302,11 +305,11 @@ def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dic
     }
     model = {"kappa": found.kappa, "rho": found.rho, "kappa_range": found.kappa_range, "rho_range": found.rho_range}
     model |= {"levels": found.levels, "chi2": found.chi2, "freedom": found.freedom}
-    return {"budget_core_s": told.budget, "model": model, "rooms": of_rooms}
+    return {"budget_core_s": arguments.budget, "model": model, "rooms": of_rooms}
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
     parser.add_argument("--budget", type=float, default=200.0, help="core-seconds of each arm (200)")
@@ -318,15 +321,15 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = options()
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        plans = [planned(name, told) for name in told.rooms]
+        plans = [planned(name, arguments) for name in arguments.rooms]
     except (SpecError, ValueError) as error:
         parser.error(str(error))
-    rooms = [measured_room(number, plan, told) for number, plan in enumerate(plans)]
+    rooms = [measured_room(number, plan, arguments) for number, plan in enumerate(plans)]
     found = fit([room.errors for room in rooms])
-    results.write("noise_budget", page(told, rooms, found), document(told, rooms, found), told.out)
+    results.write("noise_budget", page(arguments, rooms, found), document(arguments, rooms, found), arguments.out)
     return 0
 
 

@@ -54,7 +54,7 @@ class Targets:
 class Study:
     """All that was rendered, trained and measured."""
 
-    told: argparse.Namespace
+    arguments: argparse.Namespace
     spec: SceneSpec
     settings: TrainSettings
     costs: Costs

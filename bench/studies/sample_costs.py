@@ -99,14 +99,14 @@ def main() -> int:
     parser = results.parser(__doc__)
     parser.add_argument("--budget", type=float, default=2000.0, help="core-seconds (%(default)s)")
     parser.add_argument("--views", type=int, default=12, help="that are measured of each (%(default)s)")
-    told = parser.parse_args()
+    options = parser.parse_args()
     try:
-        rooms = [measured(name, told.views) for name in names()]
+        rooms = [measured(name, options.views) for name in names()]
     except SpecError as error:
         parser.error(str(error))
     values = {room.name: asdict(room.costs) for room in rooms}
-    document = {"budget_core_s": told.budget, "views": told.views, "kappa": KAPPA, "rho": RHO, "rooms": values}
-    results.write(NAME, page(rooms, told.budget, told.views), document, told.out)
+    document = {"budget_core_s": options.budget, "views": options.views, "kappa": KAPPA, "rho": RHO, "rooms": values}
+    results.write(NAME, page(rooms, options.budget, options.views), document, options.out)
     return 0
 
 

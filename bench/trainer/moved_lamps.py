@@ -278,15 +278,15 @@ def held_out(source: StoreSource, share: float, views: int) -> list[int]:
     return found
 
 
-def measured(name: str, told: argparse.Namespace) -> Room:
+def measured(name: str, arguments: argparse.Namespace) -> Room:
     """An experiment's networks on views whose lamps move. Raises PhotonfarmError where that cannot be."""
-    folder = told.work / name
+    folder = arguments.work / name
     runs = trained_runs(folder)
     store, scene_id = Store(folder / "store"), runs[0][0].scene_id
     source = StoreSource(store.root, scene_id)
     share = min(run.settings.hold_out for group in runs for run in group)  # shares are nested: no run has seen these
-    rows = held_out(source, share, told.views)
-    stage = Stage.of(store, scene_id, told.half_spp)
+    rows = held_out(source, share, arguments.views)
+    stage = Stage.of(store, scene_id, arguments.half_spp)
     if not lamps(stage.spec).any():
         raise SpecError(f"{name}: none of its movable groups shines, and this is about lamps that move")
     candidates = [candidate_of(group, stage.spec, stage.base) for group in runs]
@@ -388,7 +388,7 @@ def _rounded(errors: Errors) -> list[list[float]]:
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--rooms", nargs="+", help="experiments that have run (all whose lamps move)")
     parser.add_argument("--views", type=int, default=16, help="held-out configurations, at most (%(default)s)")
@@ -401,19 +401,19 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = options()
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        names = told.rooms or rooms_that_ran(told.work)
+        names = arguments.rooms or rooms_that_ran(arguments.work)
         for name in names:
-            trained_runs(told.work / name)  # what is wrong should be said before hours go by
-        rooms = [measured(name, told) for name in names]
+            trained_runs(arguments.work / name)  # what is wrong should be said before hours go by
+        rooms = [measured(name, arguments) for name in names]
     except PhotonfarmError as error:
         parser.error(str(error))
     if not rooms:
-        parser.error(f"{told.work}: no experiment whose lamps move has run; `python experiments/run.py` runs them")
-    figures = {"views": told.views, "half_spp": told.half_spp, "rooms": document(rooms)}
-    results.write(NAME, page(rooms, told.half_spp), figures, told.out)
+        parser.error(f"{arguments.work}: no experiment whose lamps move has run; `python experiments/run.py` runs them")
+    figures = {"views": arguments.views, "half_spp": arguments.half_spp, "rooms": document(rooms)}
+    results.write(NAME, page(rooms, arguments.half_spp), figures, arguments.out)
     return 0
 
 

@@ -10,7 +10,6 @@ seconds with a GPU; reading and waiting in seconds, by the feed that training us
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -273,7 +272,7 @@ Images:
 """
 
 
-def page(told: argparse.Namespace, presets: list[Preset]) -> str:
+def page(device: str, presets: list[Preset]) -> str:
     """All of it as Markdown."""
     most = max(points_share(parts) for row in presets[-1].rows for parts in (row.step_parts_ms, row.image_parts_ms))
     waiting = max(row.wait_share for row in presets[0].rows)
@@ -284,7 +283,7 @@ def page(told: argparse.Namespace, presets: list[Preset]) -> str:
 Waiting for data takes at most {waiting:.1%} of a step with `small`; 5 % are allowed. Light transport, projection and
 photon map take at most {most:.1%} of the U-Net's time at the supplement's sizes; 15 % are allowed.
 
-`room` on the device `{told.device}`, one thread. Parts are measured by themselves, so that their shares need not sum to
+`room` on the device `{device}`, one thread. Parts are measured by themselves, so that their shares need not sum to
 100 %; the rest is the loss, rays, and what joins the parts. **Points over U-Net** is point branch, projection and
 photon map over the U-Net's time. Medians of turns. Reading is a thread's, which works ahead on the same processor
 cores; waiting is what is left of it in a run, as a share of the steps' time.
@@ -314,16 +313,17 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=100, help="of the run whose waiting is measured (100)")
     parser.add_argument("--repetitions", type=int, default=15)
     parser.add_argument("--paper-batch", type=int, default=1, help="at the supplement's sizes (1)")
-    told = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    small = preset("small", device=told.device)
-    paper = preset("paper-dynamic", device=told.device, batch=told.paper_batch)
-    fewer = Clock(told.device, -(-told.repetitions // 5))
+    small = preset("small", device=options.device)
+    paper = preset("paper-dynamic", device=options.device, batch=options.paper_batch)
+    fewer = Clock(options.device, -(-options.repetitions // 5))
     presets = [
-        measure_preset("small", 64, small, Clock(told.device, told.repetitions), told.steps),
-        measure_preset("paper-dynamic", 256, paper, fewer, -(-told.steps // 20)),
+        measure_preset("small", 64, small, Clock(options.device, options.repetitions), options.steps),
+        measure_preset("paper-dynamic", 256, paper, fewer, -(-options.steps // 20)),
     ]
-    results.write("train_step", page(told, presets), {"presets": [document(of) for of in presets]}, told.out)
+    values = {"presets": [document(of) for of in presets]}
+    results.write("train_step", page(options.device, presets), values, options.out)
     return 0
 
 

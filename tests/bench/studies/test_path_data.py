@@ -182,7 +182,7 @@ def test_the_page_and_its_figures_and_the_picture_are_made(seeds: tuple[int, ...
 def test_budgets_are_of_measured_core_seconds() -> None:
     found, targets = study()
     dearer = Study(
-        found.told, found.spec, found.settings, found.costs,
+        found.arguments, found.spec, found.settings, found.costs,
         {**found.made, "path": Rendered(Path("path"), 22, 1.6, 0)}, found.references, found.measured,
     )  # fmt: skip
     assert found.budgets == pytest.approx(list(ARMS))

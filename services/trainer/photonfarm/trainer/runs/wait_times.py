@@ -61,7 +61,7 @@ class Stopwatch:
             self.turn(before)
 
 
-def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
+def wait_shares(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
     """The shares of the time since `before` in which training waited, for samples to be rendered, and to be read."""
     spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
     total = max(sum(spent.values()), 1e-9)
@@ -69,7 +69,7 @@ def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> d
 
 
 def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """The part that takes most of the time, by `waits`; the rest of the time is training."""
+    """The part that takes most of the time, by `wait_shares`; the rest of the time is training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])

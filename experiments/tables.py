@@ -35,12 +35,12 @@ from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, Table
+from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Published, PublishedTable
 from photonfarm.trainer.report.tables import with_interval
 
 T = TypeVar("T")
 
-PARTS: Mapping[Part, tuple[str, Table]] = {
+PARTS: Mapping[Part, tuple[str, PublishedTable]] = {
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
     "movable": ("Table 2: movable objects and lights; the lights that move are all the light", MOVABLE_LIGHTS),
     "daylight": ("The rooms of Table 2 by day: windows and sky add light that does not move", MOVABLE_LIGHTS),
@@ -71,7 +71,7 @@ COLUMNS = {
 """Heads of the columns, and whether the paper has such a one."""
 
 
-def paper_table(rooms: Sequence[Room], published: Table) -> str:
+def paper_table(rooms: Sequence[Room], published: PublishedTable) -> str:
     """The paper's columns, each a mean over the rooms that have the row; the published figure beside each."""
     head = ["architecture"]
     for column, is_published in COLUMNS.items():
@@ -157,7 +157,7 @@ def mean(estimates: Sequence[Estimate]) -> Estimate:
 # ---------------------------------------------------------------------------------------------------------- the order
 
 
-def order_table(rooms: Sequence[Room], published: Table) -> str:
+def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
     """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
     head = ("pair", "paper: gap", *(f"{room.name}: gap (95 %; each seed)" for room in rooms))
     lines = []

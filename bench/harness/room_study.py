@@ -264,7 +264,7 @@ def _train(source: Callable[[], SampleSource], settings: TrainSettings, folder: 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class References:
+class ReferenceViews:
     """Views of held-out configurations with all their passes merged, in two halves that are independent."""
 
     rows: tuple[int, ...]  # the first sample of each view
@@ -273,7 +273,7 @@ class References:
     spp: int  # of both halves together, of the view that has fewest
 
     @classmethod
-    def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> References:
+    def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> ReferenceViews:
         """Those of held-out configurations that have `spp` at least; `share` of all are held out."""
         reader, source = SceneReader(store.root, spec.scene_id), StoreSource(store.root, spec.scene_id)
         reader.refresh()
@@ -328,7 +328,7 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def document(settings: TrainSettings, options: argparse.Namespace, references: References) -> dict[str, Any]:
+def document(settings: TrainSettings, options: argparse.Namespace, references: ReferenceViews) -> dict[str, Any]:
     """What a study's JSON says beside its figures."""
     return {
         "settings": settings.model_dump(mode="json"),

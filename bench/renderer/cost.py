@@ -34,7 +34,7 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MethodCost:
     """One method; times are CPU seconds of a render call."""
 
     method: str
@@ -45,7 +45,7 @@ class Row:
     cost_to: float
 
 
-def measure(scene: Any, spp: int, repetitions: int) -> list[Row]:
+def measure(scene: Any, spp: int, repetitions: int) -> list[MethodCost]:
     """Every method on one scene, in turn."""
     import mitsuba as mi
 
@@ -63,11 +63,11 @@ def measure(scene: Any, spp: int, repetitions: int) -> list[Row]:
     for name in METHODS:
         ratios = [turn[name] / turn["path"] for turn in turns]
         middle = statistics.median(turn[name] for turn in turns)
-        rows.append(Row(name, first[name], middle, statistics.median(ratios), min(ratios), max(ratios)))
+        rows.append(MethodCost(name, first[name], middle, statistics.median(ratios), min(ratios), max(ratios)))
     return rows
 
 
-def page(scene: str, size: int, spp: int, repetitions: int, rows: list[Row]) -> str:
+def page(scene: str, size: int, spp: int, repetitions: int, rows: list[MethodCost]) -> str:
     """The table as Markdown."""
     header = ("method", "CPU ms an image", "cost of a sample over `path`", "least … greatest", "first call, CPU s")
     lines = [

@@ -46,7 +46,7 @@ SHARES = (
 )  # fmt: skip
 
 
-class Arm(ChosenSamples):
+class ArmSamples(ChosenSamples):
     """The training samples of one share: some configurations of a store, each with what the share gives it.
 
     A sample's halves are means of the halves of `spp` / 2 passes of its view. An arm of a slice holds every `slices`-th

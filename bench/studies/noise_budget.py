@@ -27,9 +27,9 @@ import torch
 
 from bench.harness import results, room_study
 from bench.harness.network_errors import F64, Errors, each_seed, of_intervals, stated, within
-from bench.harness.room_study import HELD_OUT, References, Run, in_processes, settings_of
+from bench.harness.room_study import HELD_OUT, ReferenceViews, Run, in_processes, settings_of
 from bench.harness.scenes import in_passes
-from bench.studies.budget_arms import HALF_SPP, SHARES, Arm, Share, requests
+from bench.studies.budget_arms import HALF_SPP, SHARES, ArmSamples, Share, requests
 from bench.studies.budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.errors import SpecError
@@ -47,7 +47,7 @@ TIMED_VIEWS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredShare:
     """Networks of one share of the budget, one from each seed."""
 
     share: Share
@@ -62,14 +62,14 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Room:
+class BudgetStudy:
     """A room with all its arms."""
 
     name: str
     spec: SceneSpec
     costs: SampleCosts
-    references: References
-    arms: tuple[Measured, ...]
+    references: ReferenceViews
+    arms: tuple[MeasuredShare, ...]
     errors: RoomErrors  # of the arms, in their order
 
 
@@ -120,18 +120,18 @@ def paid(costs: SampleCosts, share: Share, budget: float) -> int:
     return int(budget / one)
 
 
-def measured_room(number: int, plan: Planned, arguments: argparse.Namespace) -> Room:
+def measured_room(number: int, plan: Planned, arguments: argparse.Namespace) -> BudgetStudy:
     """Samples, networks and errors of one room, which has a number among all."""
     held_out = TopUp.of(str(arguments.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
     asked: list[Request | TopUp] = [*requests(plan.counts, len(arguments.seeds), arguments.plan_seed), held_out]
     room_study.render(plan.spec, plan.store, asked, arguments.processes)
-    references = References.of(plan.store, plan.spec, arguments.reference_spp)
+    references = ReferenceViews.of(plan.store, plan.spec, arguments.reference_spp)
     networks = {share: runs(share, plan, arguments) for share in SHARES}
     room_study.train_all([run for of_share in networks.values() for run in of_share], arguments.processes)
     arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
     shown = [(arm.allocation, arm.shown) for arm in arms]
     errors = RoomErrors.of(plan.name, plan.costs.relative_variance, shown, number)
-    return Room(plan.name, plan.spec, plan.costs, references, arms, errors)
+    return BudgetStudy(plan.name, plan.spec, plan.costs, references, arms, errors)
 
 
 def runs(share: Share, plan: Planned, arguments: argparse.Namespace) -> list[Run]:
@@ -139,26 +139,26 @@ def runs(share: Share, plan: Planned, arguments: argparse.Namespace) -> list[Run
     found = []
     for number, seed in enumerate(arguments.seeds):
         slice_ = number, len(arguments.seeds)
-        source = partial(Arm, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
+        source = partial(ArmSamples, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
         name = f"{share}-{number}-of-{len(arguments.seeds)}"
         found.append(Run(source, settings_of(arguments, seed), plan.folder, name))
     return found
 
 
-def measure(share: Share, plan: Planned, networks: Sequence[Run], references: References) -> Measured:
+def measure(share: Share, plan: Planned, networks: Sequence[Run], references: ReferenceViews) -> MeasuredShare:
     """Look at the held-out views with networks that are trained on one share of the budget."""
     where = plan.folder / "store", plan.spec.scene_id
     made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
     shown = Errors(np.stack([references.shown_errors(images) for images in made]), references.units)
     linear = Errors(np.stack([references.linear_errors(images) for images in made]), references.units)
     room_study.tell(f"{share}: {each_seed(shown)}")
-    return Measured(share, plan.counts[share], shown, linear)
+    return MeasuredShare(share, plan.counts[share], shown, linear)
 
 
 # --------------------------------------------------------------------------------------------------------------- page
 
 
-def table(room: Room, found: Fit) -> str:
+def table(room: BudgetStudy, found: Fit) -> str:
     """The arms, their errors, and the model's."""
     header = (
         "spp of a sample", "views of a configuration", "passes of a view", "configurations", "samples", "MSE (95 %)",
@@ -175,7 +175,7 @@ def table(room: Room, found: Fit) -> str:
     return results.table(header, lines)
 
 
-def pairs_table(room: Room) -> str:
+def pairs_table(room: BudgetStudy) -> str:
     """Every arm against the best, on the same views."""
     best = min(room.arms, key=lambda arm: arm.shown.estimate().mean)
     lines = []
@@ -189,7 +189,7 @@ def pairs_table(room: Room) -> str:
     return said + results.table(("share", "more MSE (95 %)", "of each seed", "it is"), lines)
 
 
-def levels(room: Room, found: Fit) -> str:
+def levels(room: BudgetStudy, found: Fit) -> str:
     """What of the errors the model takes for excess, which alone the shares of a budget change, in words."""
     a, b = found.levels[room.name]
     beyond = [(model - a) / model for model in found.predicted(room.errors)]
@@ -201,7 +201,7 @@ def levels(room: Room, found: Fit) -> str:
     )
 
 
-def optimum(room: Room, found: Fit, budget: float) -> str:
+def optimum(room: BudgetStudy, found: Fit, budget: float) -> str:
     """What was measured to be best in this room, and what the model says is, in words."""
     first, of_arms = room.errors.best()
     terms = CostModel(room.costs, found.kappa, found.rho)
@@ -217,7 +217,7 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
     )
 
 
-def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
+def best_of_replicates(room: BudgetStudy, found: Fit, budget: float) -> list[Allocation]:
     """What the model says is best in a room, by the constants of each replicate."""
     best = cache(lambda kappa, rho: CostModel(room.costs, kappa, rho).best(budget))
     return [best(kappa, rho) for kappa, rho in found.constants]
@@ -235,7 +235,7 @@ def in_range(low: float, high: float, grid: F64) -> str:
     return f"{low:.3g}{below} … {high:.3g}{' or more' if high == grid[-1] else ''}"
 
 
-def room_part(room: Room, found: Fit, arguments: argparse.Namespace) -> str:
+def room_part(room: BudgetStudy, found: Fit, arguments: argparse.Namespace) -> str:
     """The page's part on one room."""
     costs, film = room.costs, room.spec.film
     return f"""## {room.name}
@@ -255,7 +255,7 @@ with references of {room.references.spp} spp.
 {optimum(room, found, arguments.budget)}"""
 
 
-def page(arguments: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
+def page(arguments: argparse.Namespace, rooms: Sequence[BudgetStudy], found: Fit) -> str:
     """The tables as Markdown."""
     settings = settings_of(arguments, arguments.seeds[0])
     parts = "\n\n".join(room_part(room, found, arguments) for room in rooms)
@@ -288,7 +288,7 @@ searched, "or more", "or less", the constant is bounded on one side only, and it
 {parts}"""
 
 
-def document(arguments: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
+def document(arguments: argparse.Namespace, rooms: Sequence[BudgetStudy], found: Fit) -> dict[str, Any]:
     """The figures of noise_budget.json."""
     settings = settings_of(arguments, arguments.seeds[0])
     of_rooms = {

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from bench.harness import results, room_study
 from bench.harness.network_errors import Errors, each_seed
-from bench.harness.room_study import ChosenSamples, References, Run, settings_of
+from bench.harness.room_study import ChosenSamples, ReferenceViews, Run, settings_of
 from bench.studies import path_data_page, path_scene
-from bench.studies.path_data_study import BLOCK, Arm, Measured, Study, Targets
+from bench.studies.path_data_study import BLOCK, Arm, MeasuredArm, Study, Targets
 from bench.studies.path_scene import Rendered
 from experiments.experiment import Experiment
 from photonfarm.shared.core.errors import SpecError
@@ -94,14 +94,14 @@ def runs(arm: Arm, made: Rendered, where: tuple[Path, str], arguments: argparse.
     return [Run(source, settings_of(arguments, seed, HELD_OUT), folder, name) for seed in arguments.seeds]
 
 
-def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: References) -> Measured:
+def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: ReferenceViews) -> MeasuredArm:
     """Look at held-out views with an arm's networks, one from each seed; `where` is bdpt's store and the scene."""
     made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
 
     def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
         return Errors(np.stack([error(images) for images in made]), references.units)
 
-    found = Measured(
+    found = MeasuredArm(
         arm,
         train_s=sum(run.seconds() for run in networks) / len(networks),
         shown=each(references.shown_errors),
@@ -116,7 +116,7 @@ def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], referenc
 # ------------------------------------------------------------------------------------------------------------ targets
 
 
-def targets(made: dict[str, Rendered], spec: SceneSpec, references: References) -> Targets:
+def targets(made: dict[str, Rendered], spec: SceneSpec, references: ReferenceViews) -> Targets:
     """What both kinds of samples show of the views that both stores have, as they are before training."""
     sources = {kind: StoreSource(one.root, spec.scene_id) for kind, one in made.items()}
     first = {kind: _first_rows(source) for kind, source in sources.items()}
@@ -166,7 +166,7 @@ def main() -> int:
     folder, store = room_study.opened(arguments, f"{arguments.experiment}-{spec.scene_id[:8]}-{arguments.samples}")
     costs = path_scene.costs_of(spec, folder)
     made = path_scene.render(spec, (folder, store), requests(arguments), costs, arguments.processes)
-    references = References.of(store, spec, arguments.reference_spp, HELD_OUT)
+    references = ReferenceViews.of(store, spec, arguments.reference_spp, HELD_OUT)
     networks = {arm: runs(arm, made[arm.kind], (folder, spec.scene_id), arguments) for arm in arms(arguments)}
     room_study.train_all([run for arm in reversed(networks) for run in networks[arm]], arguments.processes)
     seen_in = made["bdpt"].root, spec.scene_id

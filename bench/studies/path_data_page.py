@@ -14,7 +14,7 @@ from bench.harness.mosaic import Column, mosaic
 from bench.harness.network_errors import Errors, each_seed, of_intervals, stated
 from bench.studies import path_statistics
 from bench.studies.path_data_study import BLOCK, METRICS, Study, Targets
-from bench.studies.path_statistics import Bias, Found
+from bench.studies.path_statistics import Bias, BudgetFactor
 from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 SHOWN = (0.3, 0.6, 0.8, 0.95)  # quantiles of the error of bdpt at budget 1: these views are shown
@@ -27,12 +27,12 @@ def in_words(factor: float, budgets: Sequence[float]) -> str:
     return f"{factor:.2f}" if math.isfinite(factor) else f"more than {budgets[-1]:.2f}"
 
 
-def in_interval(found: Found) -> str:
+def in_interval(found: BudgetFactor) -> str:
     """A ratio and its 95 % interval."""
     return f"{found.value:.2f} ({found.low:.2f} … {found.high:.2f})"
 
 
-def within_words(found: Found, budgets: Sequence[float]) -> str:
+def within_words(found: BudgetFactor, budgets: Sequence[float]) -> str:
     """The 95 % interval of a factor."""
     return f"{in_words(found.low, budgets)} … {in_words(found.high, budgets)}"
 
@@ -270,7 +270,7 @@ def document(study: Study, targets: Targets) -> dict[str, Any]:
     }
 
 
-def in_json(found: Found, of_seeds: Sequence[float]) -> dict[str, Any]:
+def in_json(found: BudgetFactor, of_seeds: Sequence[float]) -> dict[str, Any]:
     """A factor as JSON has it, which knows no infinity."""
     finite = {name: value if math.isfinite(value) else None for name, value in asdict(found).items()}
     return {**finite, "of_seeds": [value if math.isfinite(value) else None for value in of_seeds]}

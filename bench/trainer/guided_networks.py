@@ -113,7 +113,7 @@ def measured(name: str, told: argparse.Namespace) -> list[Result]:
         for seed in told.seeds
     }
     room_study.train_all(list(runs.values()), told.processes)
-    references = room_study.References.of(store, spec, told.reference_spp, HOLD_OUT)
+    references = room_study.ReferenceViews.of(store, spec, told.reference_spp, HOLD_OUT)
     source = functools.partial(StoreSource, store.root, spec.scene_id)
     frames = frame_seconds({name: runs[name, told.seeds[0]] for name in told.candidates}, source, references.rows)
     found = []
@@ -174,7 +174,7 @@ def frame_seconds(
     return {name: seconds.median for name, seconds in zip(runs, by_turns(calls), strict=True)}
 
 
-def _by_configuration(errors: NDArray[np.float64], references: room_study.References) -> NDArray[np.float64]:
+def _by_configuration(errors: NDArray[np.float64], references: room_study.ReferenceViews) -> NDArray[np.float64]:
     return np.array(group_means(errors, references.units))
 
 

@@ -49,7 +49,7 @@ PARTS = ("copy", "point branch", "projection", "photon map", "U-Net", "optimiser
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ArchitectureTimes:
     """One architecture; milliseconds per batch."""
 
     architecture: str
@@ -83,11 +83,11 @@ class Preset:
     name: str
     size: int
     settings: TrainSettings
-    rows: list[Row]
+    rows: list[ArchitectureTimes]
     reading: Reading
 
 
-class Clock:
+class WorkTimer:
     """Milliseconds of a piece of work: CPU time, or time on a GPU until it has done what it was given."""
 
     def __init__(self, device: str, repetitions: int) -> None:
@@ -124,7 +124,7 @@ def filled(spec: SceneSpec, root: Path) -> str:
     return scene.scene_id
 
 
-def measure(where: tuple[Path, str], settings: TrainSettings, clock: Clock, steps: int) -> Row:
+def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, steps: int) -> ArchitectureTimes:
     """One architecture on a complete store."""
     with Feed(StoreSource(*where), settings) as feed:
         rows = [row for row, _ in feed.arrivals()[0]]
@@ -133,14 +133,14 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: Clock, step
         batch = feed.take()
         step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))
         parameters = sum(w.numel() for w in learner.network.parameters())
-    return Row(
+    return ArchitectureTimes(
         settings.network.architecture, parameters, step.pop(WHOLE), image.pop(WHOLE), step, image,
         fed_ms(where, settings) * settings.batch, wait_share(where, settings, steps),
     )  # fmt: skip
 
 
 def timed(
-    learner: Learner, batch: TrainingBatch, device: torch.device, clock: Clock, *, gradients: bool
+    learner: Learner, batch: TrainingBatch, device: torch.device, clock: WorkTimer, *, gradients: bool
 ) -> dict[str, float]:
     """A step, or an image, and its parts, each by itself."""
     network = learner.network
@@ -248,7 +248,7 @@ def for_architecture(settings: TrainSettings, architecture: str) -> TrainSetting
 def preset_section(found: Preset) -> str:
     """The tables of one preset as Markdown."""
 
-    def line(row: Row, whole: float, parts: dict[str, float]) -> list[str]:
+    def line(row: ArchitectureTimes, whole: float, parts: dict[str, float]) -> list[str]:
         shares = [f"{parts[part] / whole:.0%}" if part in parts else "" for part in PARTS]
         rest = 1 - sum(parts.values()) / whole
         return [f"`{row.architecture}`", f"{whole:.1f}", *shares, f"{round(100 * rest)}%", f"{points_share(parts):.1%}"]
@@ -297,7 +297,7 @@ network takes, in float32, exposed, with the configuration's points and photons.
 {results.table(("size", "as stored", *(f"`{name}`" for name in shown())), fed)}"""
 
 
-def measure_preset(name: str, size: int, settings: TrainSettings, clock: Clock, steps: int) -> Preset:
+def measure_preset(name: str, size: int, settings: TrainSettings, clock: WorkTimer, steps: int) -> Preset:
     """All architectures, on a store of their own."""
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder), filled(resized(size, settings.network.points), Path(folder))
@@ -317,9 +317,9 @@ def main() -> int:
     torch.set_num_threads(1)
     small = preset("small", device=options.device)
     paper = preset("paper-dynamic", device=options.device, batch=options.paper_batch)
-    fewer = Clock(options.device, -(-options.repetitions // 5))
+    fewer = WorkTimer(options.device, -(-options.repetitions // 5))
     presets = [
-        measure_preset("small", 64, small, Clock(options.device, options.repetitions), options.steps),
+        measure_preset("small", 64, small, WorkTimer(options.device, options.repetitions), options.steps),
         measure_preset("paper-dynamic", 256, paper, fewer, -(-options.steps // 20)),
     ]
     values = {"presets": [document(of) for of in presets]}

@@ -18,8 +18,8 @@ from store_samples import commit_guides
 from bench.harness import room_study
 from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors
-from bench.harness.room_study import HELD_OUT, References, Run
-from bench.studies.budget_arms import HALF_SPP, Arm, Share, requests
+from bench.harness.room_study import HELD_OUT, ReferenceViews, Run
+from bench.studies.budget_arms import HALF_SPP, ArmSamples, Share, requests
 from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import GuideSpec
@@ -60,13 +60,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
     return Path(store.root), spec.scene_id
 
 
-def configurations(arm: Arm) -> set[bytes]:
+def configurations(arm: ArmSamples) -> set[bytes]:
     return set(arm.modification_keys(arm.chosen))
 
 
 @pytest.mark.parametrize("spp", [2, 4, 16])
 def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
-    arm, source = Arm(*root, Share(spp, 1, 1), 4), StoreSource(*root)
+    arm, source = ArmSamples(*root, Share(spp, 1, 1), 4), StoreSource(*root)
     complete = source.refresh().tolist()
     (key,) = arm.view_keys(arm.chosen[:1])
     passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
@@ -79,7 +79,7 @@ def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: 
 
 
 def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view(root: Root) -> None:
-    arm = Arm(*root, Share(2, 2, 2), 5)
+    arm = ArmSamples(*root, Share(2, 2, 2), 5)
     assert len(configurations(arm)) == 5
     assert len(set(arm.view_keys(arm.chosen))) == 10
     assert len(arm.chosen) == len(set(arm.chosen)) == 20
@@ -89,7 +89,7 @@ def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view
 
 
 def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) -> None:
-    arm = Arm(*root, Share(2, 1, 1), 30)
+    arm = ArmSamples(*root, Share(2, 1, 1), 30)
     assert not any(rows_held_out(arm, arm.chosen, HELD_OUT))
     new = arm.refresh().tolist()
     assert new[:-1] == arm.chosen
@@ -102,7 +102,7 @@ def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_
     scene.guides.want(GuideSpec())
     for job in scene.missing_jobs():
         commit_guides(scene, job)
-    arm = Arm(tmp_path / "store", root[1], Share(2, 1, 1), 4)
+    arm = ArmSamples(tmp_path / "store", root[1], Share(2, 1, 1), 4)
     arm.follow_guides()
     rows = arm.refresh().tolist()
     assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
@@ -111,7 +111,7 @@ def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root: Root, number: int) -> None:
-    arms = [Arm(*root, Share(spp, 1, 1), count, (number, 2)) for spp, count in ((2, 16), (4, 8), (16, 3))]
+    arms = [ArmSamples(*root, Share(spp, 1, 1), count, (number, 2)) for spp, count in ((2, 16), (4, 8), (16, 3))]
     noisy, medium, clean = map(configurations, arms)
 
     assert [len(noisy), len(medium), len(clean)] == [16, 8, 3]
@@ -119,14 +119,14 @@ def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root:
 
 
 def test_slices_share_no_configuration(root: Root) -> None:
-    first, second = (configurations(Arm(*root, Share(4, 1, 1), 8, (number, 2))) for number in (0, 1))
+    first, second = (configurations(ArmSamples(*root, Share(4, 1, 1), 8, (number, 2))) for number in (0, 1))
     assert len(first) == len(second) == 8
     assert not first & second
 
 
 def test_an_arm_of_more_configurations_than_there_are_is_refused(root: Root) -> None:
     with pytest.raises(ValueError, match="configurations have 1 views of 8 passes, and 64 are needed"):
-        Arm(*root, Share(16, 1, 1), 64)
+        ArmSamples(*root, Share(16, 1, 1), 64)
 
 
 def test_what_is_rendered_is_enough_for_every_share_and_slice() -> None:
@@ -149,7 +149,7 @@ def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(
     parser = argparse.ArgumentParser()
     room_study.add_options(parser, "test")
     told = parser.parse_args(["--steps", "2", "--architecture", "cnn"])
-    source = partial(Arm, *root, Share(2, 1, 1), 8)
+    source = partial(ArmSamples, *root, Share(2, 1, 1), 8)
     runs = [Run(source, room_study.settings_of(told, seed), tmp_path, "few") for seed in (0, 1)]
     room_study.train_all(runs[:1], 1)
     assert [run.is_at_its_end() for run in runs] == [True, False]
@@ -165,13 +165,13 @@ def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(
 # ------------------------------------------------------------------------------------------------------------- errors
 
 
-def noisy_references(noise: float) -> tuple[References, F32]:
+def noisy_references(noise: float) -> tuple[ReferenceViews, F32]:
     """Sixteen views of halves with normal noise, and the clean images, in the middle of what a display shows."""
     rng = np.random.default_rng(2)
     clean = rng.uniform(0.4, 0.6, (16, 32, 32, 3))
     halves = clean[:, None] + rng.normal(0, noise, (16, 2, 32, 32, 3))
     units = tuple(bytes([number]) * 16 for number in range(16))
-    return References(tuple(range(16)), units, halves.astype(np.float32), 64), clean.astype(np.float32)
+    return ReferenceViews(tuple(range(16)), units, halves.astype(np.float32), 64), clean.astype(np.float32)
 
 
 def shown(image: F32) -> NDArray[np.float64]:

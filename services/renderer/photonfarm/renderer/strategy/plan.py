@@ -12,6 +12,7 @@ from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost, candidates_at_equal_cost, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Log, Measurement, measure, present
+from photonfarm.renderer.strategy.output.spec_file import SpecTables
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
@@ -20,9 +21,6 @@ SIMILAR = 4.0
 The choice depends on an image's fixed part, which matters if samples are few. A written plan keeps the time, up to a
 sample.
 """
-
-Settings = Mapping[str, Mapping[str, int | float]]
-"""Table of a spec → key → number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +38,7 @@ class TransportPlan:
     halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> SpecTables:
         """The planned tables of the spec."""
         return {
             "transport": {
@@ -52,7 +50,7 @@ class TransportPlan:
         }
 
     @property
-    def changes(self) -> Settings:
+    def changes(self) -> SpecTables:
         """The planned tables that differ from the spec's present ones."""
         now = {"transport": self.spec.transport.model_dump(), "photons": self.spec.photons.model_dump()}
         return {table: keys for table, keys in self.settings.items() if now[table] != now[table] | dict(keys)}

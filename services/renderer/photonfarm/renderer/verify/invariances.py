@@ -21,7 +21,7 @@ import numpy as np
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, Scene
+from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
 from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
 from photonfarm.renderer.verify.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
@@ -129,7 +129,7 @@ def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], Scene]]:
+def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], SceneDict]]:
     """Scenes by name: the quick ones, and for the long version also those in ``more``."""
     names = (*quick, *more) if long else quick
     return {name.replace("_", "-"): hard_scenes.HARD_SCENES[name] for name in names}
@@ -138,7 +138,7 @@ def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> d
 # ------------------------------------------------ The checks ------------------------------------------------
 
 
-def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def equal_means(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare every pair of counts with the usual one at more samples. The path tracer (0, 0) may be noisy."""
     scene = load(build(effort.size))
     truth = _images(scene, ALL[0], effort, TRUTH_SEEDS, effort.truth_spp)
@@ -151,7 +151,7 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
     return faults, "; ".join(ratios)
 
 
-def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def additive(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare all lights with the even ones plus the odd ones, each switched off in place."""
     scene = load(build(effort.size))
     parameters = mi.traverse(scene)
@@ -170,7 +170,7 @@ def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
     return faults, f"{_ratio(test)}; the halves are {shares[0]:.1%} and {shares[1]:.1%}"
 
 
-def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def linear(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare radiances times 8 with the same seed, where only the exponent changes; and times 3 with other seeds."""
     scene = load(build(effort.size))
     before = _images(scene, ALL[0], effort, 0)
@@ -204,7 +204,7 @@ def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
     )
 
 
-def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def update_equals_reload(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Dim the light, then move a box and the camera, in place and in the description, and compare.
 
     The light must match bit by bit. Embree stores moved meshes otherwise than new ones, and Mitsuba inverts a camera's
@@ -239,7 +239,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     return faults, f"with one seed: {figures}; with others {_ratio(test)}"
 
 
-def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def reproducible(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Render a seed twice, another between, and several at once: bit by bit equal, for each of the usual counts."""
     scene = load(build(effort.size))
     faults = []
@@ -258,7 +258,7 @@ def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[st
     return faults, f"{len(ALL)} settings"
 
 
-def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def recorded(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare recorded launches bit by bit: other seeds, other numbers of samples, dimmed lights, a moved camera."""
     scene = load(build(effort.size))
     parameters, sensor = mi.traverse(scene), scene.sensors()[0]
@@ -286,7 +286,7 @@ def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
     return faults, f"{len(steps)} renders"
 
 
-def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str], str]:
+def oracles_weights(build: Callable[[int], SceneDict], lanes: int) -> tuple[list[str], str]:
     """Compare the weights of real paths; see `weight_check`."""
     faults, figures = [], []
     for settings in ALL:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-Kind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
+TimeKind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
 """The kinds of time.
 
 They are: building network and feed; steps; validations; waiting for samples to be rendered, and to be read;
 checkpoints; and the rest, such as writing the log and drawing.
 """
 
-KINDS: tuple[Kind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
+KINDS: tuple[TimeKind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
 
 Bottleneck = Literal["rendering", "reading", "training"]
 
@@ -23,7 +23,7 @@ NONE: Mapping[str, float] = {}
 class Stopwatch:
     """The seconds of a run by kind: at any moment one kind runs, so that their sum is the wall time."""
 
-    def __init__(self, clock: Callable[[], float], kind: Kind, ahead: float = 0.0) -> None:
+    def __init__(self, clock: Callable[[], float], kind: TimeKind, ahead: float = 0.0) -> None:
         """Begin with `kind`, at `ahead` seconds."""
         self._clock, self._kind, self._since = clock, kind, clock() - ahead
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
@@ -44,7 +44,7 @@ class Stopwatch:
         for kind, value in seconds.items():
             self._spent[kind] += value
 
-    def turn(self, kind: Kind) -> Kind:
+    def turn(self, kind: TimeKind) -> TimeKind:
         """Switch to another kind; returns the one before."""
         before, now = self._kind, self._clock()
         self._spent[before] += now - self._since
@@ -52,7 +52,7 @@ class Stopwatch:
         return before
 
     @contextmanager
-    def on(self, kind: Kind) -> Iterator[None]:
+    def on(self, kind: TimeKind) -> Iterator[None]:
         """Switch to a kind while the block runs."""
         before = self.turn(kind)
         try:

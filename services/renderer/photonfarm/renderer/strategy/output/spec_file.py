@@ -19,7 +19,7 @@ from photonfarm.shared.scene import spec as scene
 BYTE_ORDER_MARK = "\ufeff"
 """Some editors begin a file with it."""
 
-Settings = Mapping[str, Mapping[str, int | float]]
+SpecTables = Mapping[str, Mapping[str, int | float]]
 """Table → key → number."""
 
 
@@ -35,7 +35,7 @@ def writable(name: str) -> Path:
     return file
 
 
-def write(file: Path, settings: Settings) -> None:
+def write(file: Path, settings: SpecTables) -> None:
     """Put settings into a TOML file; it changes at once or not at all. Raises SpecError for a file that is no TOML."""
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
@@ -48,7 +48,7 @@ def write(file: Path, settings: Settings) -> None:
         aside.unlink(missing_ok=True)
 
 
-def put(text: str, settings: Settings, *, where: str) -> str:
+def put(text: str, settings: SpecTables, *, where: str) -> str:
     """A TOML document with other numbers in some of its tables; everything else stays. SpecError for no valid TOML."""
     plain = text.removeprefix(BYTE_ORDER_MARK)
     mark = text[: len(text) - len(plain)]

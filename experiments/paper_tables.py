@@ -15,7 +15,7 @@ from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.report.published import Published, Table
+from photonfarm.trainer.report.published import Published, PublishedTable
 from photonfarm.trainer.report.tables import with_interval
 
 T = TypeVar("T")
@@ -120,17 +120,17 @@ FURTHER = (
 )
 
 
-def error_table(rooms: Sequence[Room], published: Table) -> str:
+def error_table(rooms: Sequence[Room], published: PublishedTable) -> str:
     """The time of a frame and its errors, each a mean over the rooms that have the row. Raises SpecError."""
     return _table(rooms, published, ERRORS)
 
 
-def further_table(rooms: Sequence[Room], published: Table) -> str:
+def further_table(rooms: Sequence[Room], published: PublishedTable) -> str:
     """Times of networks and metrics of features, each a mean over the rooms that have the row."""
     return _table(rooms, published, FURTHER)
 
 
-def _table(rooms: Sequence[Room], published: Table, columns: Sequence[Column]) -> str:
+def _table(rooms: Sequence[Room], published: PublishedTable, columns: Sequence[Column]) -> str:
     """A row for each predictor; behind a column that the paper has, its figures."""
     head = ["architecture"]
     for column in columns:
@@ -140,7 +140,7 @@ def _table(rooms: Sequence[Room], published: Table, columns: Sequence[Column]) -
     return markdown_table(head, [_line(rooms, name, published, columns) for name in _row_names(rooms)])
 
 
-def _line(rooms: Sequence[Room], name: str, published: Table, columns: Sequence[Column]) -> list[str]:
+def _line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
     having, paper = [room for room in rooms if name in room.rows], published.get(name)
     line = [name]
     for column in columns:
@@ -164,7 +164,7 @@ def _row_names(rooms: Sequence[Room]) -> list[str]:
 # -------------------------------------------------------------------------------------------------------------- pairs
 
 
-def order_table(rooms: Sequence[Room], published: Table) -> str:
+def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
     """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
     head = ("pair", *(["paper"] if published else []), *(room.name for room in rooms))
     lines = []

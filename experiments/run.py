@@ -27,7 +27,7 @@ from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, Spec
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
@@ -47,21 +47,21 @@ def _count(text: str) -> int:
 
 def main() -> int:
     """Run them; returns the exit code."""
-    told = options().parse_args()
+    arguments = options().parse_args()
     try:
-        experiments = [Experiment.load(name, told.size) for name in told.names or names()]
+        experiments = [Experiment.load(name, arguments.size) for name in arguments.names or names()]
         for experiment in experiments:
             experiment.spec()  # what is wrong should be said before hours go by
     except SpecError as error:
         tell(f"error: {error}")
         return SpecError.exit_code
-    if told.dry_run:
+    if arguments.dry_run:
         for experiment in experiments:
-            print(dry_run.measured(experiment).line(told.tflops), flush=True)
+            print(dry_run.measured(experiment).line(arguments.tflops), flush=True)
         return 0
     failed = False
     for experiment in experiments:
-        stages = Stages(experiment, told.work / told.size / experiment.name, told.workers)
+        stages = Stages(experiment, arguments.work / arguments.size / experiment.name, arguments.workers)
         try:
             tell(f"{experiment.name}: {stages.run()}")
         except PhotonfarmError as error:

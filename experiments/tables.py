@@ -29,9 +29,9 @@ from experiments.paper_tables import CLOSE, error_table, further_table, lacking,
 from experiments.room_tables import cost_table, descriptions, room_table, said, wrapped
 from experiments.rooms import Room
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
-from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, Table
+from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
 
-PARTS: Mapping[Part, tuple[str, Table]] = {
+PARTS: Mapping[Part, tuple[str, PublishedTable]] = {
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),
     "movable": ("Table 2: movable objects and lights; the lights that move are all the light", MOVABLE_LIGHTS),
     "daylight": ("The rooms of Table 2 by day: windows and sky add light that does not move", MOVABLE_LIGHTS),
@@ -67,7 +67,7 @@ def page(found: Sequence[Room], size: SizeName) -> str:
     return "\n\n".join([*parts, wrapped(made)])
 
 
-def _part(rooms: Sequence[Room], title: str, published: Table) -> list[str]:
+def _part(rooms: Sequence[Room], title: str, published: PublishedTable) -> list[str]:
     """The tables of some rooms: pairs, errors, further metrics, and what they were measured on."""
     means = wrapped(f"Means over: {', '.join(room.name for room in rooms)}.{lacking(rooms)}")
     return [

@@ -29,7 +29,7 @@ SPINS = 12_000_000  # of a loop: about a second
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ConcurrentWork:
     """What a number of processes did at once."""
 
     rate: float  # per second, all together
@@ -49,7 +49,7 @@ class Pair:
     cpu_ratio: float  # twice one's processor time for the same work over two's: with a processor for each
 
 
-def pair_of(what: str, runs: Sequence[tuple[Run, Run]]) -> Pair:
+def pair_of(what: str, runs: Sequence[tuple[ConcurrentWork, ConcurrentWork]]) -> Pair:
     """The row of neighbouring runs, (one, two)."""
     ratios = sorted(two.rate / one.rate for one, two in runs)
     return Pair(
@@ -63,13 +63,13 @@ def pair_of(what: str, runs: Sequence[tuple[Run, Run]]) -> Pair:
     )
 
 
-def cost_of_company(one: Run, two: Run) -> float:
+def cost_of_company(one: ConcurrentWork, two: ConcurrentWork) -> float:
     """Processor time of two at work over that of one, for the pieces of work that both have done."""
     same = one.cpu_s.keys() & two.cpu_s.keys()
     return sum(two.cpu_s[number] for number in same) / sum(one.cpu_s[number] for number in same)
 
 
-def farm(folder: Path, options: argparse.Namespace, count: int) -> Run:
+def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWork:
     """Jobs of a number of workers in the steady state."""
     folder = Path(tempfile.mkdtemp(dir=folder))
     with EmbeddedRedis(folder / "redis") as redis:
@@ -85,7 +85,7 @@ def farm(folder: Path, options: argparse.Namespace, count: int) -> Run:
         raise SystemExit("a worker has failed; what it said stands above")
     steady = steady_ends(ends_of_jobs(scene), count)
     rate = sum((len(ends) - 1) / (ends[-1].at - ends[0].at) for ends in steady)
-    return Run(rate, {end.job: end.cpu_s for ends in steady for end in ends[1:]})
+    return ConcurrentWork(rate, {end.job: end.cpu_s for ends in steady for end in ends[1:]})
 
 
 class End(NamedTuple):
@@ -118,10 +118,10 @@ def steady_ends(found: Sequence[Sequence[End]], count: int) -> Sequence[Sequence
     return steady
 
 
-def run(twins: Processes, count: int) -> Run:
+def run(twins: Processes, count: int) -> ConcurrentWork:
     """One piece of work by each of the first processes, at once."""
     seconds, cpu_s = twins.ask([True] * count)
-    return Run(count / seconds, {0: statistics.fmean(cpu_s)})
+    return ConcurrentWork(count / seconds, {0: statistics.fmean(cpu_s)})
 
 
 def render(pipe: Any, name: str, rows: int) -> None:
@@ -163,12 +163,12 @@ def pairs(folder: Path, options: argparse.Namespace) -> list[Pair]:
     rendering, computing = Processes(2, render, options.spec, options.rows), Processes(2, compute)
     for twins in (rendering, computing):
         run(twins, 2)  # warms both
-    ways: dict[str, Callable[[int], Run]] = {
+    ways: dict[str, Callable[[int], ConcurrentWork]] = {
         "workers, jobs": partial(farm, folder, options),
         "the same rendering without queue and store, jobs": partial(run, rendering),
         "computing alone, loops": partial(run, computing),
     }
-    runs: dict[str, list[tuple[Run, Run]]] = {what: [] for what in ways}
+    runs: dict[str, list[tuple[ConcurrentWork, ConcurrentWork]]] = {what: [] for what in ways}
     for i in range(options.repetitions):
         for what, way in ways.items():
             found = {count: way(count) for count in ((1, 2) if i % 2 == 0 else (2, 1))}

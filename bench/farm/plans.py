@@ -44,7 +44,7 @@ ABOUT = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StepCost:
     """One step."""
 
     step: str
@@ -64,13 +64,13 @@ def run_steps(job: str, options: argparse.Namespace) -> None:
         step()
         wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
         peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        print(json.dumps(asdict(Row(name, wall_s, processor_s, peak_bytes))), flush=True)
+        print(json.dumps(asdict(StepCost(name, wall_s, processor_s, peak_bytes))), flush=True)
 
 
-Steps = Iterable[tuple[str, Callable[[], Any]]]
+NamedSteps = Iterable[tuple[str, Callable[[], Any]]]
 
 
-def submit(options: argparse.Namespace) -> Steps:
+def submit(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared.farm import submission
     from photonfarm.shared.plan.request import Request
     from photonfarm.shared.scene.spec import NamedSpec
@@ -80,7 +80,7 @@ def submit(options: argparse.Namespace) -> Steps:
     yield "submit", lambda: submission.submit(NamedSpec.load(options.spec), store, options.redis, request)
 
 
-def reconcile(options: argparse.Namespace) -> Steps:
+def reconcile(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared import queue
     from photonfarm.shared.store import Store
 
@@ -90,7 +90,7 @@ def reconcile(options: argparse.Namespace) -> Steps:
     yield "reconcile, queue full", lambda: queue.reconcile(Store(options.folder / "store"), connection)
 
 
-def fill(options: argparse.Namespace) -> Steps:
+def fill(options: argparse.Namespace) -> NamedSteps:
     generator = Markers(options.folder / "store")
 
     def place_all_but_one() -> None:
@@ -100,13 +100,13 @@ def fill(options: argparse.Namespace) -> Steps:
     yield "markers", place_all_but_one
 
 
-def status(options: argparse.Namespace) -> Steps:
+def status(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared.store import Store, store_status
 
     yield "status", lambda: store_status(Store(options.folder / "store"))
 
 
-def read(options: argparse.Namespace) -> Steps:
+def read(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared.store import SceneReader
 
     generator = Markers(options.folder / "store")
@@ -119,7 +119,7 @@ def read(options: argparse.Namespace) -> Steps:
         raise RuntimeError(f"{len(reader.rows)} of {reader.planned} samples are complete, and all should be")
 
 
-def again(options: argparse.Namespace) -> Steps:
+def again(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared.plan.top_up import TopUp
     from photonfarm.shared.store import Store
 
@@ -160,7 +160,7 @@ class Markers:
 # ---------------------------------------------------------------------------------------------------------------- table
 
 
-def measure(options: argparse.Namespace, folder: Path) -> tuple[list[Row], dict[str, int]]:
+def measure(options: argparse.Namespace, folder: Path) -> tuple[list[StepCost], dict[str, int]]:
     """Every step in its process, and what Redis holds."""
     from photonfarm.shared import queue
     from photonfarm.shared.farm.redis_server import EmbeddedRedis
@@ -178,17 +178,17 @@ def measure(options: argparse.Namespace, folder: Path) -> tuple[list[Row], dict[
     return rows, sizes
 
 
-def run(job: str, options: argparse.Namespace, folder: Path, redis_url: str) -> list[Row]:
+def run(job: str, options: argparse.Namespace, folder: Path, redis_url: str) -> list[StepCost]:
     """One process's rows."""
     given = {"job": job, "folder": folder, "redis": redis_url}
     given |= {"spec": options.spec, "samples": options.samples, "views": options.views}
     told = [word for name, value in given.items() for word in (f"--{name}", str(value))]
     command = [sys.executable, "-m", "bench.farm.plans", *told]
     lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
-    return [Row(**json.loads(line)) for line in lines]
+    return [StepCost(**json.loads(line)) for line in lines]
 
 
-def page(rows: list[Row], sizes: dict[str, int], options: argparse.Namespace) -> str:
+def page(rows: list[StepCost], sizes: dict[str, int], options: argparse.Namespace) -> str:
     from photonfarm.shared import queue
 
     lines = [

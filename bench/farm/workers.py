@@ -24,7 +24,7 @@ WARM_UP = 2  # samples
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class Throughput:
     """One film size: samples per second of either side, medians over the repetitions."""
 
     spec: str
@@ -72,7 +72,7 @@ def samples_per_second(count: int, side: Processes, samples: int) -> float:
     return samples / side.ask([range(i, samples, count) for i in range(count)])[0]
 
 
-def measure(name: str, size: int, options: argparse.Namespace) -> Row:
+def measure(name: str, size: int, options: argparse.Namespace) -> Throughput:
     """Both sides by turns, each first as often as the other."""
     n = options.processes
     sides = [(n, Processes(n, serve, name, size, 1)), (1, Processes(1, serve, name, size, n))]
@@ -84,7 +84,7 @@ def measure(name: str, size: int, options: argparse.Namespace) -> Row:
     for _, side in sides:
         side.end()
     ratios = sorted(processes / threads for processes, threads in speeds)
-    return Row(
+    return Throughput(
         spec=name,
         size=size,
         half_spp=load_spec(name).transport.half_spp,
@@ -96,7 +96,7 @@ def measure(name: str, size: int, options: argparse.Namespace) -> Row:
     )
 
 
-def page(rows: list[Row], options: argparse.Namespace) -> str:
+def page(rows: list[Throughput], options: argparse.Namespace) -> str:
     n = options.processes
     header = ["scene", "image", f"{n} processes × 1 thread, samples/s", f"1 process × {n} threads, samples/s", "ratio"]
     lines = [

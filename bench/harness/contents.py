@@ -27,7 +27,7 @@ from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
-from photonfarm.shared.store.format.schema import Kind, output_arrays
+from photonfarm.shared.store.format.schema import RowKind, output_arrays
 from photonfarm.shared.store.format.shards import encode
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
@@ -177,11 +177,11 @@ def commit_guides(scene: SceneStore, job: int, contents: Contents) -> None:
         out.commit(FIGURES)
 
 
-def in_order(rows: JobRows) -> Iterator[tuple[Kind, int, SampleRow]]:
+def in_order(rows: JobRows) -> Iterator[tuple[RowKind, int, SampleRow]]:
     """A job's rows as a worker comes by them: of each sample first what is new of its modification and its view."""
-    seen: set[tuple[Kind, int]] = set()
+    seen: set[tuple[RowKind, int]] = set()
     for sample in rows.samples:
-        wanted: list[tuple[Kind, int]] = [("sample", sample.row)]
+        wanted: list[tuple[RowKind, int]] = [("sample", sample.row)]
         if sample.view_row in rows.new_views:
             wanted.insert(0, ("view", sample.view_row))
         if sample.modification_row in rows.new_modifications:
@@ -197,7 +197,7 @@ class EncodedPool:
 
     def __init__(self, pool: Pool, spec: SceneSpec) -> None:
         photons = [pool.photons() for _ in range(pool.count("photons"))]
-        rows: dict[Kind, list[Mapping[str, Any]]] = {
+        rows: dict[RowKind, list[Mapping[str, Any]]] = {
             "sample": [_radiance(pool.halves(), spec) for _ in range(pool.count("halves"))],
             "view": [view_row(pool.buffers(), pool.visibility()) for _ in range(pool.count("buffers"))],
             "modification": [
@@ -210,7 +210,7 @@ class EncodedPool:
             for kind, of in rows.items()
         }
 
-    def next(self, kind: Kind) -> Mapping[str, memoryview]:
+    def next(self, kind: RowKind) -> Mapping[str, memoryview]:
         """The next row of each array of a kind."""
         return next(self._of[kind])
 
@@ -231,7 +231,7 @@ def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:
 class EncodedWriter(JobWriter):
     """A JobWriter that is given rows as they are stored: what is left is to write them."""
 
-    def give(self, kind: Kind, row: int, contents: Mapping[str, memoryview]) -> None:
+    def give(self, kind: RowKind, row: int, contents: Mapping[str, memoryview]) -> None:
         """A row of each array of a kind; its values have been looked at by whoever encoded them."""
         self._given[kind].add(row)
         for name, content in contents.items():

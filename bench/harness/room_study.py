@@ -130,7 +130,7 @@ def _end_with_parent() -> None:
 class ChosenSamples(StoreSource):
     """Samples of a store that are chosen once, to be trained on, and one that is held out.
 
-    A trainer wants one to look at. Whoever derives from it sets `rows`.
+    A trainer wants one to look at. Whoever derives from it sets `chosen`.
     """
 
     def __init__(self, root: str | Path, scene_id: str, share: float) -> None:
@@ -139,30 +139,27 @@ class ChosenSamples(StoreSource):
         complete = super().refresh().tolist()
         held_out = rows_held_out(self, complete, share)
         self.trainable = [row for row, held in zip(complete, held_out, strict=True) if not held]
-        self.rows: list[int] = []
+        self.chosen: list[int] = []
         self._looked_at = [row for row, held in zip(complete, held_out, strict=True) if held][:1]
         self._told = False
         if not self._looked_at:
             raise ValueError(f"{root}: none of {len(complete)} samples is held out")
 
-    def refresh(self) -> NDArray[np.int64]:
-        """The chosen samples at the first call, and the one that is held out; none after it."""
-        new = [] if self._told else [*self.rows, *self._looked_at]
-        self._told = True
-        return np.array(new, np.int64)
-
     def follow_guides(self) -> None:
-        """As `StoreSource` does; then looks once more, as samples are complete only with their guides from now on."""
+        """Read guides too; the reader begins anew for them, and looks at what is there once more."""
         super().follow_guides()
         super().refresh()
 
-    def taken_back(self) -> NDArray[np.int64]:
-        """None is."""
-        return np.empty(0, np.int64)
+    def refresh(self) -> NDArray[np.int64]:
+        """The chosen samples at the first call, and the one that is held out; none after it."""
+        new = [] if self._told else [*self.chosen, *self._looked_at]
+        self._told = True
+        return np.array(new, np.int64)
 
+    @property
     def planned(self) -> int:
         """The number of samples that were chosen, and the one that is held out."""
-        return len(self.rows) + 1
+        return len(self.chosen) + 1
 
 
 def add_options(parser: argparse.ArgumentParser, name: str) -> None:
@@ -180,19 +177,19 @@ def add_options(parser: argparse.ArgumentParser, name: str) -> None:
     )
 
 
-def opened(told: argparse.Namespace, size: str) -> tuple[Path, Store]:
+def opened(options: argparse.Namespace, size: str) -> tuple[Path, Store]:
     """The folder of a study of this size and plan seed, and its store; looks at `code` before time goes by."""
     tell(f"code {code()}")
-    folder = told.work / f"{size}-plan-{told.plan_seed}"
+    folder = options.work / f"{size}-plan-{options.plan_seed}"
     folder.mkdir(parents=True, exist_ok=True)
     return folder, Store(folder / "store", create=True)
 
 
-def settings_of(told: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
+def settings_of(options: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
     """The preset `small` from a seed, judged after its last step alone."""
     return preset(
-        "small", network={"architecture": told.architecture}, seed=seed, max_steps=told.steps, hold_out=hold_out,
-        recover=False, validate_every=told.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
+        "small", network={"architecture": options.architecture}, seed=seed, max_steps=options.steps, hold_out=hold_out,
+        recover=False, validate_every=options.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
 
 
@@ -276,7 +273,7 @@ def _train(source: Callable[[], SampleSource], settings: TrainSettings, folder: 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class References:
+class ReferenceViews:
     """Views of held-out configurations with all their passes merged, in two halves that are independent."""
 
     rows: tuple[int, ...]  # the first sample of each view
@@ -285,7 +282,7 @@ class References:
     spp: int  # of both halves together, of the view that has fewest
 
     @classmethod
-    def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> References:
+    def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> ReferenceViews:
         """Those of held-out configurations that have `spp` at least; `share` of all are held out."""
         reader, source = SceneReader(store.root, spec.scene_id), StoreSource(store.root, spec.scene_id)
         reader.refresh()
@@ -340,13 +337,13 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
-def document(settings: TrainSettings, told: argparse.Namespace, references: References) -> dict[str, Any]:
+def document(settings: TrainSettings, options: argparse.Namespace, references: ReferenceViews) -> dict[str, Any]:
     """What a study's JSON says beside its figures."""
     return {
         "settings": settings.model_dump(mode="json"),
         "code": code(),
-        "seeds": told.seeds,
-        "plan_seed": told.plan_seed,
+        "seeds": options.seeds,
+        "plan_seed": options.plan_seed,
         "reference_spp": references.spp,
         "reference_noise": references.noise(references.spp),
         "units": [unit.hex() for unit in references.units],

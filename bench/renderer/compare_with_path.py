@@ -72,7 +72,7 @@ DEFAULT_PLAN = Plan(64, 1024, 256, 8)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PathComparison:
     """One line of the table."""
 
     scene: str
@@ -99,7 +99,7 @@ def render(scene: Any, integrator: dict[str, Any], seeds: range, spp: int) -> An
     return np.stack([image[..., :3] for image in images])
 
 
-def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[Row, dict[str, Any]]:
+def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[PathComparison, dict[str, Any]]:
     """(line of the table, pictures) of one scene."""
     from photonfarm.shared.core.statistics import block_z_test
 
@@ -111,7 +111,7 @@ def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[Row, 
     b = render(scene, {"type": "path", **common}, range(10_001, 10_001 + plan.seeds), plan.path_spp)
     wall_s = time.perf_counter() - start
     test = block_z_test(a, b, blocks=BLOCKS)
-    row = Row(
+    row = PathComparison(
         name, plan.size, plan.seeds, plan.path_spp, plan.bdpt_spp, arguments.connections, arguments.light_ratio,
         plan.max_depth, test.z_max, test.mean_ratio, test.mean_ratio_standard_error, wall_s, verdict(test),
     )  # fmt: skip
@@ -145,7 +145,7 @@ def save_pictures(folder: Path, name: str, pictures: dict[str, Any]) -> None:
     np.savetxt(folder / f"{stem}_z.txt", pictures["z"], fmt="%6.2f")
 
 
-def page(rows: list[Row], arguments: argparse.Namespace) -> str:
+def page(rows: list[PathComparison], arguments: argparse.Namespace) -> str:
     """The Markdown page."""
     header = ("scene", "size", "seeds", "spp path / bdpt", "max block z", "mean ratio", "wall s", "verdict")
     lines = (

@@ -34,7 +34,7 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MethodCost:
     """One method; times are CPU seconds of a render call."""
 
     method: str
@@ -45,7 +45,7 @@ class Row:
     cost_to: float
 
 
-def measure(scene: Any, spp: int, repetitions: int) -> list[Row]:
+def measure(scene: Any, spp: int, repetitions: int) -> list[MethodCost]:
     """Every method on one scene, in turn."""
     import mitsuba as mi
 
@@ -63,11 +63,11 @@ def measure(scene: Any, spp: int, repetitions: int) -> list[Row]:
     for name in METHODS:
         ratios = [turn[name] / turn["path"] for turn in turns]
         middle = statistics.median(turn[name] for turn in turns)
-        rows.append(Row(name, first[name], middle, statistics.median(ratios), min(ratios), max(ratios)))
+        rows.append(MethodCost(name, first[name], middle, statistics.median(ratios), min(ratios), max(ratios)))
     return rows
 
 
-def page(scene: str, size: int, spp: int, repetitions: int, rows: list[Row]) -> str:
+def page(scene: str, size: int, spp: int, repetitions: int, rows: list[MethodCost]) -> str:
     """The table as Markdown."""
     header = ("method", "CPU ms an image", "cost of a sample over `path`", "least … greatest", "first call, CPU s")
     lines = [
@@ -96,7 +96,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--repetitions", type=int, default=9)
-    told = parser.parse_args()
+    options = parser.parse_args()
 
     from photonfarm.renderer.scene import backend
 
@@ -105,11 +105,15 @@ def main() -> int:
 
     from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
-    if told.scene not in HARD_SCENES:
-        parser.error(f"--scene {told.scene}: is none of {', '.join(sorted(HARD_SCENES))}")
-    rows = measure(mi.load_dict(HARD_SCENES[told.scene](told.size), optimize=False), told.spp, told.repetitions)
-    values = {"scene": told.scene, "size": told.size, "spp": told.spp, "rows": [asdict(row) for row in rows]}
-    results.write("cost", page(told.scene, told.size, told.spp, told.repetitions, rows), values, told.out)
+    if options.scene not in HARD_SCENES:
+        parser.error(f"--scene {options.scene}: is none of {', '.join(sorted(HARD_SCENES))}")
+    rows = measure(
+        mi.load_dict(HARD_SCENES[options.scene](options.size), optimize=False), options.spp, options.repetitions
+    )
+    values = {"scene": options.scene, "size": options.size, "spp": options.spp, "rows": [asdict(row) for row in rows]}
+    results.write(
+        "cost", page(options.scene, options.size, options.spp, options.repetitions, rows), values, options.out
+    )
     return 0
 
 

@@ -31,7 +31,7 @@ SPECS = ("room", "living-room-2")
 
 
 @dataclass(slots=True)
-class Stopwatch:
+class TimedIntegrator:
     """Stands in for an integrator: renders with it, waits for the kernels, and keeps the time."""
 
     integrator: Any
@@ -50,7 +50,7 @@ class Stopwatch:
 
 
 @dataclass(slots=True)
-class Figures:
+class ModificationTimes:
     """Milliseconds of every modification after the warm-up."""
 
     new_in_warm_up: int = 0
@@ -73,7 +73,7 @@ def timed(work: Callable[[], Any]) -> float:
     return milliseconds(start)
 
 
-def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
+def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, ModificationTimes]:
     """The spec, and what its modifications cost."""
     import drjit as dr
 
@@ -88,8 +88,8 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Figures]:
         dr.kernel_history_clear()
         scene = LoadedScene.load(spec)
         unseen(dr.kernel_history(), seen)
-    scene._integrator = watch = Stopwatch(integrator_of(spec.transport))
-    figures, cloud = Figures(), scene.base()[1]
+    scene._integrator = watch = TimedIntegrator(integrator_of(spec.transport))
+    figures, cloud = ModificationTimes(), scene.base()[1]
     for i in range(modifications):
         modification = sample_modification(spec, 0, i)
         before = sample_modification(spec, 0, i - 1) if i else rest(spec)
@@ -151,7 +151,7 @@ def collect(lists: dict[str, list[float]], values: dict[str, float]) -> None:
         lists[key].append(value)
 
 
-def summary(spec: Any, figures: Figures, modifications: int) -> dict[str, Any]:
+def summary(spec: Any, figures: ModificationTimes, modifications: int) -> dict[str, Any]:
     """The figures of one spec for the JSON file."""
 
     def both(lists: dict[str, list[float]]) -> dict[str, dict[str, float]]:
@@ -172,7 +172,7 @@ def summary(spec: Any, figures: Figures, modifications: int) -> dict[str, Any]:
     }
 
 
-def line(spec: Any, figures: Figures) -> list[Any]:
+def line(spec: Any, figures: ModificationTimes) -> list[Any]:
     """The spec's line of the table."""
     split, plain = figures.split, figures.plain
     history_cost = statistics.median(split["image"]) / statistics.median(plain["image"])

@@ -122,7 +122,7 @@ def recorded_rays(render: Callable[[], None], capacity: int) -> tuple[list[Any],
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class RayCost:
     """One scene: rays traced, and CPU seconds (medians)."""
 
     scene: str
@@ -153,7 +153,7 @@ def seconds(work: Callable[[], Any]) -> tuple[float, float]:
         return spent, sum(kernel["execution_time"] for kernel in dr.kernel_history()) / 1e3
 
 
-def measure(name: str, options: argparse.Namespace) -> Row:
+def measure(name: str, options: argparse.Namespace) -> RayCost:
     """Render, record, and trace the record again."""
     import drjit as dr
     import mitsuba as mi
@@ -188,7 +188,7 @@ def measure(name: str, options: argparse.Namespace) -> Row:
             measured[part].append(seconds(work))
     cpu = {part: statistics.median(found[0] for found in runs) for part, runs in measured.items()}
     kernels = {part: statistics.median(found[1] for found in runs) for part, runs in measured.items()}
-    return Row(
+    return RayCost(
         scene=name,
         closest_hit_rays=sum(dr.width(rays) for rays in closest),
         shadow_rays=sum(dr.width(rays) for rays in shadow),
@@ -208,7 +208,7 @@ def surface_sum(si: Any) -> Any:
     return si.t + dr.sum(si.uv) + sum(dr.sum(vector) for vector in vectors)
 
 
-def page(rows: list[Row], options: argparse.Namespace) -> str:
+def page(rows: list[RayCost], options: argparse.Namespace) -> str:
     header = ["scene", "closest-hit rays", "shadow rays", "bdpt, Mrays/s", "bare, Mrays/s", "fraction"]
     header += ["fraction of kernels", "of kernels, with surfaces"]
     lines = [

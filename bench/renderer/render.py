@@ -27,7 +27,7 @@ from typing import Any
 
 from bench.harness import results
 from bench.renderer.peers import chosen, page, plot
-from bench.renderer.peers.measure import Settings, measure, say
+from bench.renderer.peers.measure import MeasureSettings, measure, say
 from bench.renderer.peers.plans import METHODS, PLANS, estimated_seconds
 from bench.renderer.scene_loading import load
 
@@ -61,7 +61,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> int:
     arguments = parse()
-    settings = Settings(
+    settings = MeasureSettings(
         tuple(arguments.methods), arguments.seconds, arguments.seeds, arguments.size, arguments.threads,
         arguments.clock, arguments.reference, arguments.pilot_seconds, arguments.chosen,
     )  # fmt: skip
@@ -81,7 +81,7 @@ def main() -> int:
     return 2 if left_out else 0
 
 
-def run(pending: list[str], settings: Settings, folder: Path, key: dict[str, Any]) -> dict[str, str]:
+def run(pending: list[str], settings: MeasureSettings, folder: Path, key: dict[str, Any]) -> dict[str, str]:
     """Measure what is not yet there. Returns why scenes were left out that cannot be loaded."""
     left_out: dict[str, str] = {}
     if not pending:

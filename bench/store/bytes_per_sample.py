@@ -27,7 +27,7 @@ COUNTS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StoreSize:
     """One store: a request's shape, and the bytes of its files without the base, over its samples."""
 
     views_per_modification: int
@@ -53,16 +53,18 @@ class Whole:
         return self.radiance + self.buffers + self.cloud + self.photons
 
 
-def measure(spec: SceneSpec, contents: Contents, modifications: int, folder: Path) -> tuple[list[Row], Whole, int]:
+def measure(
+    spec: SceneSpec, contents: Contents, modifications: int, folder: Path
+) -> tuple[list[StoreSize], Whole, int]:
     """The stores of every pair of counts; what whole samples take; and the bytes of the base, stored once."""
-    rows: list[Row] = []
+    rows: list[StoreSize] = []
     for views in COUNTS:
         for passes in COUNTS:
             request = Request(modifications=modifications, views_per_modification=views, passes=passes)
             scene = filled(spec, contents, request, folder / f"{views}-{passes}")
             samples = scene.progress().committed_samples
             before = (size(scene.folder) - size(scene.folder / "base")) / samples
-            rows.append(Row(views, passes, samples, before, before + guided(scene, contents) / samples, 0.0))
+            rows.append(StoreSize(views, passes, samples, before, before + guided(scene, contents) / samples, 0.0))
     whole = whole_samples(scene, contents, folder / "whole")
     rows = [replace(row, saving=whole.total / row.bytes_per_sample) for row in rows]
     return rows, whole, size(scene.folder / "base")

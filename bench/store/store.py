@@ -37,7 +37,7 @@ WRITING = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StoreSpeed:
     """One way against the bare one, in a number of processes at once: medians, and ratios of neighbouring runs."""
 
     what: str
@@ -167,20 +167,20 @@ def seconds(workers: Processes, asked: Sequence[Any]) -> tuple[float, float]:
 
 def row_of(
     what: str, processes: int, size: float, bare: list[tuple[float, float]], ours: list[tuple[float, float]]
-) -> Row:
+) -> StoreSpeed:
     """The row of neighbouring runs; `size` is the bytes of one run of one process."""
     ratios = sorted(b[0] / o[0] for b, o in zip(bare, ours, strict=True))
     one, other = (size * processes / 1e6 / statistics.median(wall for wall, _ in side) for side in (bare, ours))
     cpu = statistics.median(b[1] / o[1] for b, o in zip(bare, ours, strict=True))
     cpu_s = statistics.median(cpu for _, cpu in ours) / processes
-    return Row(what, processes, one, other, statistics.median(ratios), ratios[0], ratios[-1], cpu, cpu_s)
+    return StoreSpeed(what, processes, one, other, statistics.median(ratios), ratios[0], ratios[-1], cpu, cpu_s)
 
 
-def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Namespace) -> list[Row]:
+def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Namespace) -> list[StoreSpeed]:
     """Batches with and without buffers, in one and two processes."""
     workers = Processes(2, serve, "reading", store, scene_id, bare)
     sizes = {name: np.load(bare / f"{name}.npy", mmap_mode="r")[0].nbytes for name in ("radiance", *VIEW)}
-    found: list[Row] = []
+    found: list[StoreSpeed] = []
     for what, size in (("radiance", sizes["radiance"]), ("all", sum(sizes.values()))):
         for processes in (1, 2):
             times: dict[str, list[tuple[float, float]]] = {way: [] for way in ("bare", *READING, "zarr")}
@@ -203,7 +203,7 @@ def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Na
     return found
 
 
-def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namespace) -> list[Row]:
+def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namespace) -> list[StoreSpeed]:
     """Whole jobs, in one and two processes; the bare files of a job have the sizes of the first one's."""
     workers = Processes(2, serve, "writing", scene.storage.where, scene.scene_id, bare, pool)
     jobs = iter(scene.missing_jobs())
@@ -211,7 +211,7 @@ def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namesp
     seconds(workers, [("ours", first)])
     for name in renamed(scene, first, first):
         (bare / name).parent.mkdir(parents=True, exist_ok=True)
-    found: dict[str, list[Row]] = {way: [] for way in WRITING}
+    found: dict[str, list[StoreSpeed]] = {way: [] for way in WRITING}
     for processes in (1, 2):
         times: dict[str, list[tuple[float, float]]] = {"bare": [], **{way: [] for way in WRITING}}
         for i in range(options.repetitions):
@@ -264,18 +264,21 @@ def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
 # ------------------------------------------------------------------------------------------------------------- the page
 
 
-def cell(row: bytes_per_sample.Row) -> str:
+def cell(row: bytes_per_sample.StoreSize) -> str:
     return f"{row.bytes_per_sample / 1e3:.0f} kB (÷{row.saving:.1f}), {row.with_guides / 1e3:.0f} kB"
 
 
-def encoding_ms(speeds: list[Row]) -> float:
+def encoding_ms(speeds: list[StoreSpeed]) -> float:
     """Processor time per sample of what is not there to do for rows encoded before, in one process."""
     cpu_s = {row.what: row.cpu_s for row in speeds if row.processes == 1}
     return 1e3 * (cpu_s[WRITING["ours"]] - cpu_s[WRITING["encoded"]]) / BATCH
 
 
 def page(
-    speeds: list[Row], sizes: tuple[list[bytes_per_sample.Row], bytes_per_sample.Whole, int], options: Any, spec: Any
+    speeds: list[StoreSpeed],
+    sizes: tuple[list[bytes_per_sample.StoreSize], bytes_per_sample.Whole, int],
+    options: Any,
+    spec: Any,
 ) -> str:
     rows, whole, base = sizes
     lines = [
@@ -348,7 +351,7 @@ def main() -> int:
     return 0
 
 
-def run(folder: Path, options: argparse.Namespace) -> tuple[list[Row], Any, Any]:
+def run(folder: Path, options: argparse.Namespace) -> tuple[list[StoreSpeed], Any, Any]:
     """All measurements: the bytes, which renders the contents, then reading and writing."""
     from photonfarm.shared.plan.request import Request
     from photonfarm.shared.scene.spec import load_spec

@@ -17,7 +17,7 @@ from bench.harness.room_study import HELD_OUT, ChosenSamples
 from photonfarm.shared.core.records import ViewBuffers, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.trainer.data.store_source import RawSample
+from photonfarm.trainer.data.dataset import RawSample
 
 HALF_SPP = 1  # of what is rendered
 PASS_SPP = 2 * HALF_SPP
@@ -46,7 +46,7 @@ SHARES = (
 )  # fmt: skip
 
 
-class Arm(ChosenSamples):
+class ArmSamples(ChosenSamples):
     """The training samples of one share: some configurations of a store, each with what the share gives it.
 
     A sample's halves are means of the halves of `spp` / 2 passes of its view. An arm of a slice holds every `slices`-th
@@ -76,14 +76,14 @@ class Arm(ChosenSamples):
             for view in views
             for start in range(0, share.rendered, together)
         }
-        self.rows = list(self._passes)
+        self.chosen = list(self._passes)
 
-    def read_batch(self, rows: Sequence[int]) -> list[RawSample]:
+    def read_samples(self, rows: Sequence[int]) -> list[RawSample]:
         """The chosen samples of these rows, and the one that is held out as it is."""
         return [self._mean(row) for row in rows]
 
     def _mean(self, row: int) -> RawSample:
-        read = super().read_batch(self._passes.get(row, [row]))
+        read = super().read_samples(self._passes.get(row, [row]))
         halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
         buffers: dict[str, Any] = {name: values.copy() for name, values in arrays_of(read[0].buffers).items()}
         return replace(read[0], radiance=halves, scale=1.0, buffers=ViewBuffers(**buffers))

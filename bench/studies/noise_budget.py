@@ -27,9 +27,9 @@ import torch
 
 from bench.harness import results, room_study
 from bench.harness.network_errors import F64, Errors, each_seed, of_intervals, stated, within
-from bench.harness.room_study import HELD_OUT, References, Run, in_processes, settings_of
+from bench.harness.room_study import HELD_OUT, ReferenceViews, Run, in_processes, settings_of
 from bench.harness.scenes import in_passes
-from bench.studies.budget_arms import HALF_SPP, SHARES, Arm, Share, requests
+from bench.studies.budget_arms import HALF_SPP, SHARES, ArmSamples, Share, requests
 from bench.studies.budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
 from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.errors import SpecError
@@ -47,7 +47,7 @@ TIMED_VIEWS = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredShare:
     """Networks of one share of the budget, one from each seed."""
 
     share: Share
@@ -62,14 +62,14 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Room:
+class BudgetStudy:
     """A room with all its arms."""
 
     name: str
     spec: SceneSpec
     costs: SampleCosts
-    references: References
-    arms: tuple[Measured, ...]
+    references: ReferenceViews
+    arms: tuple[MeasuredShare, ...]
     errors: RoomErrors  # of the arms, in their order
 
 
@@ -90,16 +90,18 @@ class Planned:
     counts: dict[Share, int]  # configurations
 
 
-def planned(name: str, told: argparse.Namespace) -> Planned:
+def planned(name: str, arguments: argparse.Namespace) -> Planned:
     """Costs are as they were measured first. Raises SpecError, and ValueError where a share buys nothing."""
     spec = spec_of(name)
-    folder, store = room_study.opened(told, f"{name}-{spec.scene_id[:8]}-{told.budget:g}-{len(told.seeds)}")
+    folder, store = room_study.opened(
+        arguments, f"{name}-{spec.scene_id[:8]}-{arguments.budget:g}-{len(arguments.seeds)}"
+    )
     file = folder / "costs.json"
     if not file.is_file():
         (costs,) = in_processes(measured_costs, [(room_study.named_room(name),)], 1, f"{name}: measured costs")
         write_whole(file, costs.json())
     costs = SampleCosts.read(file.read_text())
-    return Planned(name, spec, folder, store, costs, {share: paid(costs, share, told.budget) for share in SHARES})
+    return Planned(name, spec, folder, store, costs, {share: paid(costs, share, arguments.budget) for share in SHARES})
 
 
 def measured_costs(room: SceneSpec) -> SampleCosts:
@@ -118,45 +120,45 @@ def paid(costs: SampleCosts, share: Share, budget: float) -> int:
     return int(budget / one)
 
 
-def measured_room(number: int, plan: Planned, told: argparse.Namespace) -> Room:
+def measured_room(number: int, plan: Planned, arguments: argparse.Namespace) -> BudgetStudy:
     """Samples, networks and errors of one room, which has a number among all."""
-    held_out = TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
-    asked: list[Request | TopUp] = [*requests(plan.counts, len(told.seeds), told.plan_seed), held_out]
-    room_study.render(plan.spec, plan.store, asked, told.processes)
-    references = References.of(plan.store, plan.spec, told.reference_spp)
-    networks = {share: runs(share, plan, told) for share in SHARES}
-    room_study.train_all([run for of_share in networks.values() for run in of_share], told.processes)
+    held_out = TopUp.of(str(arguments.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])
+    asked: list[Request | TopUp] = [*requests(plan.counts, len(arguments.seeds), arguments.plan_seed), held_out]
+    room_study.render(plan.spec, plan.store, asked, arguments.processes)
+    references = ReferenceViews.of(plan.store, plan.spec, arguments.reference_spp)
+    networks = {share: runs(share, plan, arguments) for share in SHARES}
+    room_study.train_all([run for of_share in networks.values() for run in of_share], arguments.processes)
     arms = tuple(measure(share, plan, networks[share], references) for share in SHARES)
     shown = [(arm.allocation, arm.shown) for arm in arms]
     errors = RoomErrors.of(plan.name, plan.costs.relative_variance, shown, number)
-    return Room(plan.name, plan.spec, plan.costs, references, arms, errors)
+    return BudgetStudy(plan.name, plan.spec, plan.costs, references, arms, errors)
 
 
-def runs(share: Share, plan: Planned, told: argparse.Namespace) -> list[Run]:
+def runs(share: Share, plan: Planned, arguments: argparse.Namespace) -> list[Run]:
     """The runs of one share of the budget, one from each seed."""
     found = []
-    for number, seed in enumerate(told.seeds):
-        slice_ = number, len(told.seeds)
-        source = partial(Arm, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
-        name = f"{share}-{number}-of-{len(told.seeds)}"
-        found.append(Run(source, settings_of(told, seed), plan.folder, name))
+    for number, seed in enumerate(arguments.seeds):
+        slice_ = number, len(arguments.seeds)
+        source = partial(ArmSamples, plan.folder / "store", plan.spec.scene_id, share, plan.counts[share], slice_)
+        name = f"{share}-{number}-of-{len(arguments.seeds)}"
+        found.append(Run(source, settings_of(arguments, seed), plan.folder, name))
     return found
 
 
-def measure(share: Share, plan: Planned, networks: Sequence[Run], references: References) -> Measured:
+def measure(share: Share, plan: Planned, networks: Sequence[Run], references: ReferenceViews) -> MeasuredShare:
     """Look at the held-out views with networks that are trained on one share of the budget."""
     where = plan.folder / "store", plan.spec.scene_id
     made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
     shown = Errors(np.stack([references.shown_errors(images) for images in made]), references.units)
     linear = Errors(np.stack([references.linear_errors(images) for images in made]), references.units)
     room_study.tell(f"{share}: {each_seed(shown)}")
-    return Measured(share, plan.counts[share], shown, linear)
+    return MeasuredShare(share, plan.counts[share], shown, linear)
 
 
 # --------------------------------------------------------------------------------------------------------------- page
 
 
-def table(room: Room, found: Fit) -> str:
+def table(room: BudgetStudy, found: Fit) -> str:
     """The arms, their errors, and the model's."""
     header = (
         "spp of a sample", "views of a configuration", "passes of a view", "configurations", "samples", "MSE (95 %)",
@@ -173,7 +175,7 @@ def table(room: Room, found: Fit) -> str:
     return results.table(header, lines)
 
 
-def pairs_table(room: Room) -> str:
+def pairs_table(room: BudgetStudy) -> str:
     """Every arm against the best, on the same views."""
     best = min(room.arms, key=lambda arm: arm.shown.estimate().mean)
     lines = []
@@ -187,7 +189,7 @@ def pairs_table(room: Room) -> str:
     return said + results.table(("share", "more MSE (95 %)", "of each seed", "it is"), lines)
 
 
-def levels(room: Room, found: Fit) -> str:
+def levels(room: BudgetStudy, found: Fit) -> str:
     """What of the errors the model takes for excess, which alone the shares of a budget change, in words."""
     a, b = found.levels[room.name]
     beyond = [(model - a) / model for model in found.predicted(room.errors)]
@@ -199,7 +201,7 @@ def levels(room: Room, found: Fit) -> str:
     )
 
 
-def optimum(room: Room, found: Fit, budget: float) -> str:
+def optimum(room: BudgetStudy, found: Fit, budget: float) -> str:
     """What was measured to be best in this room, and what the model says is, in words."""
     first, of_arms = room.errors.best()
     terms = CostModel(room.costs, found.kappa, found.rho)
@@ -215,7 +217,7 @@ def optimum(room: Room, found: Fit, budget: float) -> str:
     )
 
 
-def best_of_replicates(room: Room, found: Fit, budget: float) -> list[Allocation]:
+def best_of_replicates(room: BudgetStudy, found: Fit, budget: float) -> list[Allocation]:
     """What the model says is best in a room, by the constants of each replicate."""
     best = cache(lambda kappa, rho: CostModel(room.costs, kappa, rho).best(budget))
     return [best(kappa, rho) for kappa, rho in found.constants]
@@ -233,7 +235,7 @@ def in_range(low: float, high: float, grid: F64) -> str:
     return f"{low:.3g}{below} … {high:.3g}{' or more' if high == grid[-1] else ''}"
 
 
-def room_part(room: Room, found: Fit, told: argparse.Namespace) -> str:
+def room_part(room: BudgetStudy, found: Fit, arguments: argparse.Namespace) -> str:
     """The page's part on one room."""
     costs, film = room.costs, room.spec.film
     return f"""## {room.name}
@@ -250,19 +252,20 @@ with references of {room.references.spp} spp.
 
 {pairs_table(room)}
 
-{optimum(room, found, told.budget)}"""
+{optimum(room, found, arguments.budget)}"""
 
 
-def page(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> str:
+def page(arguments: argparse.Namespace, rooms: Sequence[BudgetStudy], found: Fit) -> str:
     """The tables as Markdown."""
-    settings = settings_of(told, told.seeds[0])
-    parts = "\n\n".join(room_part(room, found, told) for room in rooms)
+    settings = settings_of(arguments, arguments.seeds[0])
+    parts = "\n\n".join(room_part(room, found, arguments) for room in rooms)
+    seeds = room_study.counted(len(arguments.seeds), "seed")
     kappas, rhos = in_range(*found.kappa_range, KAPPAS), in_range(*found.rho_range, RHOS)
     return f"""# What a budget of core-seconds is best spent on
 
-Every arm is charged {told.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
+Every arm is charged {arguments.budget:g} core-seconds of rendering: configurations, views of each, passes of each view,
 samples per pixel (spp) of a pass. For each arm alike {room_study.described(settings)}.
-{room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples, each with other configurations.
+{seeds}, of weights and of the order of samples, each with other configurations.
 
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
 {2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
@@ -270,7 +273,7 @@ charged what it would cost rendered at once, by a line through the times of two 
 below, relative to squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), is that of the
 passes. Passes of a view are samples of their own. **MSE** is in the metric space, the references' noise taken out;
 **linear MSE** in exposed linear radiance.
-{of_intervals(len(told.seeds))}
+{of_intervals(len(arguments.seeds))}
 
 **The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
 b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is
@@ -285,11 +288,11 @@ searched, "or more", "or less", the constant is bounded on one side only, and it
 {parts}"""
 
 
-def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dict[str, Any]:
+def document(arguments: argparse.Namespace, rooms: Sequence[BudgetStudy], found: Fit) -> dict[str, Any]:
     """The figures of noise_budget.json."""
-    settings = settings_of(told, told.seeds[0])
+    settings = settings_of(arguments, arguments.seeds[0])
     of_rooms = {
-        room.name: room_study.document(settings, told, room.references)
+        room.name: room_study.document(settings, arguments, room.references)
         | {
             "costs": asdict(room.costs),
             "arms": [
@@ -302,11 +305,11 @@ def document(told: argparse.Namespace, rooms: Sequence[Room], found: Fit) -> dic
     }
     model = {"kappa": found.kappa, "rho": found.rho, "kappa_range": found.kappa_range, "rho_range": found.rho_range}
     model |= {"levels": found.levels, "chi2": found.chi2, "freedom": found.freedom}
-    return {"budget_core_s": told.budget, "model": model, "rooms": of_rooms}
+    return {"budget_core_s": arguments.budget, "model": model, "rooms": of_rooms}
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--rooms", nargs="+", default=ROOMS, help="(%(default)s)")
     parser.add_argument("--budget", type=float, default=200.0, help="core-seconds of each arm (200)")
@@ -318,15 +321,15 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = options()
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        plans = [planned(name, told) for name in told.rooms]
+        plans = [planned(name, arguments) for name in arguments.rooms]
     except (SpecError, ValueError) as error:
         parser.error(str(error))
-    rooms = [measured_room(number, plan, told) for number, plan in enumerate(plans)]
+    rooms = [measured_room(number, plan, arguments) for number, plan in enumerate(plans)]
     found = fit([room.errors for room in rooms])
-    results.write("noise_budget", page(told, rooms, found), document(told, rooms, found), told.out)
+    results.write("noise_budget", page(arguments, rooms, found), document(arguments, rooms, found), arguments.out)
     return 0
 
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from bench.harness import results, room_study
 from bench.harness.network_errors import Errors, each_seed
-from bench.harness.room_study import ChosenSamples, References, Run, settings_of
+from bench.harness.room_study import ChosenSamples, ReferenceViews, Run, settings_of
 from bench.studies import path_data_page, path_scene
-from bench.studies.path_data_study import BLOCK, Arm, Measured, Study, Targets
+from bench.studies.path_data_study import BLOCK, Arm, MeasuredArm, Study, Targets
 from bench.studies.path_scene import Rendered
 from experiments.experiment import Experiment
 from photonfarm.shared.core.errors import SpecError
@@ -48,29 +48,32 @@ class FirstSamples(ChosenSamples):
     def __init__(self, root: Path, scene_id: str, samples: int) -> None:
         """Raises ValueError where the store has too few."""
         super().__init__(root, scene_id, HELD_OUT)
-        self.rows = self.trainable[:samples]
-        if len(self.rows) < samples:
+        self.chosen = self.trainable[:samples]
+        if len(self.chosen) < samples:
             raise ValueError(f"{root} has {len(self.trainable)} samples to train on, and {samples} are needed")
 
 
-def spec_of(told: argparse.Namespace) -> SceneSpec:
+def spec_of(arguments: argparse.Namespace) -> SceneSpec:
     """The spec of an experiment; raises SpecError where there is none, or none of its scene file."""
-    return Experiment.load(told.experiment, told.size).spec()
+    return Experiment.load(arguments.experiment, arguments.size).spec()
 
 
-def requests(told: argparse.Namespace) -> dict[str, list[Request | TopUp]]:
+def requests(arguments: argparse.Namespace) -> dict[str, list[Request | TopUp]]:
     """Half as many configurations again as are trained on, as a quarter of all is held out.
 
     Both stores begin with the same plan, so that their first samples are of the same views.
     """
 
     def configurations(share: float) -> Request:
-        samples = round(share * told.samples)
-        return Request(modifications=samples + samples // 2 + 8, seed=told.plan_seed)
+        samples = round(share * arguments.samples)
+        return Request(modifications=samples + samples // 2 + 8, seed=arguments.plan_seed)
 
     first, most = (configurations(shares[-1]) for shares in BUDGETS.values())
     return {
-        "bdpt": [first, TopUp.of(str(told.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"])],
+        "bdpt": [
+            first,
+            TopUp.of(str(arguments.reference_spp), [f"held-out={HELD_OUT}", f"views=first:{HELD_OUT_VIEWS}"]),
+        ],
         "path": [first, most],
     }
 
@@ -78,27 +81,27 @@ def requests(told: argparse.Namespace) -> dict[str, list[Request | TopUp]]:
 # ----------------------------------------------------------------------------------------------------------- training
 
 
-def arms(told: argparse.Namespace) -> list[Arm]:
+def arms(arguments: argparse.Namespace) -> list[Arm]:
     """Every budget of either kind."""
-    return [Arm(kind, share, round(share * told.samples)) for kind, shares in BUDGETS.items() for share in shares]
+    return [Arm(kind, share, round(share * arguments.samples)) for kind, shares in BUDGETS.items() for share in shares]
 
 
-def runs(arm: Arm, made: Rendered, where: tuple[Path, str], told: argparse.Namespace) -> list[Run]:
+def runs(arm: Arm, made: Rendered, where: tuple[Path, str], arguments: argparse.Namespace) -> list[Run]:
     """The runs of one arm, one from each seed; `where` is the folder and the scene's id."""
     folder, scene_id = where
     source = partial(FirstSamples, made.root, scene_id, arm.samples)
     name = f"{arm.kind}-{made.half_spp}-spp-{arm.samples}"
-    return [Run(source, settings_of(told, seed, HELD_OUT), folder, name) for seed in told.seeds]
+    return [Run(source, settings_of(arguments, seed, HELD_OUT), folder, name) for seed in arguments.seeds]
 
 
-def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: References) -> Measured:
+def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: ReferenceViews) -> MeasuredArm:
     """Look at held-out views with an arm's networks, one from each seed; `where` is bdpt's store and the scene."""
     made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
 
     def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
         return Errors(np.stack([error(images) for images in made]), references.units)
 
-    found = Measured(
+    found = MeasuredArm(
         arm,
         train_s=sum(run.seconds() for run in networks) / len(networks),
         shown=each(references.shown_errors),
@@ -113,7 +116,7 @@ def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], referenc
 # ------------------------------------------------------------------------------------------------------------ targets
 
 
-def targets(made: dict[str, Rendered], spec: SceneSpec, references: References) -> Targets:
+def targets(made: dict[str, Rendered], spec: SceneSpec, references: ReferenceViews) -> Targets:
     """What both kinds of samples show of the views that both stores have, as they are before training."""
     sources = {kind: StoreSource(one.root, spec.scene_id) for kind, one in made.items()}
     first = {kind: _first_rows(source) for kind, source in sources.items()}
@@ -134,12 +137,12 @@ def _first_rows(source: StoreSource) -> dict[bytes, int]:
 
 def _halves(source: StoreSource, rows: Sequence[int], exposure: float) -> F32:
     """(N, 2, H, W, 3) exposed linear radiance."""
-    read = (source.read_batch([row])[0] for row in rows)
+    read = (source.read_samples([row])[0] for row in rows)
     return np.stack([sample.radiance.astype(np.float32) * np.float32(exposure * sample.scale) for sample in read])
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--experiment", default="fixed-veach-ajar", help="whose room it is (%(default)s)")
     parser.add_argument("--size", choices=("small", "paper"), default="small", help="of the experiment (%(default)s)")
@@ -152,29 +155,31 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = options()
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        spec = spec_of(told)
+        spec = spec_of(arguments)
     except SpecError as error:
         parser.error(str(error))
     if not spec.groups:
-        parser.error(f"--experiment {told.experiment}: nothing moves in it; intervals need several configurations")
+        parser.error(f"--experiment {arguments.experiment}: nothing moves in it; intervals need several configurations")
     torch.set_num_threads(1)
-    folder, store = room_study.opened(told, f"{told.experiment}-{spec.scene_id[:8]}-{told.samples}")
+    folder, store = room_study.opened(arguments, f"{arguments.experiment}-{spec.scene_id[:8]}-{arguments.samples}")
     costs = path_scene.costs_of(spec, folder)
-    made = path_scene.render(spec, (folder, store), requests(told), costs, told.processes)
-    references = References.of(store, spec, told.reference_spp, HELD_OUT)
-    networks = {arm: runs(arm, made[arm.kind], (folder, spec.scene_id), told) for arm in arms(told)}
-    room_study.train_all([run for arm in reversed(networks) for run in networks[arm]], told.processes)
+    made = path_scene.render(spec, (folder, store), requests(arguments), costs, arguments.processes)
+    references = ReferenceViews.of(store, spec, arguments.reference_spp, HELD_OUT)
+    networks = {arm: runs(arm, made[arm.kind], (folder, spec.scene_id), arguments) for arm in arms(arguments)}
+    room_study.train_all([run for arm in reversed(networks) for run in networks[arm]], arguments.processes)
     seen_in = made["bdpt"].root, spec.scene_id
     measured = [measure(arm, of_arm, seen_in, references) for arm, of_arm in networks.items()]
-    study = Study(told, spec, settings_of(told, told.seeds[0], HELD_OUT), costs, made, references, measured)
+    study = Study(
+        arguments, spec, settings_of(arguments, arguments.seeds[0], HELD_OUT), costs, made, references, measured
+    )
     looked_at = targets(made, spec, references)
-    told.out.mkdir(parents=True, exist_ok=True)
-    name = f"path_data_{told.experiment.replace('-', '_')}"
-    path_data_page.picture(study, looked_at).save(told.out / f"{name}.png")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    name = f"path_data_{arguments.experiment.replace('-', '_')}"
+    path_data_page.picture(study, looked_at).save(arguments.out / f"{name}.png")
     text, values = path_data_page.page(study, looked_at, f"{name}.png"), path_data_page.document(study, looked_at)
-    results.write("path_data", text, values, told.out, page=name)
+    results.write("path_data", text, values, arguments.out, page=name)
     return 0
 
 

@@ -14,7 +14,7 @@ from bench.harness.mosaic import Column, mosaic
 from bench.harness.network_errors import Errors, each_seed, of_intervals, stated
 from bench.studies import path_statistics
 from bench.studies.path_data_study import BLOCK, METRICS, Study, Targets
-from bench.studies.path_statistics import Bias, Found
+from bench.studies.path_statistics import Bias, BudgetFactor
 from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 SHOWN = (0.3, 0.6, 0.8, 0.95)  # quantiles of the error of bdpt at budget 1: these views are shown
@@ -27,12 +27,12 @@ def in_words(factor: float, budgets: Sequence[float]) -> str:
     return f"{factor:.2f}" if math.isfinite(factor) else f"more than {budgets[-1]:.2f}"
 
 
-def in_interval(found: Found) -> str:
+def in_interval(found: BudgetFactor) -> str:
     """A ratio and its 95 % interval."""
     return f"{found.value:.2f} ({found.low:.2f} … {found.high:.2f})"
 
 
-def within_words(found: Found, budgets: Sequence[float]) -> str:
+def within_words(found: BudgetFactor, budgets: Sequence[float]) -> str:
     """The 95 % interval of a factor."""
     return f"{in_words(found.low, budgets)} … {in_words(found.high, budgets)}"
 
@@ -45,7 +45,7 @@ def arms_table(study: Study) -> str:
         "data", "× samples", "samples", "core-seconds", "each seen", "MSE (95 %)", "of each seed",
         f"of {BLOCK} × {BLOCK} means", "linear MSE (95 %)",
     )  # fmt: skip
-    drawn = study.told.steps * study.settings.batch
+    drawn = study.arguments.steps * study.settings.batch
     lines = [
         [
             f"`{m.arm.kind}`", f"{m.arm.share:g}", m.arm.samples, f"{study.core_s(m.arm):.0f}",
@@ -146,14 +146,15 @@ def is_apart(gap: Errors) -> bool:
 
 def page(study: Study, targets: Targets, picture: str) -> str:
     """The tables as Markdown."""
-    told, spec, references, settings = study.told, study.spec, study.references, study.settings
+    arguments, spec, references, settings = study.arguments, study.spec, study.references, study.settings
+    title, seeds = arguments.experiment, room_study.counted(len(arguments.seeds), "seed")
     all_light, alike = path_statistics.bias(targets.bdpt, targets.path)
     redrawn = " and ".join(f"{made.redrawn} of `{kind}`" for kind, made in study.made.items())
     return f"""# Training data by `bdpt` and by `path`, against core-seconds
 
 {verdict(study, targets)}
 
-The room of the experiment `{told.experiment}` at {spec.film.width}², connections {spec.transport.connections}, light
+The room of the experiment `{title}` at {spec.film.width}², connections {spec.transport.connections}, light
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
 `rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
 each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
@@ -165,14 +166,14 @@ bit by bit, and its first {study.of("bdpt")[-1].arm.samples} training samples ar
 beyond, at budgets above 1, are further configurations.
 
 For each arm alike {room_study.described(settings)}, the same for both kinds of samples.
-{room_study.counted(len(told.seeds), "seed")}, of weights and of the order of samples; plan seed {told.plan_seed}.
+{seeds}, of weights and of the order of samples; plan seed {arguments.plan_seed}.
 All arms are measured after the last step, on {room_study.counted(len(references.rows), "view")} of
 {len(set(references.units))} further configurations.
 
 **MSE** is in the metric space, clip(I, 0, 1)^(1/2.2), against references of {references.spp} spp by `bdpt` whose
 noise is taken out by their halves, but for what that curve makes of it; **of {BLOCK} × {BLOCK} means**, the same of
 blocks of pixels. **Linear MSE** is in exposed linear radiance, in the same way.
-{of_intervals(len(told.seeds))} All are for this one draw of configurations and of noise, which
+{of_intervals(len(arguments.seeds))} All are for this one draw of configurations and of noise, which
 the seeds share: with another draw values may lie outside.
 
 ## What a sample costs, and its noise
@@ -201,7 +202,7 @@ At equal numbers of samples, one of `path` at {study.dearer:.3f} times the core-
 
 {pairs_table(study)}
 
-From {room_study.counted(len(told.seeds), "seed")} little is known of what seeds change: intervals of arms whose seeds
+From {seeds} little is known of what seeds change: intervals of arms whose seeds
 differ are wide, and may pass 0. Small arms are where training is the least reliable; what follows is decided by those
 from × 1. What is left there need not be noise: part of it may not be in what the network is given, as the pattern of a
 metal surface is in no buffer ([training.md](../training.md)).
@@ -222,7 +223,7 @@ variances × that of core-seconds of a sample, over held-out configurations. The
 
 From left to right: the reference; a target of `bdpt` and one of `path` at {study.dearer:.2f} times the cost, both
 held-out too; what is predicted after `bdpt` at budget 1 and after `path` at each budget from 1, from seed
-{told.seeds[0]}, with the MSE.
+{arguments.seeds[0]}, with the MSE.
 From top to bottom: the views at the quantiles {", ".join(f"{q:g}" for q in SHOWN)} of the error with `bdpt`.
 
 ![the reference, targets of both kinds and predictions of {len(SHOWN)} held-out views]({picture})"""
@@ -253,8 +254,8 @@ def document(study: Study, targets: Targets) -> dict[str, Any]:
     ]
     noise = {name: study.noise(targets, relative=name == "relative") for name in ("linear", "relative")}
     all_light, alike = path_statistics.bias(targets.bdpt, targets.path)
-    return room_study.document(study.settings, study.told, study.references) | {
-        "experiment": study.told.experiment,
+    return room_study.document(study.settings, study.arguments, study.references) | {
+        "experiment": study.arguments.experiment,
         "costs": asdict(study.costs) | {"path_spp": study.costs.path_spp, "sampler": "multijitter"},
         "factors_without_calls": study.without_calls,
         "rendered": {
@@ -269,7 +270,7 @@ def document(study: Study, targets: Targets) -> dict[str, Any]:
     }
 
 
-def in_json(found: Found, of_seeds: Sequence[float]) -> dict[str, Any]:
+def in_json(found: BudgetFactor, of_seeds: Sequence[float]) -> dict[str, Any]:
     """A factor as JSON has it, which knows no infinity."""
     finite = {name: value if math.isfinite(value) else None for name, value in asdict(found).items()}
     return {**finite, "of_seeds": [value if math.isfinite(value) else None for value in of_seeds]}

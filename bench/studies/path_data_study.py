@@ -6,10 +6,10 @@ import argparse
 from dataclasses import dataclass
 
 from bench.harness.network_errors import Errors, seed_spread
-from bench.harness.room_study import References
+from bench.harness.room_study import ReferenceViews
 from bench.studies import path_statistics
 from bench.studies.path_scene import Costs, Rendered
-from bench.studies.path_statistics import Found
+from bench.studies.path_statistics import BudgetFactor
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.spec import SceneSpec
@@ -29,7 +29,7 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredArm:
     """Networks of one arm, one from each seed; N held-out views."""
 
     arm: Arm
@@ -54,15 +54,15 @@ class Targets:
 class Study:
     """All that was rendered, trained and measured."""
 
-    told: argparse.Namespace
+    arguments: argparse.Namespace
     spec: SceneSpec
     settings: TrainSettings
     costs: Costs
     made: dict[str, Rendered]
-    references: References
-    measured: list[Measured]
+    references: ReferenceViews
+    measured: list[MeasuredArm]
 
-    def of(self, kind: str) -> list[Measured]:
+    def of(self, kind: str) -> list[MeasuredArm]:
         """The arms of one kind, by ascending budget."""
         return [one for one in self.measured if one.arm.kind == kind]
 
@@ -90,7 +90,7 @@ class Study:
         """What seeds move an arm's mean by, as a share of it, pooled over arms of `least` × samples and more."""
         return seed_spread([getattr(one, metric) for one in self.measured if one.arm.share >= least])
 
-    def factor(self, metric: str, least: float = 0.0) -> tuple[Found, list[float]]:
+    def factor(self, metric: str, least: float = 0.0) -> tuple[BudgetFactor, list[float]]:
         """The factor by which `path` must grow for the error of `bdpt` at budget 1: of all seeds, and of each.
 
         The interval is by `spread` of these arms.
@@ -104,7 +104,7 @@ class Study:
         """What factors are to be multiplied by where the fixed cost of `path`'s calls is not counted."""
         return 1 - self.costs.path_fixed_s / self.made["path"].core_s
 
-    def noise(self, targets: Targets, *, relative: bool) -> tuple[float, float, Found]:
+    def noise(self, targets: Targets, *, relative: bool) -> tuple[float, float, BudgetFactor]:
         """Variances of targets of `bdpt` and of `path` on held-out views, and their ratio at equal core-seconds."""
         views, clean = list(targets.held_out), self.references.mean
         variances = [

@@ -20,7 +20,7 @@ from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class BudgetFactor:
     """A factor and its 95 % interval; 0 is less than was tried, infinity more."""
 
     value: float
@@ -42,14 +42,14 @@ def crossing(budgets: Sequence[float], errors: Sequence[float] | F64, wanted: fl
     return math.inf
 
 
-def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float], spread: float) -> Found:
+def factor(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float], spread: float) -> BudgetFactor:
     """The budget at which arms come down to the errors that are wanted, with its bootstrap interval.
 
     `spread` is what seeds move an arm's mean by, as `replicates` has it.
     """
     value = crossing(budgets, [arm.estimate().mean for arm in arms], wanted.estimate().mean)
     found = [crossing(budgets, one[1:], one[0]) for one in replicates([wanted, *arms], spread=spread)]
-    return Found(value, *within(np.array(found)))
+    return BudgetFactor(value, *within(np.array(found)))
 
 
 def factors_of_seeds(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[float]) -> list[float]:
@@ -58,12 +58,12 @@ def factors_of_seeds(wanted: Errors, arms: Sequence[Errors], budgets: Sequence[f
     return [crossing(budgets, of_seed[1:], of_seed[0]) for of_seed in means.T]
 
 
-def ratio(above: F64, below: F64, units: Sequence[Key]) -> Found:
+def ratio(above: F64, below: F64, units: Sequence[Key]) -> BudgetFactor:
     """The ratio of two means over views (N,), with its bootstrap interval over configurations."""
     errors = [Errors(values[None], tuple(units)) for values in (above, below)]
     drawn = replicates(errors)
     low, high = within(drawn[:, 0] / drawn[:, 1])
-    return Found(errors[0].estimate().mean / errors[1].estimate().mean, low, high)
+    return BudgetFactor(errors[0].estimate().mean / errors[1].estimate().mean, low, high)
 
 
 # ------------------------------------------------------------------------------------------------------------ targets

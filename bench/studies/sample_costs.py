@@ -23,7 +23,7 @@ SPP = (2, 4, 8, 32, 128)
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class RoomCosts:
     """A scene, with what was measured."""
 
     name: str
@@ -42,17 +42,17 @@ class Room:
         return spent / self.terms.excess(self.terms.best(budget))
 
 
-def measured(name: str, views: int) -> Room:
+def measured(name: str, views: int) -> RoomCosts:
     """Costs and noise of one experiment's scene. Raises SpecError."""
     from photonfarm.renderer.measure.sample_costs import measured_costs
 
     spec = room_study.named_room(name)
-    room = Room(name, spec, measured_costs(spec, frames=views))
+    room = RoomCosts(name, spec, measured_costs(spec, frames=views))
     room_study.tell(f"{name}: {room.costs.line()}")
     return room
 
 
-def line(room: Room, budget: float) -> list[str]:
+def line(room: RoomCosts, budget: float) -> list[str]:
     """A row of the table."""
     costs, found = room.costs, room.terms.best(budget)
     parts = (costs.configuration_s, costs.view_s, costs.pass_s, costs.spp_s)
@@ -75,7 +75,7 @@ def shared_out(found: Allocation, *, static: bool) -> str:
     return " × ".join(map(str, parts)) + f" × {found.spp} spp"
 
 
-def page(rooms: list[Room], budget: float, views: int) -> str:
+def page(rooms: list[RoomCosts], budget: float, views: int) -> str:
     """The table as Markdown."""
     header = (
         "experiment", "image", "configuration, ms", "view, ms", "pass, ms", "1 spp, ms", "relative variance ν of 1 spp",
@@ -99,14 +99,14 @@ def main() -> int:
     parser = results.parser(__doc__)
     parser.add_argument("--budget", type=float, default=2000.0, help="core-seconds (%(default)s)")
     parser.add_argument("--views", type=int, default=12, help="that are measured of each (%(default)s)")
-    told = parser.parse_args()
+    options = parser.parse_args()
     try:
-        rooms = [measured(name, told.views) for name in names()]
+        rooms = [measured(name, options.views) for name in names()]
     except SpecError as error:
         parser.error(str(error))
     values = {room.name: asdict(room.costs) for room in rooms}
-    document = {"budget_core_s": told.budget, "views": told.views, "kappa": KAPPA, "rho": RHO, "rooms": values}
-    results.write(NAME, page(rooms, told.budget, told.views), document, told.out)
+    document = {"budget_core_s": options.budget, "views": options.views, "kappa": KAPPA, "rho": RHO, "rooms": values}
+    results.write(NAME, page(rooms, options.budget, options.views), document, options.out)
     return 0
 
 

@@ -151,7 +151,7 @@ def measured(room: str, candidates: Mapping[str, Changes], told: argparse.Namesp
         for name, changes in candidates.items()
     }
     room_study.train_all([run for each in runs.values() for run in each], told.processes)
-    references = room_study.References.of(store, spec, told.reference_spp, HOLD_OUT)
+    references = room_study.ReferenceViews.of(store, spec, told.reference_spp, HOLD_OUT)
     frame_s = frame_seconds({name: each[0] for name, each in runs.items()}, references.rows)
     return [
         Result(name, step_s[name], steps[name], frame_s[name], *_errors(each, references))
@@ -159,7 +159,7 @@ def measured(room: str, candidates: Mapping[str, Changes], told: argparse.Namesp
     ]
 
 
-def _errors(runs: Sequence[room_study.Run], references: room_study.References) -> tuple[Errors, float]:
+def _errors(runs: Sequence[room_study.Run], references: room_study.ReferenceViews) -> tuple[Errors, float]:
     """Squared errors in the metric space, and the mean SSIM."""
     made = [room_study.images(run.trained(), run.source(), references.rows) for run in runs]
     errors = np.stack([references.shown_errors(images) for images in made])

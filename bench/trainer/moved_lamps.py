@@ -39,8 +39,8 @@ from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, f
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, units_of
-from photonfarm.trainer.data.store_source import RawSample, StoreSource
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons, units_of
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
@@ -107,7 +107,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class PredictorGroup:
     """What predicts images: networks that differ in their seeds alone, or what is known without one."""
 
     name: str
@@ -134,7 +134,7 @@ class Views:
         same = [stays(first.sample.buffers, second.sample.buffers) for first, second in self.pairs]
         return Change(shown[:, 1] - shown[:, 0], np.stack(same), self.units)
 
-    def predicted(self, predict: Predictor, candidate: Candidate) -> F64:
+    def predicted(self, predict: Predictor, candidate: PredictorGroup) -> F64:
         """What a predictor says that the lamps change, (N, H, W, 3) in the metric space."""
         total = len(self.base[1].position)
         memory = TrainingBatch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
@@ -149,12 +149,12 @@ class Views:
             fill_photons(memory.inputs.photons, 0, given(look.photons))
         return memory.filled((0,), (b"",))
 
-    def row(self, candidate: Candidate) -> Row:
+    def row(self, candidate: PredictorGroup) -> ExplainedChange:
         """How much of the change a candidate explains."""
         left = np.stack([self.change.left(self.predicted(each, candidate)) for each in candidate.predictors], axis=1)
         there = self.change.there()
         parts = (Explained(Errors(of, self.units), all_) for of, all_ in zip(left, there, strict=True))
-        return Row(candidate.name, candidate.seeds, *parts)
+        return ExplainedChange(candidate.name, candidate.seeds, *parts)
 
 
 def _shown(exposed: F32) -> F64:
@@ -168,7 +168,7 @@ def _shown(exposed: F32) -> F64:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ExplainedChange:
     """What a candidate explains."""
 
     name: str
@@ -178,13 +178,13 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class LampStudy:
     """What was measured of a room."""
 
     name: str
     lamps: tuple[str, ...]
     change: Change
-    rows: tuple[Row, ...]
+    rows: tuple[ExplainedChange, ...]
 
 
 def known_light(batch: TrainingBatch) -> F32:
@@ -224,12 +224,12 @@ def trained_runs(folder: Path) -> list[list[TrainedRun]]:
     return sorted(groups, key=lambda runs: (order.index(runs[0].settings.network.architecture), runs[0].folder.name))
 
 
-def candidate_of(runs: Sequence[TrainedRun], spec: SceneSpec, base: Base) -> Candidate:
+def candidate_of(runs: Sequence[TrainedRun], spec: SceneSpec, base: Base) -> PredictorGroup:
     """Networks that differ in their seeds alone; named as the first's folder, without its seed."""
     first, seeds = runs[0], tuple(run.settings.seed for run in runs)
     predictors = tuple(run.predictor(spec, base, "cpu") for run in runs)
     name = first.folder.name.removesuffix(f"-{first.settings.seed}")
-    return Candidate(name, seeds, predictors, first.needs, first.settings.network.points)
+    return PredictorGroup(name, seeds, predictors, first.needs, first.settings.network.points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +263,7 @@ class Stage:
         """The views of some samples, rendered anew."""
         shines, pairs = lamps(self.spec), []
         for index, row in enumerate(rows):
-            (sample,) = source.read_batch([row])
+            (sample,) = source.read_samples([row])
             moved = relit(sample.modification, sample_modification(self.spec, SEED, index), shines)
             pairs.append((self.look(sample.modification, sample.view), self.look(moved, sample.view)))
         return Views(self.spec, self.base, tuple(pairs), tuple(units_of(source, rows)))
@@ -278,26 +278,26 @@ def held_out(source: StoreSource, share: float, views: int) -> list[int]:
     return found
 
 
-def measured(name: str, told: argparse.Namespace) -> Room:
+def measured(name: str, arguments: argparse.Namespace) -> LampStudy:
     """An experiment's networks on views whose lamps move. Raises PhotonfarmError where that cannot be."""
-    folder = told.work / name
+    folder = arguments.work / name
     runs = trained_runs(folder)
     store, scene_id = Store(folder / "store"), runs[0][0].scene_id
     source = StoreSource(store.root, scene_id)
     share = min(run.settings.hold_out for group in runs for run in group)  # shares are nested: no run has seen these
-    rows = held_out(source, share, told.views)
-    stage = Stage.of(store, scene_id, told.half_spp)
+    rows = held_out(source, share, arguments.views)
+    stage = Stage.of(store, scene_id, arguments.half_spp)
     if not lamps(stage.spec).any():
         raise SpecError(f"{name}: none of its movable groups shines, and this is about lamps that move")
     candidates = [candidate_of(group, stage.spec, stage.base) for group in runs]
     if stage.guides.light_samples:
-        candidates.insert(0, Candidate(KNOWN, (), (known_light,), Needs(points=False, guides=True)))
+        candidates.insert(0, PredictorGroup(KNOWN, (), (known_light,), Needs(points=False, guides=True)))
     views = stage.views(source, rows)
     found = tuple(views.row(candidate) for candidate in candidates)
     for row in found:
         room_study.tell(f"{name}: {row.name} {stated(row.whole)}, on surfaces that stay {stated(row.stays)}")
     named = (group.name for group, shines in zip(stage.spec.groups, lamps(stage.spec), strict=True) if shines)
-    return Room(name, tuple(named), views.change, found)
+    return LampStudy(name, tuple(named), views.change, found)
 
 
 # --------------------------------------------------------------------------------------------------------------- page
@@ -317,7 +317,7 @@ def each_seed(explained: Explained) -> str:
     return f"{' · '.join(f'{share:.3f}' for share in found)}; s = {found.std(ddof=1):.3f}"
 
 
-def part(room: Room) -> str:
+def part(room: LampStudy) -> str:
     """What a page says of a room."""
     header = ("", "R² (95 %)", "of each seed", "R² on surfaces that stay in view (95 %)", "of each seed")
     lines = [
@@ -334,7 +334,7 @@ Lamps that move: {", ".join(room.lamps)}. {room_study.counted(len(room.change.un
 {results.table(header, lines)}"""
 
 
-def page(rooms: Sequence[Room], half_spp: int) -> str:
+def page(rooms: Sequence[LampStudy], half_spp: int) -> str:
     """The tables as Markdown."""
     parts = "\n\n".join(part(room) for room in rooms)
     return f"""# How much of what moved lamps change networks explain
@@ -356,7 +356,7 @@ they are given an image of the very view.
 {parts}"""
 
 
-def document(rooms: Sequence[Room]) -> dict[str, Any]:
+def document(rooms: Sequence[LampStudy]) -> dict[str, Any]:
     """The figures of moved_lamps.json; of each view, what is there and what is left, as shares of all pixels."""
     return {
         room.name: {
@@ -388,7 +388,7 @@ def _rounded(errors: Errors) -> list[list[float]]:
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--rooms", nargs="+", help="experiments that have run (all whose lamps move)")
     parser.add_argument("--views", type=int, default=16, help="held-out configurations, at most (%(default)s)")
@@ -401,19 +401,19 @@ def options() -> argparse.ArgumentParser:
 def main() -> int:
     """Run the benchmark; returns the exit code."""
     parser = options()
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     try:
-        names = told.rooms or rooms_that_ran(told.work)
+        names = arguments.rooms or rooms_that_ran(arguments.work)
         for name in names:
-            trained_runs(told.work / name)  # what is wrong should be said before hours go by
-        rooms = [measured(name, told) for name in names]
+            trained_runs(arguments.work / name)  # what is wrong should be said before hours go by
+        rooms = [measured(name, arguments) for name in names]
     except PhotonfarmError as error:
         parser.error(str(error))
     if not rooms:
-        parser.error(f"{told.work}: no experiment whose lamps move has run; `python experiments/run.py` runs them")
-    figures = {"views": told.views, "half_spp": told.half_spp, "rooms": document(rooms)}
-    results.write(NAME, page(rooms, told.half_spp), figures, told.out)
+        parser.error(f"{arguments.work}: no experiment whose lamps move has run; `python experiments/run.py` runs them")
+    figures = {"views": arguments.views, "half_spp": arguments.half_spp, "rooms": document(rooms)}
+    results.write(NAME, page(rooms, arguments.half_spp), figures, arguments.out)
     return 0
 
 

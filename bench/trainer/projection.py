@@ -20,7 +20,7 @@ from typing import Any, get_args
 import torch
 
 from bench.harness import results
-from bench.trainer.projection_rooms import Counts, Room, Viewed
+from bench.trainer.projection_rooms import Counts, LoadedRoom, Viewed
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.runs.settings import Occlusion
 
@@ -32,7 +32,7 @@ RULES: tuple[Occlusion, ...] = get_args(Occlusion)
 
 
 @dataclass
-class Found:
+class RoomCounts:
     """What was counted in one room, over all views."""
 
     scene: str
@@ -41,7 +41,7 @@ class Found:
     counts: dict[str, Counts] = field(default_factory=lambda: dict.fromkeys((*RULES, "moved"), Counts()))
     query_s: list[float] = field(default_factory=list)  # of each view
 
-    def add(self, viewed: Viewed, room: Room) -> None:
+    def add(self, viewed: Viewed, room: LoadedRoom) -> None:
         """Count one view."""
         self.judged += len(viewed.judged)
         self.query_s.append(viewed.query_s)
@@ -57,10 +57,10 @@ class Found:
         return asdict(self) | {"counts": shares}
 
 
-def measure(name: str, options: argparse.Namespace) -> Found:
+def measure(name: str, options: argparse.Namespace) -> RoomCounts:
     """All views of one room. Raises SpecError where it is not there."""
-    room = Room.load(name, options.points, SIZE)
-    found = Found(name, len(room.geometry.faces))
+    room = LoadedRoom.load(name, options.points, SIZE)
+    found = RoomCounts(name, len(room.geometry.faces))
     for viewed in room.views(options.views, options.judged):
         found.add(viewed, room)
     return found
@@ -73,7 +73,7 @@ def met(counts: Counts) -> bool:
     return counts.recall >= RECALL and counts.leak <= LEAK
 
 
-def verdict(rooms: Iterable[Found]) -> str:
+def verdict(rooms: Iterable[RoomCounts]) -> str:
     """The rules that meet the target, and in how many rooms each does."""
     of = [found for found in rooms if found.scene in TARGET_ROOMS]
     if not of:
@@ -90,7 +90,7 @@ def verdict(rooms: Iterable[Found]) -> str:
     return "\n".join(lines)
 
 
-def rooms_table(rooms: Iterable[Found]) -> str:
+def rooms_table(rooms: Iterable[RoomCounts]) -> str:
     """Recall and leak in percent; bold where both meet the target."""
 
     def pair(counts: Counts) -> str:
@@ -107,7 +107,7 @@ def rooms_table(rooms: Iterable[Found]) -> str:
     return results.table(header, lines)
 
 
-def page(rooms: list[Found], options: argparse.Namespace) -> str:
+def page(rooms: list[RoomCounts], options: argparse.Namespace) -> str:
     query_ms = 1e3 * statistics.median(s for found in rooms for s in found.query_s)
     return f"""# Projection: which points are kept
 

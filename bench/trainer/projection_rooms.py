@@ -79,7 +79,7 @@ class Viewed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Room:
+class LoadedRoom:
     """A room that is loaded, with its base cloud."""
 
     spec: SceneSpec
@@ -88,7 +88,7 @@ class Room:
     cloud: BasePointCloud
 
     @classmethod
-    def load(cls, name: str, points: int, size: int) -> Room:
+    def load(cls, name: str, points: int, size: int) -> LoadedRoom:
         """A built-in room, or one of `scenes/`, with a square film; SpecError where it is not in PHOTONFARM_SCENES."""
         from photonfarm.renderer.scene.loaded_scene import LoadedScene
 

@@ -10,7 +10,6 @@ seconds with a GPU; reading and waiting in seconds, by the feed that training us
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import tempfile
@@ -50,7 +49,7 @@ PARTS = ("copy", "point branch", "projection", "photon map", "U-Net", "optimiser
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ArchitectureTimes:
     """One architecture; milliseconds per batch."""
 
     architecture: str
@@ -84,11 +83,11 @@ class Preset:
     name: str
     size: int
     settings: TrainSettings
-    rows: list[Row]
+    rows: list[ArchitectureTimes]
     reading: Reading
 
 
-class Clock:
+class WorkTimer:
     """Milliseconds of a piece of work: CPU time, or time on a GPU until it has done what it was given."""
 
     def __init__(self, device: str, repetitions: int) -> None:
@@ -125,7 +124,7 @@ def filled(spec: SceneSpec, root: Path) -> str:
     return scene.scene_id
 
 
-def measure(where: tuple[Path, str], settings: TrainSettings, clock: Clock, steps: int) -> Row:
+def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, steps: int) -> ArchitectureTimes:
     """One architecture on a complete store."""
     with Feed(StoreSource(*where), settings) as feed:
         rows = [row for row, _ in feed.arrivals()[0]]
@@ -134,14 +133,14 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: Clock, step
         batch = feed.take()
         step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))
         parameters = sum(w.numel() for w in learner.network.parameters())
-    return Row(
+    return ArchitectureTimes(
         settings.network.architecture, parameters, step.pop(WHOLE), image.pop(WHOLE), step, image,
         fed_ms(where, settings) * settings.batch, wait_share(where, settings, steps),
     )  # fmt: skip
 
 
 def timed(
-    learner: Learner, batch: TrainingBatch, device: torch.device, clock: Clock, *, gradients: bool
+    learner: Learner, batch: TrainingBatch, device: torch.device, clock: WorkTimer, *, gradients: bool
 ) -> dict[str, float]:
     """A step, or an image, and its parts, each by itself."""
     network = learner.network
@@ -227,7 +226,7 @@ def reading(where: tuple[Path, str], settings: TrainSettings, size: int) -> Read
     def one_round() -> float:
         began = time.perf_counter()
         for i in range(0, len(rows), settings.batch):
-            source.read_batch(rows[i : i + settings.batch])
+            source.read_samples(rows[i : i + settings.batch])
         return (time.perf_counter() - began) * 1e3 / len(rows)
 
     one_round()
@@ -249,7 +248,7 @@ def for_architecture(settings: TrainSettings, architecture: str) -> TrainSetting
 def preset_section(found: Preset) -> str:
     """The tables of one preset as Markdown."""
 
-    def line(row: Row, whole: float, parts: dict[str, float]) -> list[str]:
+    def line(row: ArchitectureTimes, whole: float, parts: dict[str, float]) -> list[str]:
         shares = [f"{parts[part] / whole:.0%}" if part in parts else "" for part in PARTS]
         rest = 1 - sum(parts.values()) / whole
         return [f"`{row.architecture}`", f"{whole:.1f}", *shares, f"{round(100 * rest)}%", f"{points_share(parts):.1%}"]
@@ -273,7 +272,7 @@ Images:
 """
 
 
-def page(told: argparse.Namespace, presets: list[Preset]) -> str:
+def page(device: str, presets: list[Preset]) -> str:
     """All of it as Markdown."""
     most = max(points_share(parts) for row in presets[-1].rows for parts in (row.step_parts_ms, row.image_parts_ms))
     waiting = max(row.wait_share for row in presets[0].rows)
@@ -284,7 +283,7 @@ def page(told: argparse.Namespace, presets: list[Preset]) -> str:
 Waiting for data takes at most {waiting:.1%} of a step with `small`; 5 % are allowed. Light transport, projection and
 photon map take at most {most:.1%} of the U-Net's time at the supplement's sizes; 15 % are allowed.
 
-`room` on the device `{told.device}`, one thread. Parts are measured by themselves, so that their shares need not sum to
+`room` on the device `{device}`, one thread. Parts are measured by themselves, so that their shares need not sum to
 100 %; the rest is the loss, rays, and what joins the parts. **Points over U-Net** is point branch, projection and
 photon map over the U-Net's time. Medians of turns. Reading is a thread's, which works ahead on the same processor
 cores; waiting is what is left of it in a run, as a share of the steps' time.
@@ -298,7 +297,7 @@ network takes, in float32, exposed, with the configuration's points and photons.
 {results.table(("size", "as stored", *(f"`{name}`" for name in shown())), fed)}"""
 
 
-def measure_preset(name: str, size: int, settings: TrainSettings, clock: Clock, steps: int) -> Preset:
+def measure_preset(name: str, size: int, settings: TrainSettings, clock: WorkTimer, steps: int) -> Preset:
     """All architectures, on a store of their own."""
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder), filled(resized(size, settings.network.points), Path(folder))
@@ -314,16 +313,17 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=100, help="of the run whose waiting is measured (100)")
     parser.add_argument("--repetitions", type=int, default=15)
     parser.add_argument("--paper-batch", type=int, default=1, help="at the supplement's sizes (1)")
-    told = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    small = preset("small", device=told.device)
-    paper = preset("paper-dynamic", device=told.device, batch=told.paper_batch)
-    fewer = Clock(told.device, -(-told.repetitions // 5))
+    small = preset("small", device=options.device)
+    paper = preset("paper-dynamic", device=options.device, batch=options.paper_batch)
+    fewer = WorkTimer(options.device, -(-options.repetitions // 5))
     presets = [
-        measure_preset("small", 64, small, Clock(told.device, told.repetitions), told.steps),
-        measure_preset("paper-dynamic", 256, paper, fewer, -(-told.steps // 20)),
+        measure_preset("small", 64, small, WorkTimer(options.device, options.repetitions), options.steps),
+        measure_preset("paper-dynamic", 256, paper, fewer, -(-options.steps // 20)),
     ]
-    results.write("train_step", page(told, presets), {"presets": [document(of) for of in presets]}, told.out)
+    values = {"presets": [document(of) for of in presets]}
+    results.write("train_step", page(options.device, presets), values, options.out)
     return 0
 
 

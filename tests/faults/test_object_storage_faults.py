@@ -268,7 +268,7 @@ def test_workers_behind_a_lossy_way_and_under_kills_lose_and_double_nothing(
     assert source.ready()
     rows = source.refresh()
     assert rows.size == 12
-    assert all(np.isfinite(sample.radiance).all() for sample in source.read_batch(rows.tolist()))
+    assert all(np.isfinite(sample.radiance).all() for sample in source.read_samples(rows.tolist()))
     assert len(source.base()[1].position) == scene.spec.points
     keys: PlannedRows = scene.plans()[0].rows
     assert len({keys.sample_key[row].tobytes() for row in rows}) == 12

@@ -1,7 +1,6 @@
 """Samples of the analytic room: as a source that grows, and as jobs of a store."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,26 +16,13 @@ from photonfarm.shared.core.records import (
     Guides,
     Photons,
     ViewBuffers,
-    Visibility,
 )
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.shared.store import Figures, SceneStore
-
-
-@dataclass(frozen=True)
-class AnalyticSample:
-    row: int
-    modification: Modification
-    view: View
-    radiance: F32
-    buffers: ViewBuffers
-    visibility: Visibility
-    pass_: int
-    scale: float = 1.0
-    guides: Guides | None = None
+from photonfarm.trainer.data.dataset import RawSample
 
 
 class AnalyticSource:
@@ -56,9 +42,11 @@ class AnalyticSource:
 
     def follow_guides(self) -> None: ...
 
+    @property
     def planned(self) -> int:
         return self._samples
 
+    @property
     def plan_requests(self) -> list[dict[str, Any]]:
         return [{"samples": self._samples}]
 
@@ -67,6 +55,7 @@ class AnalyticSource:
         self._released = min(self._samples, before + self._per_look)
         return np.arange(before, self._released)
 
+    @property
     def taken_back(self) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
 
@@ -99,16 +88,16 @@ class AnalyticSource:
     def clean(self, row: int) -> F32:
         return render(self.spec, self.modification(row), self.view(row))[0]
 
-    def read(self, row: int) -> AnalyticSample:
+    def read(self, row: int) -> RawSample:
         self.reads.append(row)
         modification, view = self.modification(row), self.view(row)
         clean, buffers = render(self.spec, modification, view)
         photons = self.read_photons(row) if self.spec.photons.paths else None
         seen = visibility(self.spec, self._base[1], modification, view, photons)
         guides = known(clean, buffers, min(LIT_POINTS, self.spec.points))
-        return AnalyticSample(row, modification, view, noisy(clean, row, self._noise), buffers, seen, 0, guides=guides)
+        return RawSample(modification, view, noisy(clean, row, self._noise), 1.0, buffers, seen, 0, guides)
 
-    def read_batch(self, rows: Sequence[int]) -> list[AnalyticSample]:
+    def read_samples(self, rows: Sequence[int]) -> list[RawSample]:
         return [self.read(row) for row in rows]
 
     def read_photons(self, row: int) -> Photons:

@@ -25,7 +25,7 @@ def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
     run = TrainedRun.load(folder)
     with Feed(make(), run.settings.model_copy(update={"device": "cpu"}), needs=run.needs) as feed:
         rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]
-        gauges = Baselines.of(make(), run, rows)
+        baselines = Baselines.of(make(), run, rows)
         network = run.network(feed.spec, (feed.geometry, feed.cloud))
         last = measure(network_predictor(network), batches(feed, rows, run.settings.batch)).error
-    return Errors(gauges.untrained.error.mean, last.mean, gauges.mean_colour.error.mean, last.count)
+    return Errors(baselines.untrained.error.mean, last.mean, baselines.mean_colour.error.mean, last.count)

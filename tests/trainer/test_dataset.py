@@ -183,7 +183,7 @@ def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothi
     source = StoreSource(scene.storage.root, scene.scene_id)
     settings = tiny(max_steps=60, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
     read = [0]
-    plain = source.read_batch
+    plain = source.read_samples
 
     def counted(rows: Sequence[int]) -> Any:
         read[0] += 1
@@ -193,7 +193,7 @@ def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothi
             commit(scene, 0)
         return plain(rows)
 
-    source.read_batch = counted
+    source.read_samples = counted
     assert train(source, settings, run).reason == "steps"
     state = checkpoint.load(run / CHECKPOINT)["following"]
     visits = state["sampler"]["visits"]

@@ -182,9 +182,9 @@ def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
         source = make_source(24)
         if fault == "step" and os.environ["RANK"] == "0":
             Ranks.average = fail  # in a process of its own
-        honest = source.read_batch
+        honest = source.read_samples
 
-        def read_batch(rows: Any) -> Any:
+        def read_samples(rows: Any) -> Any:
             samples = honest(rows)
             if fault == "store" and os.environ["RANK"] == "0" and len(source.reads) > 20:
                 raise StoreError("the disk is gone")
@@ -192,7 +192,7 @@ def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
                 samples[0].radiance[:] = np.nan
             return samples
 
-        source.read_batch = read_batch
+        source.read_samples = read_samples
         return source
 
     began = time.monotonic()
@@ -210,14 +210,14 @@ def test_a_rank_that_hangs_in_a_step_is_waited_for_by_far_less_than_one_that_has
     def make() -> Any:
         source, began = make_source(24), time.monotonic()
         source.ready = lambda: time.monotonic() - began > patience_s + 0.5
-        honest, hangs = source.read_batch, [2 * patience_s]
+        honest, hangs = source.read_samples, [2 * patience_s]
 
-        def read_batch(rows: Any) -> Any:
+        def read_samples(rows: Any) -> Any:
             if os.environ["RANK"] == "1" and len(source.reads) > 6 and hangs:
                 time.sleep(hangs.pop())
             return honest(rows)
 
-        source.read_batch = read_batch
+        source.read_samples = read_samples
         return source
 
     assert together(make, tiny(batch=4, checkpoint_every=1), run) == [IncompleteError.exit_code] * 2

@@ -27,8 +27,7 @@ from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
 from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons
-from photonfarm.trainer.data.store_source import RawSample
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network

@@ -322,7 +322,7 @@ def test_photons_are_fed_as_the_store_has_them(make_source, commit, tiny, tmp_pa
         for place, row in enumerate((3, 0)):
             for name, wanted in arrays_of(source.read_photons(row)).items():
                 np.testing.assert_array_equal(getattr(batch.inputs.photons, name)[place].numpy(), wanted)
-            seen = source.read_batch([row])[0].visibility.photons
+            seen = source.read_samples([row])[0].visibility.photons
             np.testing.assert_array_equal(batch.inputs.photons.seen[place].numpy(), seen)
             assert 0 < seen.sum() < 32
         assert batch.inputs.photons.present.sum(dim=1).tolist() == [32, 32]  # the second hits of each are empty

@@ -98,12 +98,12 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
 def test_the_samples_of_a_store_reach_the_trainer(scene, commit) -> None:
     source = StoreSource(scene.folder.parent.parent, scene.scene_id)
     assert source.ready()
-    assert len(source.refresh()) == source.planned() == 0
+    assert len(source.refresh()) == source.planned == 0
     scene.plan(Request(modifications=4, views_per_modification=2, passes=2), shard_rows=8)
     assert commit(scene, 0)
     rows = source.refresh()
-    assert (len(rows), source.planned()) == (8, 16)
-    one, other = source.read_batch(rows[:2].tolist())
+    assert (len(rows), source.planned) == (8, 16)
+    one, other = source.read_samples(rows[:2].tolist())
     assert one.radiance.shape == (2, 16, 16, 3)
     assert not np.array_equal(one.radiance[0], one.radiance[1])
     keys = source.view_keys(rows.tolist())

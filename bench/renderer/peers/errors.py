@@ -13,22 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+F64 = NDArray[np.float64]
 EPSILON = 1e-2  # so that dark pixels do not count without bound; as in the pilot (renderer/strategy/noise.py)
 TRIM = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class ReferenceImage:
     """An estimate of the true image that shares no sample with what is measured against it."""
 
-    image: Array  # [H, W, 3]
-    variance: Array  # [H, W, 3]: of `image`, not of one render
+    image: F64  # [H, W, 3]
+    variance: F64  # [H, W, 3]: of `image`, not of one render
     mean: float
     mean_standard_error: float
 
 
-def reference_of(sets: list[Any]) -> Reference:
+def reference_of(sets: list[Any]) -> ReferenceImage:
     """The mean of sets of independent renders [K, H, W, 3], each weighted by the inverse variance of its mean.
 
     One weight per set, not per pixel: weights that follow a pixel's own noise would favour renders that missed light.
@@ -41,10 +41,10 @@ def reference_of(sets: list[Any]) -> Reference:
     variance = sum(w**2 * v for w, v in zip(weights, variances, strict=True))
     means = [s.reshape(len(s), -1).mean(axis=1) for s in stacks]
     squared = sum(w**2 * m.var(ddof=1) / len(m) for w, m in zip(weights, means, strict=True))
-    return Reference(np.asarray(image), np.asarray(variance), float(np.mean(image)), math.sqrt(float(squared)))
+    return ReferenceImage(np.asarray(image), np.asarray(variance), float(np.mean(image)), math.sqrt(float(squared)))
 
 
-def relative_errors(images: Any, reference: Reference, relative_to: Reference | None = None) -> Array:
+def relative_errors(images: Any, reference: ReferenceImage, relative_to: ReferenceImage | None = None) -> F64:
     """[K, P] squared errors ((f − r)² − var r) / (q² + ε·mean(q)²), averaged over channels; q is r unless given.
 
     f and r are independent, so E (f − r)² = E (f − truth)² + var r: subtracting the reference's variance leaves the
@@ -56,12 +56,12 @@ def relative_errors(images: Any, reference: Reference, relative_to: Reference | 
     return np.asarray((squared / (q.image**2 + EPSILON * q.mean**2)).mean(axis=-1).reshape(len(f), -1))
 
 
-def full_error(errors: Array) -> float:
+def full_error(errors: F64) -> float:
     """RelMSE: mean of [K, P] errors."""
     return float(errors.mean())
 
 
-def trimmed_error(errors: Array) -> float:
+def trimmed_error(errors: F64) -> float:
     """RelMSE without the pixels whose error, averaged over the renders, is among the worst 1 %.
 
     The same rule for every method, but each loses its own worst pixels. It forgives rare outliers, so it flatters
@@ -72,14 +72,14 @@ def trimmed_error(errors: Array) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class JackknifeEstimate:
     """A figure and its standard error; NaN where it cannot be had."""
 
     value: float
     standard_error: float
 
 
-def jackknifed(estimate: Callable[[NDArray[np.intp]], float], rounds: int) -> Estimate:
+def jackknifed(estimate: Callable[[NDArray[np.intp]], float], rounds: int) -> JackknifeEstimate:
     """`estimate` of all round numbers, with the delete-one jackknife's standard error.
 
     Works on logarithms, as errors and their ratios are products. NaN if any estimate is not positive.
@@ -88,20 +88,20 @@ def jackknifed(estimate: Callable[[NDArray[np.intp]], float], rounds: int) -> Es
     whole = estimate(everything)
     parts = np.array([estimate(np.delete(everything, k)) for k in range(rounds)]) if rounds > 2 else np.array([np.nan])
     if not whole > 0 or not np.all(parts > 0):
-        return Estimate(whole if whole > 0 else math.nan, math.nan)
+        return JackknifeEstimate(whole if whole > 0 else math.nan, math.nan)
     logarithms = np.log(parts)
     spread = math.sqrt((rounds - 1) / rounds * float(((logarithms - logarithms.mean()) ** 2).sum()))
-    return Estimate(whole, whole * spread)
+    return JackknifeEstimate(whole, whole * spread)
 
 
-def error_of(errors: Array, measure: Callable[[Array], float]) -> Estimate:
+def error_of(errors: F64, measure: Callable[[F64], float]) -> JackknifeEstimate:
     """One figure of [K, P] errors, full or trimmed, and its standard error."""
     return jackknifed(lambda kept: measure(errors[kept]), len(errors))
 
 
 def efficiency(
-    errors: Array, seconds: Array, base_errors: Array, base_seconds: Array, measure: Callable[[Array], float]
-) -> Estimate:
+    errors: F64, seconds: F64, base_errors: F64, base_seconds: F64, measure: Callable[[F64], float]
+) -> JackknifeEstimate:
     """(error × time) of the baseline over that of a method, above 1 is better.
 
     Errors [K, P], seconds [K]; round k of both ran one after the other, and they are deleted together.
@@ -123,7 +123,7 @@ class MeanRatio:
     z: float  # (value − 1) in standard errors, mapped from Student's t to a normal distribution
 
 
-def mean_ratio(images: Any, reference: Reference) -> MeanRatio:
+def mean_ratio(images: Any, reference: ReferenceImage) -> MeanRatio:
     """How bright K images are together, against the reference; its noise counts too."""
     from photonfarm.shared.core.statistics import student_to_normal
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench.renderer.peers import chosen, luxcore, luxcore_scene, scoring
-from bench.renderer.peers.errors import Reference, reference_of
+from bench.renderer.peers.errors import ReferenceImage, reference_of
 from bench.renderer.peers.methods import Calibration, Method, MitsubaMethod, Shot, calibrate, integrator, multijittered
 from bench.renderer.peers.plans import BUDGETS, ScenePlan
 
@@ -20,7 +20,7 @@ REFERENCE_SEED = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class MeasureSettings:
     """How to measure; a result is valid for exactly these."""
 
     methods: tuple[str, ...]
@@ -40,7 +40,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredMethod:
     """The images of one method."""
 
     calibration: Calibration
@@ -48,11 +48,11 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Line:
+class SceneToMeasure:
     """One scene to measure: what every step needs to know."""
 
     plan: ScenePlan
-    settings: Settings
+    settings: MeasureSettings
     scene: Any  # Mitsuba's, loaded
 
     def method(self, name: str, chosen: dict[str, Any] | None = None) -> MitsubaMethod:
@@ -61,9 +61,9 @@ class Line:
         return MitsubaMethod(self.scene, integrator(name, self.plan.max_depth, chosen or {}), camera)
 
 
-def measure(name: str, plan: ScenePlan, settings: Settings, scene: Any) -> dict[str, Any]:
+def measure(name: str, plan: ScenePlan, settings: MeasureSettings, scene: Any) -> dict[str, Any]:
     """The result of one line, as JSON takes it."""
-    line = Line(plan, settings, scene)
+    line = SceneToMeasure(plan, settings, scene)
     methods, absent, differences = _peers(line)
     try:
         calibrations = {name: _calibrated(name, methods[name], settings) for name in methods}
@@ -93,13 +93,13 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _calibrated(name: str, method: Method, settings: Settings) -> Calibration:
+def _calibrated(name: str, method: Method, settings: MeasureSettings) -> Calibration:
     found = calibrate(method, settings.budgets_s, settings.clock)
     say(f"  {name}: {found.spp} spp, compiled in {found.compile_s:.1f} s")
     return found
 
 
-def _settle(line: Line, calibrations: Mapping[str, Calibration]) -> chosen.Chosen | None:
+def _settle(line: SceneToMeasure, calibrations: Mapping[str, Calibration]) -> chosen.Chosen | None:
     """The settings of the method 'chosen'. After the others are compiled: the pilot compiles all of its candidates."""
     settings = line.settings
     if "chosen" not in settings.methods:
@@ -112,7 +112,7 @@ def _settle(line: Line, calibrations: Mapping[str, Calibration]) -> chosen.Chose
     return found
 
 
-def _peers(line: Line) -> tuple[dict[str, Method], dict[str, str], set[str]]:
+def _peers(line: SceneToMeasure) -> tuple[dict[str, Method], dict[str, str], set[str]]:
     """(methods but 'chosen' by name, why others are absent, in what LuxCore's scene is only almost the same)."""
     methods: dict[str, Method] = {}
     absent: dict[str, str] = {}
@@ -139,10 +139,10 @@ def _peers(line: Line) -> tuple[dict[str, Method], dict[str, str], set[str]]:
 
 
 def _in_turns(
-    methods: Mapping[str, Method], calibrations: Mapping[str, Calibration], settings: Settings
-) -> dict[str, Measured]:
+    methods: Mapping[str, Method], calibrations: Mapping[str, Calibration], settings: MeasureSettings
+) -> dict[str, MeasuredMethod]:
     """Every round renders one image of every method at every budget, so that drift of the machine meets all alike."""
-    measured = {name: Measured(calibrations[name], [[] for _ in BUDGETS]) for name in methods}
+    measured = {name: MeasuredMethod(calibrations[name], [[] for _ in BUDGETS]) for name in methods}
     for k in range(settings.seeds):
         order = list(methods)[k % len(methods) :] + list(methods)[: k % len(methods)]
         for name in order:
@@ -153,8 +153,8 @@ def _in_turns(
 
 
 def _references(
-    line: Line, methods: Mapping[str, Method], calibrations: Mapping[str, Calibration]
-) -> tuple[dict[str, Reference], str]:
+    line: SceneToMeasure, methods: Mapping[str, Method], calibrations: Mapping[str, Calibration]
+) -> tuple[dict[str, ReferenceImage], str]:
     """(reference of each method, what the common one is made of).
 
     LuxCore has its own, as its scene differs a little.

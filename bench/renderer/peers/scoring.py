@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.renderer.peers.errors import (
-    Array,
-    Reference,
+    F64,
+    ReferenceImage,
     efficiency,
     error_of,
     full_error,
@@ -22,13 +22,15 @@ from bench.renderer.peers.methods import Shot
 from bench.renderer.peers.plans import BASELINE
 
 if TYPE_CHECKING:
-    from bench.renderer.peers.measure import Measured
+    from bench.renderer.peers.measure import MeasuredMethod
 
 AVERAGED = (2, 4)
 """Points of the plots beyond the time budget: so many independent images averaged, at so many times the cost."""
 
 
-def rows(measured: Mapping[str, Measured], references: Mapping[str, Reference], clock: str) -> dict[str, Any]:
+def rows(
+    measured: Mapping[str, MeasuredMethod], references: Mapping[str, ReferenceImage], clock: str
+) -> dict[str, Any]:
     """A row of figures for each method, at the full time budget."""
     common = references["common"]
     scored = {name: _scored(m.shots[-1], references[name], common, clock) for name, m in measured.items()}
@@ -53,7 +55,7 @@ def rows(measured: Mapping[str, Measured], references: Mapping[str, Reference], 
 
 
 def gains(
-    of: str, measured: Mapping[str, Measured], references: Mapping[str, Reference], clock: str
+    of: str, measured: Mapping[str, MeasuredMethod], references: Mapping[str, ReferenceImage], clock: str
 ) -> dict[str, dict[str, Any]]:
     """(relMSE × time) of each other method over that of the method `of`: 'full' and 'trimmed', above 1 `of` is better.
 
@@ -72,13 +74,15 @@ def gains(
 
 
 def curves(
-    measured: Mapping[str, Measured], references: Mapping[str, Reference], clock: str
+    measured: Mapping[str, MeasuredMethod], references: Mapping[str, ReferenceImage], clock: str
 ) -> dict[str, list[dict[str, Any]]]:
     """Points (seconds, full, trimmed, spp, averaged images) of each method, shortest time first."""
     return {name: _curve(m, references[name], references["common"], clock) for name, m in measured.items()}
 
 
-def _curve(measured: Measured, reference: Reference, common: Reference, clock: str) -> list[dict[str, Any]]:
+def _curve(
+    measured: MeasuredMethod, reference: ReferenceImage, common: ReferenceImage, clock: str
+) -> list[dict[str, Any]]:
     points = []
     for spp, shots in zip(measured.calibration.spp, measured.shots, strict=True):
         errors, seconds = _scored(shots, reference, common, clock)
@@ -96,12 +100,12 @@ def _curve(measured: Measured, reference: Reference, common: Reference, clock: s
     return points
 
 
-def _point(errors: Array, seconds: float, spp: int, averaged: int) -> dict[str, Any]:
+def _point(errors: F64, seconds: float, spp: int, averaged: int) -> dict[str, Any]:
     full, trimmed = full_error(errors), trimmed_error(errors)
     return {"seconds": seconds, "full": full, "trimmed": trimmed, "spp": spp, "averaged": averaged}
 
 
-def _scored(shots: list[Shot], reference: Reference, common: Reference, clock: str) -> tuple[Array, Array]:
+def _scored(shots: list[Shot], reference: ReferenceImage, common: ReferenceImage, clock: str) -> tuple[F64, F64]:
     return relative_errors(_images(shots), reference, common), np.array([shot.seconds(clock) for shot in shots])
 
 

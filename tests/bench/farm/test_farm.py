@@ -10,7 +10,7 @@ import pytest
 
 from bench.farm import farm, pairs
 from bench.farm.account import WRITER, Account, Ledger, accounted
-from bench.farm.pairs import Run
+from bench.farm.pairs import ConcurrentWork
 
 # of three jobs after the first, in seconds: 10 of rendering, 1 of the store's, 0.5 of the rest, 0.1 of the queue
 JOB = {"loop": 11.6, "render": 11.5, "scene": 10.0, "rows": 0.4, "commit": 0.6}
@@ -82,10 +82,10 @@ def test_a_run_without_a_steady_state_ends_the_program(count: int) -> None:
 
 def test_ratios_are_of_neighbouring_runs() -> None:
     runs = [
-        (Run(1.0, {0: 3.0}), Run(1.8, {0: 4.0})),
-        (Run(2.0, {0: 3.0}), Run(3.8, {0: 3.0})),
+        (ConcurrentWork(1.0, {0: 3.0}), ConcurrentWork(1.8, {0: 4.0})),
+        (ConcurrentWork(2.0, {0: 3.0}), ConcurrentWork(3.8, {0: 3.0})),
     ]
-    runs.append((Run(4.0, {0: 3.0}), Run(6.0, {0: 6.0})))
+    runs.append((ConcurrentWork(4.0, {0: 3.0}), ConcurrentWork(6.0, {0: 6.0})))
     found = pairs.pair_of("jobs", runs)
     assert (found.one, found.two) == (2.0, 3.8)
     assert (found.ratio, found.ratio_from, found.ratio_to) == pytest.approx((1.8, 1.5, 1.9))
@@ -93,7 +93,7 @@ def test_ratios_are_of_neighbouring_runs() -> None:
 
 
 def test_processor_time_is_compared_for_the_same_jobs() -> None:
-    one, two = Run(1.0, {1: 4.0, 2: 10.0, 3: 6.0}), Run(2.0, {2: 11.0, 3: 7.0, 4: 100.0})
+    one, two = ConcurrentWork(1.0, {1: 4.0, 2: 10.0, 3: 6.0}), ConcurrentWork(2.0, {2: 11.0, 3: 7.0, 4: 100.0})
     assert pairs.cost_of_company(one, two) == pytest.approx(18 / 16)
 
 

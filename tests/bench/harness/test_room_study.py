@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import operator
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,16 @@ import numpy as np
 import pytest
 from analytic_scene import AnalyticScene, small_spec
 from numpy.typing import NDArray
+from store_samples import commit_guides
 
 from bench.harness import room_study
 from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors
-from bench.harness.room_study import HELD_OUT, References, Run
-from bench.studies.budget_arms import HALF_SPP, Arm, Share, requests
+from bench.harness.room_study import HELD_OUT, ReferenceViews, Run
+from bench.studies.budget_arms import HALF_SPP, ArmSamples, Share, requests
 from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
@@ -59,46 +62,58 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
     return Path(store.root), spec.scene_id
 
 
-def configurations(arm: Arm) -> set[bytes]:
-    return set(arm.modification_keys(arm.rows))
+def configurations(arm: ArmSamples) -> set[bytes]:
+    return set(arm.modification_keys(arm.chosen))
 
 
 @pytest.mark.parametrize("spp", [2, 4, 16])
 def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
-    arm, source = Arm(*root, Share(spp, 1, 1), 4), StoreSource(*root)
+    arm, source = ArmSamples(*root, Share(spp, 1, 1), 4), StoreSource(*root)
     complete = source.refresh().tolist()
-    (key,) = arm.view_keys(arm.rows[:1])
+    (key,) = arm.view_keys(arm.chosen[:1])
     passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
-    (sample,) = arm.read_batch(arm.rows[:1])
+    (sample,) = arm.read_samples(arm.chosen[:1])
 
-    read = source.read_batch(passes)
+    read = source.read_samples(passes)
     expected = np.mean([one.radiance.astype(np.float64) * one.scale for one in read], axis=0)
     assert len(read) == spp // 2
     np.testing.assert_allclose(sample.radiance.astype(np.float64) * sample.scale, expected, rtol=1e-6)
 
 
 def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view(root: Root) -> None:
-    arm = Arm(*root, Share(2, 2, 2), 5)
+    arm = ArmSamples(*root, Share(2, 2, 2), 5)
     assert len(configurations(arm)) == 5
-    assert len(set(arm.view_keys(arm.rows))) == 10
-    assert len(arm.rows) == len(set(arm.rows)) == 20
-    first, second = (arm.read_batch([row])[0].radiance.copy() for row in arm.rows[:2])
-    assert arm.view_keys(arm.rows[:1]) == arm.view_keys(arm.rows[1:2])
+    assert len(set(arm.view_keys(arm.chosen))) == 10
+    assert len(arm.chosen) == len(set(arm.chosen)) == 20
+    first, second = (arm.read_samples([row])[0].radiance.copy() for row in arm.chosen[:2])
+    assert arm.view_keys(arm.chosen[:1]) == arm.view_keys(arm.chosen[1:2])
     assert np.any(first != second), "two passes of one view"
 
 
 def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) -> None:
-    arm = Arm(*root, Share(2, 1, 1), 30)
-    assert not any(rows_held_out(arm, arm.rows, HELD_OUT))
+    arm = ArmSamples(*root, Share(2, 1, 1), 30)
+    assert not any(rows_held_out(arm, arm.chosen, HELD_OUT))
     new = arm.refresh().tolist()
-    assert new[:-1] == arm.rows
+    assert new[:-1] == arm.chosen
     assert rows_held_out(arm, new[-1:], HELD_OUT) == [True], "one for the trainer to look at"
     assert not len(arm.refresh())
 
 
+def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_path: Path) -> None:
+    scene = Store(shutil.copytree(root[0], tmp_path / "store")).scene(root[1])
+    scene.guides.want(GuideSpec())
+    for job in scene.missing_jobs():
+        commit_guides(scene, job)
+    arm = ArmSamples(tmp_path / "store", root[1], Share(2, 1, 1), 4)
+    arm.follow_guides()
+    rows = arm.refresh().tolist()
+    assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
+    assert all(sample.guides is not None for sample in arm.read_samples(rows))
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root: Root, number: int) -> None:
-    arms = [Arm(*root, Share(spp, 1, 1), count, (number, 2)) for spp, count in ((2, 16), (4, 8), (16, 3))]
+    arms = [ArmSamples(*root, Share(spp, 1, 1), count, (number, 2)) for spp, count in ((2, 16), (4, 8), (16, 3))]
     noisy, medium, clean = map(configurations, arms)
 
     assert [len(noisy), len(medium), len(clean)] == [16, 8, 3]
@@ -106,14 +121,14 @@ def test_configurations_of_cleaner_samples_are_among_those_of_noisier_ones(root:
 
 
 def test_slices_share_no_configuration(root: Root) -> None:
-    first, second = (configurations(Arm(*root, Share(4, 1, 1), 8, (number, 2))) for number in (0, 1))
+    first, second = (configurations(ArmSamples(*root, Share(4, 1, 1), 8, (number, 2))) for number in (0, 1))
     assert len(first) == len(second) == 8
     assert not first & second
 
 
 def test_an_arm_of_more_configurations_than_there_are_is_refused(root: Root) -> None:
     with pytest.raises(ValueError, match="64"):
-        Arm(*root, Share(16, 1, 1), 64)
+        ArmSamples(*root, Share(16, 1, 1), 64)
 
 
 def test_what_is_rendered_is_enough_for_every_share_and_slice() -> None:
@@ -136,7 +151,7 @@ def test_runs_are_trained_in_processes_and_only_those_that_are_not_at_their_end(
     parser = argparse.ArgumentParser()
     room_study.add_options(parser, "test")
     told = parser.parse_args(["--steps", "2", "--architecture", "cnn"])
-    source = partial(Arm, *root, Share(2, 1, 1), 8)
+    source = partial(ArmSamples, *root, Share(2, 1, 1), 8)
     runs = [Run(source, room_study.settings_of(told, seed), tmp_path, "few") for seed in (0, 1)]
     room_study.train_all(runs[:1], 1)
     assert [run.is_at_its_end() for run in runs] == [True, False]
@@ -166,13 +181,13 @@ def test_a_run_of_a_users_own_network_is_another_once_its_module_changes(
 # ------------------------------------------------------------------------------------------------------------- errors
 
 
-def noisy_references(noise: float) -> tuple[References, F32]:
+def noisy_references(noise: float) -> tuple[ReferenceViews, F32]:
     """Sixteen views of halves with normal noise, and the clean images, in the middle of what a display shows."""
     rng = np.random.default_rng(2)
     clean = rng.uniform(0.4, 0.6, (16, 32, 32, 3))
     halves = clean[:, None] + rng.normal(0, noise, (16, 2, 32, 32, 3))
     units = tuple(bytes([number]) * 16 for number in range(16))
-    return References(tuple(range(16)), units, halves.astype(np.float32), 64), clean.astype(np.float32)
+    return ReferenceViews(tuple(range(16)), units, halves.astype(np.float32), 64), clean.astype(np.float32)
 
 
 def shown(image: F32) -> NDArray[np.float64]:

@@ -32,6 +32,8 @@ def test_a_dark_block_fails() -> None:
 
 
 def test_a_row_has_its_figures() -> None:
-    row = compare_with_path.Row("glass_caustic", 48, 16, 32768, 8192, 1, 1.0, 8, 3.33, 0.9993, 0.0007, 204.0, "pass")
+    row = compare_with_path.PathComparison(
+        "glass_caustic", 48, 16, 32768, 8192, 1, 1.0, 8, 3.33, 0.9993, 0.0007, 204.0, "pass"
+    )
     text = compare_with_path.page([row], Namespace(connections=1, light_ratio=1.0))
     assert "| glass_caustic | 48² | 16 | 32768 / 8192 | 3.33 | 0.9993 ± 0.0007 | 204 | pass |" in text

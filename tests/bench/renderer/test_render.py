@@ -14,7 +14,7 @@ from bench.renderer import render
 from bench.renderer.peers import page, scoring, verdict, wording
 from bench.renderer.peers.chosen import given
 from bench.renderer.peers.errors import reference_of
-from bench.renderer.peers.measure import Measured
+from bench.renderer.peers.measure import MeasuredMethod
 from bench.renderer.peers.methods import Shot, calibrate
 from bench.renderer.peers.plans import BUDGETS, METHODS, PLAN_SECONDS, PLANS, estimated_seconds
 from photonfarm.renderer.cli import scene_plan
@@ -48,10 +48,10 @@ KEY = {
 }  # fmt: skip
 
 
-def measured(method: Clockwork, base: int, seeds: int = 8) -> Measured:
+def measured(method: Clockwork, base: int, seeds: int = 8) -> MeasuredMethod:
     calibration = calibrate(method, tuple(share * 0.5 for share in BUDGETS), "wall")
     shots = [[method.render(base + 100 * b + k, spp) for k in range(seeds)] for b, spp in enumerate(calibration.spp)]
-    return Measured(calibration, shots)
+    return MeasuredMethod(calibration, shots)
 
 
 def result_of(name: str = "cornell", chosen_noise: float = 0.5) -> dict[str, Any]:

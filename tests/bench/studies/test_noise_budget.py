@@ -9,11 +9,11 @@ import pytest
 from analytic_scene import small_spec
 
 from bench.harness.network_errors import Errors
-from bench.harness.room_study import References
+from bench.harness.room_study import ReferenceViews
 from bench.studies import noise_budget
 from bench.studies.budget_arms import SHARES
 from bench.studies.budget_fit import KAPPAS, RHOS, RoomErrors, fit
-from bench.studies.noise_budget import Measured, Room
+from bench.studies.noise_budget import BudgetStudy, MeasuredShare
 from photonfarm.shared.plan.allocation import excess
 from photonfarm.shared.plan.sample_costs import SampleCosts
 
@@ -22,19 +22,20 @@ UNITS = tuple(bytes([unit]) * 16 for unit in range(VIEWS))
 COSTS = SampleCosts(small_spec().scene_id, 0.1, 0.05, 0.01, 0.01, 30.0)
 
 
-def room(number: int, seeds: int) -> Room:
+def room(number: int, seeds: int) -> BudgetStudy:
     rng, arms = np.random.default_rng(number), []
     hard = rng.uniform(0.5, 1.5, VIEWS)
     for share in SHARES:
         configurations = noise_budget.paid(COSTS, share, BUDGET)
-        bought = Measured(share, configurations, Errors(hard[None], UNITS), Errors(hard[None], UNITS)).allocation
+        bought = MeasuredShare(share, configurations, Errors(hard[None], UNITS), Errors(hard[None], UNITS)).allocation
         level = 0.01 + excess(COSTS.relative_variance, bought, kappa=20, rho=1)
         errors = Errors(level * (hard + 0.02 * rng.normal(size=(seeds, VIEWS))), UNITS)
-        arms.append(Measured(share, configurations, errors, errors))
+        arms.append(MeasuredShare(share, configurations, errors, errors))
     halves = rng.random((VIEWS, 2, SIZE, SIZE, 3), np.float32)
     shown = RoomErrors.of(f"room {number}", COSTS.relative_variance, [(a.allocation, a.shown) for a in arms], number)
     spec = small_spec(film={"width": SIZE, "height": SIZE})
-    return Room(f"room {number}", spec, COSTS, References(tuple(range(VIEWS)), UNITS, halves, 256), tuple(arms), shown)
+    references = ReferenceViews(tuple(range(VIEWS)), UNITS, halves, 256)
+    return BudgetStudy(f"room {number}", spec, COSTS, references, tuple(arms), shown)
 
 
 @pytest.mark.parametrize("seeds", [1, 2])

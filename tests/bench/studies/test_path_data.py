@@ -14,12 +14,12 @@ from store_samples import commit_guides
 
 from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors, replicates, seed_spread
-from bench.harness.room_study import References
+from bench.harness.room_study import ReferenceViews
 from bench.studies import path_data, path_data_page, path_statistics
 from bench.studies.path_data import BUDGETS, HELD_OUT, FirstSamples
-from bench.studies.path_data_study import METRICS, Measured, Study, Targets
+from bench.studies.path_data_study import METRICS, MeasuredArm, Study, Targets
 from bench.studies.path_scene import Costs, Rendered
-from bench.studies.path_statistics import Found, bias, crossing, factor, noise, ratio, relative_noise
+from bench.studies.path_statistics import BudgetFactor, bias, crossing, factor, noise, ratio, relative_noise
 from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.store import Store
@@ -45,7 +45,7 @@ def test_what_lies_beyond_the_arms_is_no_number() -> None:
     assert crossing(ARMS, errors, 0.5) == 0
     assert path_data_page.in_words(math.inf, ARMS) == "more than 4.00"
     assert path_data_page.in_words(0.0, ARMS) == "less than 0.25"
-    assert path_data_page.within_words(Found(1.5, 0.0, math.inf), ARMS) == "less than 0.25 … more than 4.00"
+    assert path_data_page.within_words(BudgetFactor(1.5, 0.0, math.inf), ARMS) == "less than 0.25 … more than 4.00"
 
 
 def test_of_errors_that_rise_again_the_first_crossing_counts() -> None:
@@ -152,12 +152,12 @@ def study(seeds: tuple[int, ...] = (0, 1)) -> tuple[Study, Targets]:
     """Networks whose errors fall with the root of the budget; data of `path` is 2.5 times as noisy."""
     told = path_data.options().parse_args(["--seeds", *map(str, seeds)])
     images = np.random.default_rng(0).random((VIEWS, SIZE, SIZE, 3), np.float32)
-    references = References(tuple(range(VIEWS)), UNITS, np.stack([images, images], axis=1), 256)
+    references = ReferenceViews(tuple(range(VIEWS)), UNITS, np.stack([images, images], axis=1), 256)
     measured = []
     for number, arm in enumerate(path_data.arms(told)):
         level = 0.01 * math.sqrt((1 if arm.kind == "bdpt" else 2.5) / arm.share)
         of_seeds = Errors(errors(level, number).values[: len(seeds)], UNITS)
-        measured.append(Measured(arm, 60.0, images=images, **dict.fromkeys(METRICS.values(), of_seeds)))
+        measured.append(MeasuredArm(arm, 60.0, images=images, **dict.fromkeys(METRICS.values(), of_seeds)))
     made = {kind: Rendered(Path(kind), spp, 0.8, 0) for kind, spp in (("bdpt", 4), ("path", 22))}
     spec = small_spec(film={"width": SIZE, "height": SIZE})
     settings = path_data.settings_of(told, 0, HELD_OUT)
@@ -183,7 +183,7 @@ def test_the_page_and_its_figures_and_the_picture_are_made(seeds: tuple[int, ...
 def test_budgets_are_of_measured_core_seconds() -> None:
     found, targets = study()
     dearer = Study(
-        found.told, found.spec, found.settings, found.costs,
+        found.arguments, found.spec, found.settings, found.costs,
         {**found.made, "path": Rendered(Path("path"), 22, 1.6, 0)}, found.references, found.measured,
     )  # fmt: skip
     assert found.budgets == pytest.approx(list(ARMS))
@@ -221,7 +221,7 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str
 
 
 def views(source: FirstSamples) -> list[bytes]:
-    return source.view_keys(source.rows)
+    return source.view_keys(source.chosen)
 
 
 def test_both_kinds_are_trained_on_the_same_views(roots: dict[str, tuple[Path, str]]) -> None:
@@ -238,11 +238,11 @@ def test_smaller_budgets_are_parts_of_larger_ones(roots: dict[str, tuple[Path, s
 
 def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]]) -> None:
     source = FirstSamples(*roots["path"], 4 * SAMPLES)
-    references = References.of(Store(roots["bdpt"][0]), small_spec(), 16, HELD_OUT)
+    references = ReferenceViews.of(Store(roots["bdpt"][0]), small_spec(), 16, HELD_OUT)
     assert len(references.rows) > 1
-    assert not set(source.modification_keys(source.rows)) & set(references.units)
+    assert not set(source.modification_keys(source.chosen)) & set(references.units)
     *trained_on, looked_at = source.refresh().tolist()
-    assert trained_on == source.rows
+    assert trained_on == source.chosen
     assert are_held_out(source.modification_keys([looked_at]), HELD_OUT) == [True]
 
 
@@ -262,7 +262,7 @@ def test_more_samples_than_there_are_is_refused(roots: dict[str, tuple[Path, str
 def test_targets_of_both_kinds_are_of_one_view(roots: dict[str, tuple[Path, str]]) -> None:
     spec = small_spec()
     made = {kind: Rendered(root, 4, 0.8, 0) for kind, (root, _) in roots.items()}
-    references = References.of(Store(made["bdpt"].root), spec, 16, HELD_OUT)
+    references = ReferenceViews.of(Store(made["bdpt"].root), spec, 16, HELD_OUT)
     found = path_data.targets(made, spec, references)
     assert found.bdpt.shape == found.path.shape == (SAMPLES + SAMPLES // 2 + 8, 2, 8, 8, 3)
     assert [found.units[place] for place in found.held_out] == list(references.units)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 from analytic_scene import small_spec
 
-from bench.studies.sample_costs import SPP, Room, line, shared_out
+from bench.studies.sample_costs import SPP, RoomCosts, line, shared_out
 from photonfarm.shared.plan.allocation import Allocation
 from photonfarm.shared.plan.sample_costs import SampleCosts
 
 BUDGET = 200.0
 
 
-def room(**changes: float) -> Room:
+def room(**changes: float) -> RoomCosts:
     """A scene with movable groups; a configuration costs as much as 50 samples per pixel."""
     parts = {"configuration_s": 0.5, "view_s": 0.05, "pass_s": 0.0, "spp_s": 0.01, "relative_variance": 40.0} | changes
-    return Room("made-up", spec := small_spec(), SampleCosts(spec.scene_id, **parts))
+    return RoomCosts("made-up", spec := small_spec(), SampleCosts(spec.scene_id, **parts))
 
 
 def test_none_of_the_shares_is_better_than_the_best() -> None:

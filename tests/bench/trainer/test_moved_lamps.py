@@ -11,7 +11,17 @@ import pytest
 
 from bench.harness import room_study
 from bench.trainer import moved_lamps
-from bench.trainer.moved_lamps import KNOWN, Candidate, Row, Stage, Views, held_out, lamps, stays, trained_runs
+from bench.trainer.moved_lamps import (
+    KNOWN,
+    ExplainedChange,
+    PredictorGroup,
+    Stage,
+    Views,
+    held_out,
+    lamps,
+    stays,
+    trained_runs,
+)
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.processes import Stop
@@ -76,8 +86,8 @@ def views(work: Path) -> Views:
     return Stage.of(store, scene_id, half_spp=8).views(source, rows)
 
 
-def row(views: Views, predict: Predictor) -> Row:
-    return views.row(Candidate("made up", (0,), (predict,), POINTS_ONLY))
+def row(views: Views, predict: Predictor) -> ExplainedChange:
+    return views.row(PredictorGroup("made up", (0,), (predict,), POINTS_ONLY))
 
 
 @pytest.mark.slow
@@ -120,7 +130,7 @@ def test_a_network_is_told_of_a_view_as_it_is_what_the_store_holds_of_it(work: P
         return made[-1]
 
     network = run.predictor(views.spec, views.base, "cpu")
-    views.predicted(predict, Candidate("recorded", (0,), (predict,), run.needs, run.settings.network.points))
+    views.predicted(predict, PredictorGroup("recorded", (0,), (predict,), run.needs, run.settings.network.points))
     as_they_are = np.concatenate(made[::2])
     np.testing.assert_allclose(as_they_are, stored, rtol=0.01, atol=0.003)  # what is stored is rounded to 8 bits
     assert np.abs(np.concatenate(made[1::2]) - stored).mean() > 0.01

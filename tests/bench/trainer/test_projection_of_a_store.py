@@ -62,7 +62,7 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> Read:
     assert source.refresh().tolist() == [*range(6)]
     base = source.base()
     batch = read_into(TrainingBatch.empty(len(ROWS), POINTS, spec, needs), source, ROWS, needs, base[1])
-    samples = source.read_batch(ROWS)
+    samples = source.read_samples(ROWS)
     cameras = [Camera.of(sample.view, spec) for sample in samples]
     points, photons = [], []
     for row, sample, camera in zip(ROWS, samples, cameras, strict=True):

@@ -89,8 +89,8 @@ def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -
     rows = tuple(r.model_copy(update={"errors": r.errors.model_copy(update={"plain": (0.1,) * 3})}) for r in rows)
     found = plan_of(spec_with(), measurement(*rows), cached=False)
     assert (found.candidate, found.half_spp) == (PLAIN, 10)
-    assert found.offers[PLAIN].half_error == pytest.approx(0.1 * 2 / 10)
-    assert found.offers[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
+    assert found.at_equal_cost[PLAIN].half_error == pytest.approx(0.1 * 2 / 10)
+    assert found.at_equal_cost[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
 
 
 @pytest.mark.parametrize("seed", range(200))

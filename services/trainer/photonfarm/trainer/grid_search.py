@@ -140,9 +140,9 @@ def _about(source: SampleSource, settings: TrainSettings) -> dict[str, Any]:
     if not source.ready():
         raise IncompleteError("the scene has no samples yet; a grid compares runs over samples that are there")
     rows = source.refresh().tolist()
-    if len(rows) < source.planned():
+    if len(rows) < source.planned:
         raise IncompleteError(
-            f"{len(rows)} of {source.planned()} planned samples are complete; "
+            f"{len(rows)} of {source.planned} planned samples are complete; "
             "a grid compares runs over the same samples: wait for the workers"
         )
     sides = zip(rows, rows_held_out(source, rows, settings.hold_out), strict=True)

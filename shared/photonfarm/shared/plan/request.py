@@ -42,7 +42,7 @@ MAX_SAMPLES = 10_000_000
 UNUSED = -1
 """The reference in rows that hold nothing."""
 
-Count = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+SampleCount = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ class Request(Frozen):
     """What to plan: modifications × views × passes, under one master seed."""
 
     kind: Literal["samples"] = "samples"  # distinguishes it from other requests in the store
-    modifications: Count = 1
-    views_per_modification: Count = 1
+    modifications: SampleCount = 1
+    views_per_modification: SampleCount = 1
     passes: Annotated[int, Field(ge=1, le=65536)] = 1
     seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
 

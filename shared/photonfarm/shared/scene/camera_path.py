@@ -11,31 +11,27 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 from photonfarm.shared.scene.view import View
 
 MOST_FRAMES = 10_000
 ORBIT = 0.9
 """Size of the ellipse of an orbit over that of the box of origins."""
 
-Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+FinitePoint = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class KeyView(_Frozen):
+class KeyView(Frozen):
     """A view that the path passes through."""
 
-    origin: Point
-    look_at: Point
+    origin: FinitePoint
+    look_at: FinitePoint
 
 
-class CameraPath(_Frozen):
+class CameraPath(Frozen):
     """A path's file: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}."""
 
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)]

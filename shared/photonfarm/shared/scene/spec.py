@@ -27,6 +27,7 @@ Vector = tuple[float, float, float]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 BUILTIN_ROOMS = ("cornell", "room")

@@ -46,9 +46,6 @@ EXACT = 1e-4
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
 
-Log = Callable[[str], None]
-"""A function that takes a line about the progress."""
-
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
@@ -120,7 +117,7 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, log: Log, *, target: float = TARGET, frames: int = FRAMES
+    spec: SceneSpec, beside: Path | None, log: Callable[[str], None], *, target: float = TARGET, frames: int = FRAMES
 ) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 

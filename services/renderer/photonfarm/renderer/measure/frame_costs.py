@@ -34,7 +34,7 @@ from photonfarm.shared.store.read.find import scene_named
 WARM_UPS = 2
 """The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
 
-Result = TypeVar("Result")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +168,7 @@ def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -
     return scene.sees(frame.view, position) & present
 
 
-def _wall_timed(work: Callable[[], Result]) -> tuple[float, Result]:
+def _wall_timed(work: Callable[[], T]) -> tuple[float, T]:
     begun = time.perf_counter()
     result = work()
     return time.perf_counter() - begun, result

@@ -49,9 +49,7 @@ Clean images would take minutes, and beyond one launch of the integrator time is
 LOG_SECONDS = 10.0
 """The least seconds between two lines of progress."""
 
-Result = TypeVar("Result")
-Log = Callable[[str], None]
-"""A function that takes a line about the progress."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +64,9 @@ class _Frame:
     noise: float | None  # None if nothing is seen, or values are not finite
 
 
-def find_or_measure(spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Log) -> SampleCosts:
+def find_or_measure(
+    spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Callable[[str], None]
+) -> SampleCosts:
     """The costs kept from an earlier measurement here of as many frames; with `again`, or without one, measured now.
 
     The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
@@ -91,14 +91,14 @@ def _kept(file: Path) -> SampleCosts | None:
 
 
 def measured_costs(
-    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, log: Log | None = None
+    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, log: Callable[[str], None] | None = None
 ) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
     return sample_costs(LoadedScene.load(spec, beside), frames, log)
 
 
-def sample_costs(scene: LoadedScene, frames: int, log: Log | None = None) -> SampleCosts:
+def sample_costs(scene: LoadedScene, frames: int, log: Callable[[str], None] | None = None) -> SampleCosts:
     """The medians over views of `frames` random configurations, one view of each, after some untimed ones."""
     cloud = scene.base()[1]
     measured, logged = [], time.monotonic()
@@ -165,7 +165,7 @@ def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: 
     scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
 
 
-def _timed(work: Callable[[], Result]) -> tuple[float, Result]:
+def _timed(work: Callable[[], T]) -> tuple[float, T]:
     begun = time.process_time()
     result = work()
     return time.process_time() - begun, result

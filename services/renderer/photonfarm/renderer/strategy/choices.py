@@ -19,17 +19,17 @@ class CandidateAtCost(MeasuredCandidate):
     fits: bool  # whether at least about one sample per pixel fits the time
 
 
-def offers(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
+def candidates_at_equal_cost(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
     """Every measured candidate, at the samples per pixel that fit `half_s`.
 
     The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
     sample × time / n.
     """
     plain = measurement.row(PLAIN)
-    return {row.candidate: _offer(row, plain, measurement.spp, half_s) for row in measurement.rows}
+    return {row.candidate: _at_cost(row, plain, measurement.spp, half_s) for row in measurement.rows}
 
 
-def _offer(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> CandidateAtCost:
+def _at_cost(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> CandidateAtCost:
     samples = row.cost.bought(half_s)
     cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
     relative = row.errors.relative_spread(plain.errors)
@@ -51,13 +51,13 @@ def _per_sample_s(row: CandidateRow, half_s: float) -> float:
     return row.cost.time_s(samples) / samples
 
 
-def best(offered: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:
-    """The offer with the least error × time, among the candidates that were measured longest."""
-    return min((offered[c] for c in longest(list(offered), lambda c: offered[c].errors.images)), key=_cost)
+def best(candidates: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:
+    """The candidate with the least error × time, among those that were measured longest."""
+    return min((candidates[c] for c in longest(list(candidates), lambda c: candidates[c].errors.images)), key=_cost)
 
 
-def _cost(offer: CandidateAtCost) -> float:
-    return offer.relative_cost
+def _cost(at_cost: CandidateAtCost) -> float:
+    return at_cost.relative_cost
 
 
 def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
@@ -76,9 +76,9 @@ def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tu
 
 
 def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
-    offered = offers(measurement, measurement.row(candidate).cost.time_s(half_spp))
-    fitting = {c: offer for c, offer in offered.items() if offer.fits}
+    candidates = candidates_at_equal_cost(measurement, measurement.row(candidate).cost.time_s(half_spp))
+    fitting = {c: at_cost for c, at_cost in candidates.items() if at_cost.fits}
     found = best(fitting)
-    if found.candidate == candidate or not saving(found, over=offered[candidate]).significant:
+    if found.candidate == candidate or not saving(found, over=candidates[candidate]).significant:
         return None
     return found.candidate, found.half_spp

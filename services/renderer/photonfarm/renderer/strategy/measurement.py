@@ -109,12 +109,12 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> M
     """
     begun = time.process_time()
     log(f"loading {spec.name}")
-    stage = PilotScene(spec, beside)
-    found = content.read(stage.loaded.scene, stage.camera())
-    reach = light_reach.measure(stage.configurations(LIT), spec.view, SEED)
+    pilot_scene = PilotScene(spec, beside)
+    found = content.read(pilot_scene.loaded.scene, pilot_scene.camera())
+    reach = light_reach.measure(pilot_scene.configurations(LIT), spec.view, SEED)
     depth = spec.transport.max_depth
     candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
-    compared = _compare(stage, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, log)
+    compared = _compare(pilot_scene, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, log)
     spent = time.process_time() - begun
     return Measurement(
         film=compared.film,
@@ -136,26 +136,26 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> M
 
 
 def _compare(
-    stage: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, log: Log
+    pilot_scene: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, log: Log
 ) -> _Compared:
-    spec = stage.spec
+    spec = pilot_scene.spec
     now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
-    costs = time_images(stage.renders(1)[0], candidates, half_spp, TIMING * seconds, stage.clock)
+    costs = time_images(pilot_scene.renders(1)[0], candidates, half_spp, TIMING * seconds, pilot_scene.clock)
     half_s = costs[now].time_s(half_spp)
     film, spp, views = _pilot_film(spec, costs, left_s)
     if film != spec.film:
-        stage = PilotScene(spec.model_copy(update={"film": film}), beside)
+        pilot_scene = PilotScene(spec.model_copy(update={"film": film}), beside)
     log(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
     pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
     choice = pilot.choose(
-        stage.renders(views),
+        pilot_scene.renders(views),
         candidates,
         seconds=left_s,
         spp=spp,
         seed=SEED,
         keep=[c for c in (DEFAULT, now) if c in candidates],
         later={candidate: _images(cost, half_s, spp) / cost.time_s(pilot_spp) for candidate, cost in costs.items()},
-        clock=stage.clock,
+        clock=pilot_scene.clock,
     )
     rows = tuple(_row(measured, costs[measured.candidate], pilot_spp, half_spp) for measured in choice.measured)
     return _Compared(film, spp, half_s, choice, rows)

@@ -9,9 +9,10 @@ from typing import Any
 
 from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.choices import CandidateAtCost, offers, settled
+from photonfarm.renderer.strategy.choices import CandidateAtCost, candidates_at_equal_cost, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Log, Measurement, measure, present
+from photonfarm.renderer.strategy.output.spec_file import SpecTables
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
@@ -20,9 +21,6 @@ SIMILAR = 4.0
 The choice depends on an image's fixed part, which matters if samples are few. A written plan keeps the time, up to a
 sample.
 """
-
-Settings = Mapping[str, Mapping[str, int | float]]
-"""Table of a spec → key → number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +34,11 @@ class TransportPlan:
     half_spp: int  # of about the cost of the spec's settings now
     photons: PhotonSpec
     photons_reason: str
-    offers: Mapping[Candidate, CandidateAtCost]  # all measured candidates, at that cost; empty if every view is black
+    at_equal_cost: Mapping[Candidate, CandidateAtCost]  # all measured ones; empty if every view is black
     halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> SpecTables:
         """The planned tables of the spec."""
         return {
             "transport": {
@@ -52,20 +50,20 @@ class TransportPlan:
         }
 
     @property
-    def changes(self) -> Settings:
+    def changes(self) -> SpecTables:
         """The planned tables that differ from the spec's present ones."""
         now = {"transport": self.spec.transport.model_dump(), "photons": self.spec.photons.model_dump()}
         return {table: keys for table, keys in self.settings.items() if now[table] != now[table] | dict(keys)}
 
     def saving(self, over: Candidate) -> Saving:
         """The saving over other settings, which were measured."""
-        return saving(self.offers[self.candidate], self.offers[over])
+        return saving(self.at_equal_cost[self.candidate], self.at_equal_cost[over])
 
     @property
     def savings(self) -> tuple[Saving, ...]:
         """The savings over plain path tracing, the default and the spec's settings now, as far as these differ."""
         others = dict.fromkeys((PLAIN, DEFAULT, present(self.spec)))
-        return tuple(self.saving(c) for c in others if c in self.offers and c != self.candidate)
+        return tuple(self.saving(c) for c in others if c in self.at_equal_cost and c != self.candidate)
 
     def document(self) -> dict[str, Any]:
         """All of it, for JSON."""
@@ -125,6 +123,6 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Trans
         half_spp=samples,
         photons=photons,
         photons_reason=reason,
-        offers=offers(measurement, measurement.row(now).cost.time_s(half_spp)),
+        at_equal_cost=candidates_at_equal_cost(measurement, measurement.row(now).cost.time_s(half_spp)),
         halves_overhead=2 * cost.time_s(samples) / cost.time_s(2 * samples) - 1,
     )

@@ -21,7 +21,7 @@ TEMPLATE = Path(__file__).with_name("preview.html.j2")
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class SheetRow:
     """One sample of the sheet."""
 
     number: int  # its row in the store
@@ -49,7 +49,7 @@ def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
     out.write_text(contact_sheet(reader, count))
 
 
-def _line(reader: SceneReader, row: int) -> Line:
+def _line(reader: SceneReader, row: int) -> SheetRow:
     sample, spec = reader.read(row), reader.spec
     a, b = (pictures.display(half, spec.exposure) for half in sample.radiance)
     panels = (
@@ -61,7 +61,7 @@ def _line(reader: SceneReader, row: int) -> Line:
         photon_picture(sample, reader.read_photons(row) if spec.photons.paths else None, spec),
     )
     removed = [g.name for g, there in zip(spec.groups, sample.modification.present, strict=True) if not there]
-    return Line(row, removed, panels)
+    return SheetRow(row, removed, panels)
 
 
 def photon_picture(sample: StoredSample, photons: Photons | None, spec: SceneSpec) -> Picture:

@@ -21,7 +21,7 @@ import numpy as np
 from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, Scene
+from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
 from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
 from photonfarm.renderer.verify.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
@@ -129,7 +129,7 @@ def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], Scene]]:
+def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], SceneDict]]:
     """Scenes by name: the quick ones, and for the long version also those in ``more``."""
     names = (*quick, *more) if long else quick
     return {name.replace("_", "-"): hard_scenes.HARD_SCENES[name] for name in names}
@@ -138,7 +138,7 @@ def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> d
 # ------------------------------------------------ The checks ------------------------------------------------
 
 
-def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def equal_means(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare every pair of counts with the usual pair at more samples; the path tracer, (0, 0), may be noisy."""
     scene = load(build(effort.size))
     truth = _images(scene, ALL[0], effort, TRUTH_SEEDS, effort.truth_spp)
@@ -151,7 +151,7 @@ def equal_means(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str
     return faults, "; ".join(ratios)
 
 
-def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def additive(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare the image of all lights with the sum of those of the even and the odd ones, switched off in place."""
     scene = load(build(effort.size))
     parameters = mi.traverse(scene)
@@ -170,7 +170,7 @@ def additive(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
     return faults, f"{_ratio(test)}; the halves are {shares[0]:.1%} and {shares[1]:.1%}"
 
 
-def linear(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def linear(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare images of lights 8 times as bright with the same seed, and 3 times as bright with other seeds.
 
     A factor of 8 changes only the exponents.
@@ -209,7 +209,7 @@ def scale(factor: float, effort: Effort) -> tuple[list[str], str]:
     )
 
 
-def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def update_equals_reload(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare scenes that are edited in place with scenes loaded anew: a dimmed light, then a moved box and camera.
 
     With the dimmed light the images must be equal bit by bit. With the moved box and camera the last bits differ:
@@ -245,7 +245,7 @@ def update_equals_reload(build: Callable[[int], Scene], effort: Effort) -> tuple
     return faults, f"with one seed: {figures}; with others {_ratio(test)}"
 
 
-def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def reproducible(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Render a seed twice with another seed between, and both at once; equal seeds must give equal bytes."""
     scene = load(build(effort.size))
     faults = []
@@ -264,7 +264,7 @@ def reproducible(build: Callable[[int], Scene], effort: Effort) -> tuple[list[st
     return faults, f"{len(ALL)} settings"
 
 
-def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], str]:
+def recorded(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[str], str]:
     """Compare recorded launches with traced ones bit by bit, after changes of seeds, samples, lights and camera."""
     scene = load(build(effort.size))
     parameters, sensor = mi.traverse(scene), scene.sensors()[0]
@@ -292,7 +292,7 @@ def recorded(build: Callable[[int], Scene], effort: Effort) -> tuple[list[str], 
     return faults, f"{len(steps)} renders"
 
 
-def oracles_weights(build: Callable[[int], Scene], lanes: int) -> tuple[list[str], str]:
+def oracles_weights(build: Callable[[int], SceneDict], lanes: int) -> tuple[list[str], str]:
     """Compare the integrator's weights of traced paths with the oracle's; see `weight_check`."""
     faults, figures = [], []
     for settings in ALL:

@@ -20,7 +20,7 @@ FAILURES = Path(".stability")
 """The folder for the renders of failures."""
 
 
-Key = TypeVar("Key", int, str)
+Label = TypeVar("Label", int, str)
 
 
 @dataclass(slots=True)
@@ -44,8 +44,8 @@ class StabilityReport:
         return _all_passed((result.label, result) for result in self.results if result.row is not None)
 
 
-def _all_passed(results: Iterable[tuple[Key, SceneResult]]) -> dict[Key, bool]:
-    verdicts: dict[Key, bool] = {}
+def _all_passed(results: Iterable[tuple[Label, SceneResult]]) -> dict[Label, bool]:
+    verdicts: dict[Label, bool] = {}
     for key, result in results:
         verdicts[key] = verdicts.get(key, True) and not result.faults
     return verdicts

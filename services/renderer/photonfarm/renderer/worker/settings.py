@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from photonfarm.shared.scene.spec import Frozen
+from photonfarm.shared.scene.spec import Count, Frozen, Positive
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.
@@ -26,9 +26,6 @@ JOBS_SO_FAR = "so far: "
 
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
 """The format of log lines of a supervisor and its child."""
-
-Positive = Annotated[float, Field(gt=0)]
-Count = Annotated[int, Field(ge=1)]
 
 
 class WorkerSettings(Frozen):

@@ -102,7 +102,7 @@ class HeldOutSamples:
         """A sample's reference, or the mean of its halves; StoreError if a repair has removed the sample."""
         spec = self.source.spec
         half_spp = spec.transport.half_spp
-        (sample,) = self.source.read_batch([row])
+        (sample,) = self.source.read_samples([row])
         halves = np.float32(spec.exposure * sample.scale) * sample.radiance.astype(np.float32)
         if reference is not None:
             return Target(row, reference.mean, reference.count * half_spp, is_reference=True, half_a=halves[0])

@@ -45,40 +45,18 @@ from photonfarm.trainer.networks.inputs import (
 )
 
 
-class SourceSample(Protocol):
-    """One sample as it is read; its images have their stored types."""
+@dataclass(frozen=True, slots=True, eq=False)
+class RawSample:
+    """One sample in its stored types; its images are in memory that the next read reuses."""
 
-    @property
-    def modification(self) -> Modification:
-        """The configuration."""
-
-    @property
-    def view(self) -> View:
-        """The view."""
-
-    @property
-    def radiance(self) -> NDArray[np.floating]:
-        """Half-estimates A and B, (2, H, W, 3); times `scale` linear."""
-
-    @property
-    def scale(self) -> float:
-        """The factor from stored values to linear radiance, a power of two."""
-
-    @property
-    def buffers(self) -> ViewBuffers:
-        """The image-space buffers."""
-
-    @property
-    def visibility(self) -> Visibility:
-        """Which points and photons the view sees."""
-
-    @property
-    def pass_(self) -> int:
-        """The number of the noisy pass of this view."""
-
-    @property
-    def guides(self) -> Guides | None:
-        """The guides of the view; None unless they are followed."""
+    modification: Modification
+    view: View
+    radiance: NDArray[np.floating]  # (2, H, W, 3) half-estimates A and B, times `scale` linear
+    scale: float  # a power of two
+    buffers: ViewBuffers
+    visibility: Visibility
+    pass_: int  # the number of the noisy pass of this view
+    guides: Guides | None = None  # if guides are followed
 
 
 class SampleSource(Protocol):
@@ -100,10 +78,11 @@ class SampleSource(Protocol):
     def refresh(self) -> NDArray[np.int64]:
         """Look for new samples; returns the rows that became complete since the last call."""
 
+    @property
     def taken_back(self) -> NDArray[np.int64]:
         """The rows that were complete before the last `refresh` and not after it; workers render them again."""
 
-    def read_batch(self, rows: Sequence[int]) -> Sequence[SourceSample]:
+    def read_samples(self, rows: Sequence[int]) -> Sequence[RawSample]:
         """The samples of complete rows, valid until the next call; StoreError if one is incomplete or unreadable."""
 
     def read_photons(self, row: int) -> Photons:
@@ -115,9 +94,11 @@ class SampleSource(Protocol):
     def view_keys(self, rows: Sequence[int]) -> list[Key]:
         """The content key of each row's configuration and view."""
 
+    @property
     def planned(self) -> int:
         """The number of samples in all plans so far, complete or not."""
 
+    @property
     def plan_requests(self) -> list[dict[str, Any]]:
         """The requests of all plans so far, in order, as JSON documents: all rows follow from them."""
 
@@ -196,7 +177,7 @@ def kept_count(spec: SceneSpec, of: int) -> int:
     return pixels // of
 
 
-def kept_pixels(sample: SourceSample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+def kept_pixels(sample: RawSample, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from the sample's content key.
 
     So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
@@ -216,7 +197,7 @@ def read_into(
     """Read complete rows of a source into the first places of a batch's memory; StoreError if one cannot be read."""
     spec = source.spec
     units = []
-    for place, (row, sample) in enumerate(zip(rows, source.read_batch(rows), strict=True)):
+    for place, (row, sample) in enumerate(zip(rows, source.read_samples(rows), strict=True)):
         fill(memory, place, sample, spec, cloud)
         if memory.inputs.photons is not None:
             fill_photons(memory.inputs.photons, place, source.read_photons(row))
@@ -226,7 +207,7 @@ def read_into(
     return memory.filled(tuple(rows), tuple(units))
 
 
-def fill(batch: TrainingBatch, place: int, sample: SourceSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
+def fill(batch: TrainingBatch, place: int, sample: RawSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
     """Write one sample into a batch's memory, except its photons and its noisy colour.
 
     That is its camera, its buffers, its exposed targets; if needed, its points; and which points and photons the view

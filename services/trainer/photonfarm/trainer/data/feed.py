@@ -134,15 +134,15 @@ class Feed:
 
     def _poll(self) -> None:
         rows = [int(row) for row in self._source.refresh()]
-        gone = [int(row) for row in self._source.taken_back()]
+        gone = [int(row) for row in self._source.taken_back]
         self._here.difference_update(gone)
         self._here.update(rows)
         self._known.update(rows)
         found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
         with self._lock:
             self._arrived.extend(found)
-            self._plans = self._source.plan_requests()
-            self._complete = 0 < self._source.planned() <= len(self._known)
+            self._plans = list(self._source.plan_requests)
+            self._complete = 0 < self._source.planned <= len(self._known)
         self._polled.set()
 
     def _read(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:

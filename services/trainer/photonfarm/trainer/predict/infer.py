@@ -18,14 +18,12 @@ import torch
 
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.shared.core.records import F32, BasePointCloud, Guides, ViewBuffers, Visibility
+from photonfarm.shared.core.records import F32, BasePointCloud
 from photonfarm.shared.scene.frames import Frames
-from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.trainer.data.dataset import TrainingBatch, fill, fill_photons, rows_held_out
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons, rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import given
@@ -81,7 +79,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
 
 
 def _missing(source: StoreSource, row: int) -> str:
-    rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests()), default=0)
+    rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
         return f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0"
     return f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers"
@@ -176,20 +174,6 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Unrendered:
-    """A frame in the form of a sample, without a rendered image."""
-
-    modification: Modification
-    view: View
-    buffers: ViewBuffers
-    visibility: Visibility
-    radiance: F32  # (2, H, W, 3) black
-    guides: Guides | None
-    scale: float = 1.0
-    pass_: int = 0
-
-
 def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
     points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
@@ -198,10 +182,8 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
         fill_photons(memory.inputs.photons, 0, given(frames.photons))
     black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
     for i, view in enumerate(frames.views):
-        shown = _Unrendered(
-            frames.modification, view, frames.buffers(i), frames.visibility(i), black, frames.guides_of(i)
-        )
-        fill(memory, 0, shown, spec, cloud)
+        seen = frames.buffers(i), frames.visibility(i)
+        fill(memory, 0, RawSample(frames.modification, view, black, 1.0, *seen, 0, frames.guides_of(i)), spec, cloud)
         yield memory.filled((i,), (b"",))
 
 

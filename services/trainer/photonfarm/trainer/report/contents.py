@@ -44,7 +44,7 @@ class ReportContents:
 
     card: DatasetCard
     stories: tuple[RunStory, ...]
-    gauges: Baselines
+    baselines: Baselines
     evaluation: Evaluation
     entries: tuple[ReportEntry, ...]
     costs: FrameCosts | None
@@ -71,8 +71,8 @@ class ReportContents:
             "val_mssim": None if metrics is None else metrics.mssim.estimate.mean,
             "dataset": self.card.document(),
             "runs": [story.document() for story in self.stories],
-            "mean_colour": self.gauges.mean_colour.error.mean,
-            "untrained": self.gauges.untrained.error.mean,
+            "mean_colour": self.baselines.mean_colour.error.mean,
+            "untrained": self.baselines.untrained.error.mean,
             "evaluation": rows,
             "machine": asdict(self.machine),
             "edit_seconds": None if self.costs is None else self.costs.medians()["edit_s"],
@@ -108,7 +108,7 @@ def gathered(
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        gauges=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
+        baselines=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
         entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
         costs=costs,
@@ -170,7 +170,7 @@ class _CloseLook:
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []
         for row in references.keys() & images.keys():
-            (sample,) = source.read_batch([row])
+            (sample,) = source.read_samples([row])
             read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
             a, b = references[row].half_a, references[row].half_b
             views.append(HeldOutView(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))

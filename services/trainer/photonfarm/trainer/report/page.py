@@ -38,7 +38,7 @@ def page(contents: ReportContents, drawn: list[Plot]) -> str:
 def headline(contents: ReportContents) -> list[tuple[str, str]]:
     """Figures of the data and of the first entry, each with what it is."""
     card, evaluation = contents.card, contents.evaluation
-    samples, colour = card.samples, contents.gauges.mean_colour.error.mean
+    samples, colour = card.samples, contents.baselines.mean_colour.error.mean
     first = contents.entries[0]
     error, reach = first.row.held_out.error, confidence_interval(first.row.held_out.error)
     spread = "" if reach is None else f" (95 %: {reach[0]:.3g} … {reach[1]:.3g})"
@@ -47,7 +47,7 @@ def headline(contents: ReportContents) -> list[tuple[str, str]]:
         (f"{samples.rows}", f"samples of {samples.planned} planned, held-out ones among them"),
         ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
         (f"{error.mean:.4g}", f"held-out error of {first.name}{spread}"),
-        (f"{contents.gauges.untrained.error.mean:.4g}", f"of {first.name} before its first step"),
+        (f"{contents.baselines.untrained.error.mean:.4g}", f"of {first.name} before its first step"),
         (f"{colour:.4g}", f"of the mean colour{f': {colour / error.mean:.1f} × as much' if error.mean > 0 else ''}"),
         (f"{evaluation.noise_floor:.4g}", "noise of the targets"),
     ]

@@ -116,7 +116,7 @@ def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoi
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
     levels = {
-        "mean colour": contents.gauges.mean_colour.error.mean,
+        "mean colour": contents.baselines.mean_colour.error.mean,
         "noise of the targets": contents.evaluation.noise_floor,
     }
     for (name, value), style in zip(levels.items(), ("--", ":"), strict=True):

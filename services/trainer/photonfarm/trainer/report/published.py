@@ -45,11 +45,11 @@ MOVABLE_LIGHTS = {
     "light_transport_photons": Published(0.0468, 0.0014, 0.887, 25.1, 0.172),
 }
 
-Table = dict[str, Published]
+PublishedTable = dict[str, Published]
 """Rows by architecture, in the order of the published table."""
 
 
-def table_of(spec: SceneSpec) -> tuple[str, Table] | None:
+def table_of(spec: SceneSpec) -> tuple[str, PublishedTable] | None:
     """The name of the published table for scenes of this kind, and its rows; None for a static scene."""
     if spec.lights:
         return "Table 2, movable objects and lights", MOVABLE_LIGHTS

@@ -11,7 +11,7 @@ from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.device import AUTO, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
-from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, waits
+from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, wait_shares
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class RunStory:
         """Its part of report.json."""
         state, settings = self.state, self.run.settings
         draws = state["step"] * settings.batch
-        shares = waits(state["seconds"])
+        shares = wait_shares(state["seconds"])
         return {
             "name": self.name,
             "folder": str(self.run.folder),

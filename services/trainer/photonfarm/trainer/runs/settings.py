@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import sentences
+from photonfarm.shared.scene.spec import Count, Frozen, Positive, sentences
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.user_code import is_own
 
@@ -31,9 +31,6 @@ Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Schedule = Literal["epochs", "cosine"]
 UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
-
-Positive = Annotated[float, Field(gt=0)]
-Count = Annotated[int, Field(ge=1)]
 
 
 def _one_of(kind: Any) -> BeforeValidator:
@@ -56,11 +53,7 @@ MOST_HELD_OUT = 512
 """The most samples that a finished run is measured on."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class NetworkSettings(_Frozen):
+class NetworkSettings(Frozen):
     """The settings of the network; other values make another network, and old checkpoints are refused."""
 
     architecture: ArchitectureName = "light_transport"  # or MODULE:NAME, a class of your own
@@ -90,7 +83,7 @@ class NetworkSettings(_Frozen):
         return self
 
 
-class TrainSettings(_Frozen):
+class TrainSettings(Frozen):
     """The settings of a training run."""
 
     network: NetworkSettings = NetworkSettings()

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Literal
 
-Kind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
+TimeKind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
 """The kinds of time.
 
 In this order: building the network and the feed; steps; validations; waiting for samples to be rendered; waiting for
 samples to be read; writing checkpoints; and the rest, such as writing the log and drawing.
 """
 
-KINDS: tuple[Kind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
+KINDS: tuple[TimeKind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
 
 Bottleneck = Literal["rendering", "reading", "training"]
 
@@ -23,7 +23,7 @@ NONE: Mapping[str, float] = {}
 class Stopwatch:
     """Counts the seconds of a run by kind. At any moment exactly one kind is counted, so their sum is the wall time."""
 
-    def __init__(self, clock: Callable[[], float], kind: Kind, ahead: float = 0.0) -> None:
+    def __init__(self, clock: Callable[[], float], kind: TimeKind, ahead: float = 0.0) -> None:
         """Begin to count `kind`, which has `ahead` seconds already."""
         self._clock, self._kind, self._since = clock, kind, clock() - ahead
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
@@ -44,7 +44,7 @@ class Stopwatch:
         for kind, value in seconds.items():
             self._spent[kind] += value
 
-    def turn(self, kind: Kind) -> Kind:
+    def turn(self, kind: TimeKind) -> TimeKind:
         """Switch to another kind; returns the one before."""
         before, now = self._kind, self._clock()
         self._spent[before] += now - self._since
@@ -52,7 +52,7 @@ class Stopwatch:
         return before
 
     @contextmanager
-    def on(self, kind: Kind) -> Iterator[None]:
+    def on(self, kind: TimeKind) -> Iterator[None]:
         """Switch to a kind while the block runs."""
         before = self.turn(kind)
         try:
@@ -61,7 +61,7 @@ class Stopwatch:
             self.turn(before)
 
 
-def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
+def wait_shares(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
     """The shares of the time since `before` in which training waited for samples to be rendered, and to be read."""
     spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
     total = max(sum(spent.values()), 1e-9)
@@ -69,7 +69,7 @@ def waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> d
 
 
 def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """The part that takes most of the time, from the shares of `waits`; the rest of the time counts as training."""
+    """The part that takes most of the time, by `wait_shares`; the rest of the time counts as training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])

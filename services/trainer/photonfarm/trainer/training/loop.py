@@ -26,7 +26,7 @@ from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, waits
+from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, wait_shares
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
@@ -108,7 +108,7 @@ class Session:
         self._learner = Learner(feed, settings, hooks.group)
         self._good = GoodState(self._learner)
         self._best: BestValidation | None = None
-        self._following = BatchStream(feed, settings, hooks.script, hooks.group)
+        self._stream = BatchStream(feed, settings, hooks.script, hooks.group)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
@@ -128,7 +128,7 @@ class Session:
                 self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
-        if reason != "stopped" and self._following.held_out:
+        if reason != "stopped" and self._stream.held_out:
             self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
@@ -167,7 +167,7 @@ class Session:
         self._watch.add(state["seconds"])
         self._seconds_logged = dict(state["seconds"])
         self._send_begin(continues=True)
-        self._following.restore(state["following"])
+        self._stream.restore(state["following"])
         return changed
 
     def _send_begin(self, *, continues: bool) -> None:
@@ -179,14 +179,14 @@ class Session:
 
     def _save(self) -> None:
         with self._watch.on("save"):
-            samples = len(self._following.growth.rows)
+            samples = len(self._stream.growth.rows)
             state = {
                 **self._learner.state(),
                 **self._identity(),
                 "step": self._step,
                 "seconds": self._watch.seconds,
                 "last_error": self._last_error,
-                "following": self._following.state(),
+                "following": self._stream.state(),
                 "recovery": {**self._good.state(), "best": self._best.state() if self._best else None},
                 "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
                 "versions": checkpoint.versions(),
@@ -215,33 +215,33 @@ class Session:
         return found
 
     def _next_batch(self) -> TrainingBatch | None:
-        if not self._following.draw_ahead(self._settings.max_steps):
+        if not self._stream.draw_ahead(self._settings.max_steps):
             return None
         with self._watch.on("wait_read"):
-            return self._following.take()
+            return self._stream.take()
 
     def _can_validate(self) -> bool:
-        self._following.look()
-        if self._following.complete:
+        self._stream.look()
+        if self._stream.complete:
             self._check_split()
-        return bool(self._following.held_out) and (self._step > 0 or self._following.may_draw())
+        return bool(self._stream.held_out) and (self._step > 0 or self._stream.may_draw())
 
     def _check_split(self) -> None:
-        rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._following.growth.rows)} samples planned"
-        if not self._following.held_out:
+        rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.growth.rows)} samples planned"
+        if not self._stream.held_out:
             raise SpecError(
                 f"{rule} none is held out, and one is needed to validate on; raise it (--hold-out), or plan more "
                 "configurations"
             )
-        if not self._following.training_rows:
+        if not self._stream.training_rows:
             raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
 
     def _validate(self) -> None:
         """Log the held-out error of the predicting network, and compare it with the best before."""
         self._compared = None
-        rows = self._following.held_out[: self._settings.validation_samples]
+        rows = self._stream.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
-            self._following.drop()
+            self._stream.drop()
             found = batches(self._feed, rows, self._settings.batch)
             try:
                 predict, loss = network_predictor(self._learner.predicting), self._settings.loss
@@ -249,7 +249,7 @@ class Session:
             except IncompleteError:  # a repair has removed all of them, for now
                 return
             finally:
-                self._following.ask_again()
+                self._stream.ask_again()
         self._validated = self._step
         if self._settings.recover:
             self._compare(now)
@@ -267,7 +267,7 @@ class Session:
             shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
-            waits=waits(seconds := self._watch.seconds, self._seconds_logged),
+            waits=wait_shares(seconds := self._watch.seconds, self._seconds_logged),
             **self._counts(),
         )
         self._seconds_logged = seconds
@@ -315,7 +315,7 @@ class Session:
 
     def _used(self) -> tuple[int, int]:
         """The number of draws so far, and of arrived samples."""
-        return self._step * self._settings.batch, len(self._following.growth.rows)
+        return self._step * self._settings.batch, len(self._stream.growth.rows)
 
     def _report_draws(self) -> None:
         if self._hooks.on_draws is not None:

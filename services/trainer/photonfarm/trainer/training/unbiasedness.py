@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-Loss = Callable[[Tensor, Tensor], Tensor]
+LossFunction = Callable[[Tensor, Tensor], Tensor]
 
 DRAWS = 8192
 """The targets of the test: a bias of 6 % of a gradient's standard deviation is then five standard errors."""
@@ -53,7 +53,7 @@ class Verdict:
         return f"{found} standard errors; elsewhere it is not that with the clean target ({self.elsewhere:.0f})"
 
 
-def judged(loss: Loss) -> Verdict:
+def judged(loss: LossFunction) -> Verdict:
     """Test a loss on images of random brightness, whose pixels are dark with rare bright samples; deterministic.
 
     `loss` takes a prediction (B, H, W, 3) and targets (B, 2, H, W, 3), and returns the mean over the batch, ().
@@ -66,7 +66,7 @@ def judged(loss: Loss) -> Verdict:
     return Verdict(at_clean, max(elsewhere))
 
 
-def _away(loss: Loss, at: Tensor, clean: Tensor, wanted: Tensor, generator: torch.Generator) -> float:
+def _away(loss: LossFunction, at: Tensor, clean: Tensor, wanted: Tensor, generator: torch.Generator) -> float:
     """The largest distance of the mean gradient at a prediction from the wanted one, in standard errors."""
     drawn = [_gradients(loss, at, _noisy(clean, generator)) for _ in range(DRAWS // BATCH)]
     gradients = torch.cat(drawn).double()
@@ -76,7 +76,7 @@ def _away(loss: Loss, at: Tensor, clean: Tensor, wanted: Tensor, generator: torc
     return float((off / (error + tiny)).max())
 
 
-def _gradients(loss: Loss, at: Tensor, targets: Tensor) -> Tensor:
+def _gradients(loss: LossFunction, at: Tensor, targets: Tensor) -> Tensor:
     """The gradients with each target, as if it were a batch of its own: (B, H, W, 3)."""
     prediction = at.expand(len(targets), -1, -1, -1).clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(prediction, targets), prediction)

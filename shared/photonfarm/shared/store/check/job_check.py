@@ -24,7 +24,7 @@ from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.guides import GUIDES, beside
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
-KINDS: tuple[schema.Kind, ...] = ("sample", "view", "modification")
+KINDS: tuple[schema.RowKind, ...] = ("sample", "view", "modification")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class CheckTarget:
         """The arrays that jobs store there, by name."""
         return schema.guide_arrays(self.spec) if self.guides else schema.output_arrays(self.spec)
 
-    def wanted(self, rows: JobRows) -> dict[schema.Kind, Set[int]]:
+    def wanted(self, rows: JobRows) -> dict[schema.RowKind, Set[int]]:
         """The rows that a job stores of each kind."""
         if self.guides:
             return {"sample": frozenset(), "view": rows.new_views, "modification": frozenset()}
@@ -212,7 +212,7 @@ class JobCheck:
     def _rows(
         self,
         job: int,
-        kind: schema.Kind,
+        kind: schema.RowKind,
         files: dict[str, dict[str, Any]],
         shards: dict[str, Shard],
         rows: JobRows | None,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from photonfarm.shared.store.io.storage import Storage
 
-Kind = Literal["sample", "view", "modification"]
+RowKind = Literal["sample", "view", "modification"]
 
 INPUT_ROWS_PER_CHUNK = 65536
 BLOSC: dict[str, Any] = {
@@ -45,7 +45,7 @@ class ArraySchema:
     """One output array of a scene: a row of it belongs to one sample, view or modification."""
 
     name: str
-    kind: Kind
+    kind: RowKind
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     fill: float | int  # of unwritten rows; in `photon_bounce` and bits also a legal value of written ones
@@ -76,9 +76,9 @@ def _arrays(declared: Iterable[ArrayDeclaration], spec: SceneSpec) -> dict[str, 
     return {each.name: _resolved(each, lengths, spec) for each in wanted}
 
 
-def bytes_of_rows(spec: SceneSpec) -> dict[Kind, int]:
+def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
     """The stored bytes of one sample, one view with its guides, and one modification, with inputs, uncompressed."""
-    found: dict[Kind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
+    found: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
             found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
@@ -103,7 +103,7 @@ def _resolved(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: Scen
     scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
     return ArraySchema(
         declared.name,
-        cast("Kind", declared.axes[0]),
+        cast("RowKind", declared.axes[0]),
         tuple(n if isinstance(n, int) else lengths[n] for n in declared.shape[1:]),
         np.dtype(declared.dtype),
         declared.fill,

@@ -104,8 +104,7 @@ class SceneReader:
             self._with_guides, self._spec = True, None
             self._committed, self._complete = set(), np.zeros(0, np.bool_)
 
-    @property
-    def is_begun(self) -> bool:
+    def ready(self) -> bool:
         """Whether spec and base are there; the base comes with the scene's first job."""
         return all(self._storage.exists(f"{self._name}/{name}") for name in ("spec.json", "base/zarr.json"))
 

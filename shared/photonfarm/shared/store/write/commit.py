@@ -120,7 +120,7 @@ class RowWriter(ABC):
 
     # ------------------------------------------------------------------------------------------------------------- rows
 
-    def _claim(self, kind: schema.Kind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
+    def _claim(self, kind: schema.RowKind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
         if row not in expected or row in self._given[kind]:
             raise IncompleteError(f"{what} of job {self._rows.job}: row {row} is not the job's, or is there already")
         self._given[kind].add(row)
@@ -281,7 +281,7 @@ class RowWriter(ABC):
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
     @abstractmethod
-    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+    def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
         """The rows required of each kind, with the name of the kind in messages."""
 
     def _check_complete(self) -> None:
@@ -362,7 +362,7 @@ class JobWriter(RowWriter):
         if count:
             self._put(row, name, np.packbits(seen, bitorder="little"))
 
-    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+    def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
         return {
             "sample": ("radiance", {sample.row for sample in self._rows.samples}),
             "view": ("view", self._rows.new_views),

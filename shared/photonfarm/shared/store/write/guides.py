@@ -189,7 +189,7 @@ class GuideWriter(RowWriter):
         for name, values in arrays_of(guides).items():
             self._put(row, name, rounded(values) if name in NOISY else values)
 
-    def _expected(self) -> dict[schema.Kind, tuple[str, Set[int]]]:
+    def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
         return {"view": ("guides", self._rows.new_views)}
 
     def _check_readable(self) -> None:

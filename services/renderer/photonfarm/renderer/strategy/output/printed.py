@@ -39,7 +39,7 @@ def lines(plan: TransportPlan) -> list[str]:
 
 def _verdict(plan: TransportPlan) -> str:
     now = present(plan.spec)
-    if not plan.offers:
+    if not plan.at_equal_cost:
         return "nothing was measured: every view is black"
     if plan.candidate == now:
         found = best(_fitting(plan))
@@ -54,7 +54,7 @@ _NO_GAIN = "no significant gain over the spec's settings"
 
 
 def _fitting(plan: TransportPlan) -> dict[Candidate, CandidateAtCost]:
-    return {c: offer for c, offer in plan.offers.items() if offer.fits}
+    return {c: at_cost for c, at_cost in plan.at_equal_cost.items() if at_cost.fits}
 
 
 def _halves(plan: TransportPlan) -> list[str]:
@@ -68,7 +68,7 @@ def _halves(plan: TransportPlan) -> list[str]:
 
 def _unchosen(plan: TransportPlan) -> list[str]:
     """The techniques, of light paths and connections, that were measured and are not in the plan."""
-    if plan.measurement.left_out or not plan.offers:
+    if plan.measurement.left_out or not plan.at_equal_cost:
         return []
     if not plan.candidate.light_ratio:
         return [f"light paths: {_not_better(plan, lambda c: c.light_ratio > 0)}"]
@@ -78,9 +78,9 @@ def _unchosen(plan: TransportPlan) -> list[str]:
 
 
 def _not_better(plan: TransportPlan, has: Callable[[Candidate], bool]) -> str:
-    chosen = plan.offers[plan.candidate]
-    others = [offer for offer in plan.offers.values() if has(offer.candidate)]
-    if all(saving(chosen, offer).deviations >= CLEAR for offer in others):
+    chosen = plan.at_equal_cost[plan.candidate]
+    others = [at_cost for at_cost in plan.at_equal_cost.values() if has(at_cost.candidate)]
+    if all(saving(chosen, at_cost).deviations >= CLEAR for at_cost in others):
         return "all settings with them take longer to the same error here"
     return "no settings with them that fit the cost are shown to be worth a change"
 
@@ -89,10 +89,10 @@ def _not_better(plan: TransportPlan, has: Callable[[Candidate], bool]) -> str:
 
 
 def _why(plan: TransportPlan) -> list[str]:
-    if not plan.offers:
+    if not plan.at_equal_cost:
         return [BLACK]
-    rows = list(plan.offers.values())
-    reasons = [*reasons_for(plan.offers[plan.candidate], rows, plan.measurement.shared), *_not_taken(plan)]
+    rows = list(plan.at_equal_cost.values())
+    reasons = [*reasons_for(plan.at_equal_cost[plan.candidate], rows, plan.measurement.shared), *_not_taken(plan)]
     now, half_spp = present(plan.spec), plan.spec.transport.half_spp
     if plan.half_spp != half_spp:
         reasons.append(f"half_spp {plan.half_spp} costs about what {half_spp} does with the spec's settings, {now}")
@@ -102,7 +102,7 @@ def _why(plan: TransportPlan) -> list[str]:
 def _not_taken(plan: TransportPlan) -> list[str]:
     """Why the plan does not have the best measured settings, if it does not."""
     reasons = []
-    chosen, fitting, any_cost = plan.offers[plan.candidate], best(_fitting(plan)), best(dict(plan.offers))
+    chosen, fitting, any_cost = plan.at_equal_cost[plan.candidate], best(_fitting(plan)), best(dict(plan.at_equal_cost))
     if fitting.candidate != plan.candidate:
         gain = saving(fitting, over=chosen)
         if gain.factor > 1:
@@ -133,6 +133,6 @@ def _savings(plan: TransportPlan) -> Sequence[str]:
 
 def _measured(plan: TransportPlan) -> list[str]:
     """The table, its legend and an empty line each; nothing without a measurement."""
-    if not plan.offers:
+    if not plan.at_equal_cost:
         return []
-    return [*table(list(plan.offers.values()), plan.candidate), "", *legend(plan.spec), ""]
+    return [*table(list(plan.at_equal_cost.values()), plan.candidate), "", *legend(plan.spec), ""]

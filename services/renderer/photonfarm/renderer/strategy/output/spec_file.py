@@ -19,7 +19,7 @@ from photonfarm.shared.scene import spec as scene
 BYTE_ORDER_MARK = "\ufeff"
 """The character with which some editors begin a file."""
 
-Settings = Mapping[str, Mapping[str, int | float]]
+SpecTables = Mapping[str, Mapping[str, int | float]]
 """The numbers to write, by table and key."""
 
 
@@ -35,7 +35,7 @@ def writable(name: str) -> Path:
     return file
 
 
-def write(file: Path, settings: Settings) -> None:
+def write(file: Path, settings: SpecTables) -> None:
     """Write settings into a TOML file, all of them or none; raises SpecError for a file that is not valid TOML."""
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
@@ -48,7 +48,7 @@ def write(file: Path, settings: Settings) -> None:
         aside.unlink(missing_ok=True)
 
 
-def put(text: str, settings: Settings, *, where: str) -> str:
+def put(text: str, settings: SpecTables, *, where: str) -> str:
     """A TOML document with new numbers and everything else unchanged; raises SpecError if it is not valid TOML."""
     plain = text.removeprefix(BYTE_ORDER_MARK)
     mark = text[: len(text) - len(plain)]

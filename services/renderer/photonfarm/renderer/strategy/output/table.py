@@ -12,31 +12,31 @@ from photonfarm.renderer.strategy.reasons import rounded
 from photonfarm.shared.scene.spec import SceneSpec
 
 
-def table(offered: Sequence[CandidateAtCost], chosen: Candidate) -> list[str]:
+def table(candidates: Sequence[CandidateAtCost], chosen: Candidate) -> list[str]:
     """A line of heads and one for each candidate."""
-    costs = [rounded(offer.relative_cost, offer.spread) for offer in offered]
+    costs = [rounded(measured.relative_cost, measured.spread) for measured in candidates]
     means, spreads = (_aligned(part) for part in zip(*costs, strict=True))
     columns = {
-        "connections": [str(offer.candidate.connections) for offer in offered],
-        "light ratio": _aligned(f"{offer.candidate.light_ratio:g}" for offer in offered),
-        "images": [str(offer.errors.images) for offer in offered],
-        "half_spp": [str(offer.half_spp) for offer in offered],
-        "relMSE": _aligned(_three_digits(offer.half_error) for offer in offered),
-        "ms": _aligned(f"{1e3 * offer.time_s:.1f}" for offer in offered),
+        "connections": [str(measured.candidate.connections) for measured in candidates],
+        "light ratio": _aligned(f"{measured.candidate.light_ratio:g}" for measured in candidates),
+        "images": [str(measured.errors.images) for measured in candidates],
+        "half_spp": [str(measured.half_spp) for measured in candidates],
+        "relMSE": _aligned(_three_digits(measured.half_error) for measured in candidates),
+        "ms": _aligned(f"{1e3 * measured.time_s:.1f}" for measured in candidates),
         "error × time": [
             f"{mean} {'±' if spread.strip() else ' '} {spread}" for mean, spread in zip(means, spreads, strict=True)
         ],
-        "": [_remark(offer, chosen) for offer in offered],
+        "": [_remark(measured, chosen) for measured in candidates],
     }
     widths = [max(map(len, [head, *cells])) for head, cells in columns.items()]
     rows = [columns, *zip(*columns.values(), strict=True)]
     return ["  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def _remark(offer: CandidateAtCost, chosen: Candidate) -> str:
-    if offer.candidate == chosen:
+def _remark(measured: CandidateAtCost, chosen: Candidate) -> str:
+    if measured.candidate == chosen:
         return "chosen"
-    return "" if offer.fits else "too costly"
+    return "" if measured.fits else "too costly"
 
 
 def legend(spec: SceneSpec) -> list[str]:

@@ -9,15 +9,15 @@ from typing import Any
 import mitsuba as mi
 
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import EYE_ALONE, LONG, QUICK, HardScene, Refusal, Scene
+from photonfarm.renderer.verify.scenes.case import EYE_ALONE, LONG, QUICK, HardScene, Refusal, SceneDict
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import PATH, crop_of_full_image, same_by_bdpt
 
 
-def seen_by(**changes: Any) -> Callable[[int], Scene]:
+def seen_by(**changes: Any) -> Callable[[int], SceneDict]:
     """The room of two-sided sheets, its sensor changed."""
 
-    def build(size: int) -> Scene:
+    def build(size: int) -> SceneDict:
         scene = hard_scenes.twosided(size)
         film = {**scene["sensor"]["film"], **changes.get("film", {})}
         scene["sensor"] = {**scene["sensor"], **changes, "film": film}
@@ -29,30 +29,30 @@ def seen_by(**changes: Any) -> Callable[[int], Scene]:
 # ------------------------------------------------ Places of a camera ------------------------------------------------
 
 
-def camera_in_light(size: int) -> Scene:
+def camera_in_light(size: int) -> SceneDict:
     """The camera lies in the plane of the light, within it, and looks in the direction of its light."""
     return {**lit_room(size), "sensor": camera(size, [0.1, 0.05, 1.95], [0.1, 0.3, 0], 60)}
 
 
-def camera_at_wall(size: int) -> Scene:
+def camera_at_wall(size: int) -> SceneDict:
     """The camera touches a wall and looks along it."""
     return {**lit_room(size), "sensor": camera(size, [-0.999, -0.9, 1], [-0.9, 0.9, 0.9], 70, near_clip=1e-3)}
 
 
-def blocked_before_near_plane(size: int) -> Scene:
+def blocked_before_near_plane(size: int) -> SceneDict:
     """A sheet between the camera and its near plane: it is not seen, and casts no shadow on the lens."""
     scene = {**lit_room(size), "blocker": rectangle([0.5, 0.5], [0, -2.9, 1], [0, -1, 0], bsdf=grey(0.5))}
     scene["sensor"]["near_clip"] = 0.5
     return scene
 
 
-def light_on_wall(size: int) -> Scene:
+def light_on_wall(size: int) -> SceneDict:
     """The room of two-sided sheets with its light large on the back wall: something to see at every depth."""
     scene = hard_scenes.twosided(size)
     return {**scene, "light": rectangle([0.6, 0.6], [0, 0.99, 0.9], [0, -1, 0], emitter=shining([3.0, 2.5, 2.0]))}
 
 
-def orthographic(size: int) -> Scene:
+def orthographic(size: int) -> SceneDict:
     """The room of two-sided sheets without perspective."""
     scene = hard_scenes.twosided(size)
     sensor = {key: value for key, value in scene["sensor"].items() if key != "fov"}
@@ -67,7 +67,7 @@ LENS = {"type": "thinlens", "aperture_radius": 0.15, "focus_distance": 3.0}
 CLIPPED_LENS = {**LENS, "aperture_radius": 0.1, "near_clip": 2.9, "far_clip": 3.6}
 
 
-def cropped(size: int) -> Scene:
+def cropped(size: int) -> SceneDict:
     """The room through a crop window off the middle, with the principal point moved."""
     unit = size // 16
     window = {"crop_offset_x": 4, "crop_offset_y": 2, "crop_width": 8, "crop_height": 12}
@@ -85,11 +85,11 @@ cove at half width 1e-3 is brighter by 2.7 % with `path`, too.
 """
 
 
-def scaled(factor: float) -> Callable[[int], Scene]:
+def scaled(factor: float) -> Callable[[int], SceneDict]:
     """The cove, everything made larger by this factor."""
     length = LENGTH * factor
 
-    def build(size: int) -> Scene:
+    def build(size: int) -> SceneDict:
         scene = hard_scenes.cove(size)
         for entry in scene.values():
             if isinstance(entry, dict) and entry["type"] == "rectangle":
@@ -103,11 +103,11 @@ def scaled(factor: float) -> Callable[[int], Scene]:
 # ------------------------------------------------ What is refused ------------------------------------------------
 
 
-def _with_filter(size: int) -> Scene:
+def _with_filter(size: int) -> SceneDict:
     return seen_by(film={"rfilter": {"type": "gaussian"}})(size)
 
 
-def _fog(size: int) -> Scene:
+def _fog(size: int) -> SceneDict:
     fog = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
     return {**hard_scenes.cove(size), "fog": fog}
 

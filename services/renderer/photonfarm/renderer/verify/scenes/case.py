@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Scene = dict[str, Any]
+SceneDict = dict[str, Any]
 """A dictionary for ``mi.load_dict``."""
 Images = NDArray[np.floating[Any]]
 """[K, H, W, 3] linear radiance of K independent renders; K = 1 stands for an image that is known exactly."""
@@ -70,7 +70,7 @@ class HardScene:
     row: int  # number in the table of hard scenes, 1 … 36
     name: str
     hard: str  # what is hard about it
-    build: Callable[[int], Scene]  # function of the image size
+    build: Callable[[int], SceneDict]  # function of the image size
     truth: Truth
     max_depth: int = 6
     rr_depth: int = 5
@@ -93,7 +93,7 @@ class Refusal:
 
     row: int | None  # number in the table of hard scenes, None where it has none
     name: str
-    build: Callable[[int], Scene]
+    build: Callable[[int], SceneDict]
     sentence: str  # a part of the required message
     settings: BdptSettings = FIRST
     allowed: BdptSettings | None = None  # settings with which it is rendered nevertheless

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.scenes.case import ALL, QUICK, HardScene, Scene
+from photonfarm.renderer.verify.scenes.case import ALL, QUICK, HardScene, SceneDict
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import PATH, known, known_on_plane
 
@@ -19,25 +19,25 @@ Values = npt.NDArray[np.float64]  # [N]
 # ------------------------------------------------ Closed spheres ------------------------------------------------
 
 
-def closed_sphere(size: int) -> Scene:
+def closed_sphere(size: int) -> SceneDict:
     """The inside of a sphere of reflectance ½ without a light."""
     sensor = camera(size, [0.3, 0.2, 0.1], [1, 0, 0], 60, near_clip=1e-3)
     return {"type": "scene", "sensor": sensor, "sphere": {"type": "sphere", "flip_normals": True, "bsdf": grey(0.5)}}
 
 
-def shining_sphere(size: int) -> Scene:
+def shining_sphere(size: int) -> SceneDict:
     """The closed sphere, shining with radiance ½."""
     scene = closed_sphere(size)
     scene["sphere"]["emitter"] = shining(0.5)
     return scene
 
 
-def point_in_sphere(size: int) -> Scene:
+def point_in_sphere(size: int) -> SceneDict:
     """The closed sphere with a point light of intensity π in its centre."""
     return {**closed_sphere(size), "light": {"type": "point", "intensity": {"type": "rgb", "value": np.pi}}}
 
 
-def four_points_in_sphere(size: int) -> Scene:
+def four_points_in_sphere(size: int) -> SceneDict:
     """The closed sphere with four lights in its centre, of intensity π/4 each, chosen with unequal probabilities."""
     scene = closed_sphere(size)
     for k in range(4):
@@ -49,7 +49,7 @@ def four_points_in_sphere(size: int) -> Scene:
 # ------------------------------------------------ Furnaces ------------------------------------------------
 
 
-def furnace(size: int) -> Scene:
+def furnace(size: int) -> SceneDict:
     """Bodies that reflect or transmit all light, under a constant sky of radiance 1."""
     mirror = {"type": "conductor", "material": "none"}
     rough = {"type": "roughdielectric", "alpha": 0.002, "distribution": "ggx"}
@@ -65,7 +65,7 @@ def furnace(size: int) -> Scene:
     }
 
 
-def glass_in_sphere(size: int) -> Scene:
+def glass_in_sphere(size: int) -> SceneDict:
     """The shining sphere around a glass ball, a mirror and a pane, which lose no light: radiance is 1 everywhere."""
     mirror = {"type": "conductor", "material": "none"}
     return {
@@ -76,7 +76,7 @@ def glass_in_sphere(size: int) -> Scene:
     }
 
 
-def rough_furnace(size: int) -> Scene:
+def rough_furnace(size: int) -> SceneDict:
     """The furnace with rough glass and rough metal, whose microfacets lose the light that they would scatter twice."""
     rough = {"type": "roughdielectric", "alpha": 0.3, "distribution": "ggx"}
     scene = furnace(size)
@@ -85,7 +85,7 @@ def rough_furnace(size: int) -> Scene:
     return scene
 
 
-def empty(size: int) -> Scene:
+def empty(size: int) -> SceneDict:
     """Nothing but a constant sky."""
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.37}}
     return {"type": "scene", "sensor": camera(size, [0, 0, 6], [0, 0, 0], 40), "sky": sky}
@@ -94,13 +94,13 @@ def empty(size: int) -> Scene:
 # ------------------------------------------------ Lights over a plane ------------------------------------------------
 
 
-def over_a_plane(size: int, light: Scene) -> Scene:
+def over_a_plane(size: int, light: SceneDict) -> SceneDict:
     """A plane of reflectance ½ at z = 0 below one light."""
     plane = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20), "bsdf": grey(0.5)}
     return {"type": "scene", "sensor": camera(size, [3, 0, 4], [0, 0, 0], 30), "plane": plane, "light": light}
 
 
-def point_over_plane(size: int) -> Scene:
+def point_over_plane(size: int) -> SceneDict:
     """A plane below a point light of intensity 8 at (1, 0, 2)."""
     return over_a_plane(size, {"type": "point", "position": [1, 0, 2], "intensity": {"type": "rgb", "value": 8.0}})
 
@@ -111,13 +111,13 @@ def point_radiance(p: Points) -> Values:
     return 0.5 / np.pi * 8 * 2 / r2**1.5
 
 
-def sun_over_plane(size: int) -> Scene:
+def sun_over_plane(size: int) -> SceneDict:
     """A plane below a directional light of irradiance 3."""
     irradiance = {"type": "rgb", "value": 3.0}
     return over_a_plane(size, {"type": "directional", "direction": [1, 0, -2], "irradiance": irradiance})
 
 
-def rectangle_over_plane(size: int) -> Scene:
+def rectangle_over_plane(size: int) -> SceneDict:
     """A plane below a parallel rectangle light of half sizes 0.7 and 0.4 at height 1.5, above the camera."""
     light = rectangle([0.7, 0.4], [0, 0, 1.5], [0, 0, -1], bsdf=grey(0.0), emitter=shining(5.0))
     return {**over_a_plane(size, light), "sensor": camera(size, [2.5, 0, 1.4], [0, 0, 0], 30)}
@@ -139,7 +139,7 @@ def rectangle_radiance(p: Points) -> Values:
     return 0.5 * 5 * (corner(right, high) - corner(left, high) - corner(right, low) + corner(left, low))
 
 
-def ball_over_plane(size: int) -> Scene:
+def ball_over_plane(size: int) -> SceneDict:
     """A plane below a sphere light of radius 0.6 around (−1, 0, 2), wholly above the horizon of every point."""
     light = {"type": "sphere", "center": [-1, 0, 2], "radius": 0.6, "bsdf": grey(0.0), "emitter": shining(5.0)}
     return over_a_plane(size, light)
@@ -154,7 +154,7 @@ def ball_radiance(p: Points) -> Values:
 SPOT = np.array([1.0, 0.0, 2.0])
 
 
-def spot_over_plane(size: int) -> Scene:
+def spot_over_plane(size: int) -> SceneDict:
     """A 5° spot light of intensity 8, which is full up to 4°; the camera is near, so that the rim is in the image."""
     to_world = mi.ScalarTransform4f().look_at(origin=list(SPOT), target=[0, 0, 0], up=[0, 1, 0])
     intensity = {"type": "rgb", "value": 8.0}

@@ -13,10 +13,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-Scene = dict[str, Any]
+from photonfarm.renderer.verify.scenes.case import SceneDict
 
 
-def camera(size: int, origin: list[float], target: list[float], fov: float, **more: Any) -> Scene:
+def camera(size: int, origin: list[float], target: list[float], fov: float, **more: Any) -> SceneDict:
     """A perspective camera with an independent sampler and a box filter; ``more`` overrides."""
     up = (
         [0, 0, 1]
@@ -33,24 +33,24 @@ def camera(size: int, origin: list[float], target: list[float], fov: float, **mo
     }
 
 
-def grey(value: float) -> Scene:
+def grey(value: float) -> SceneDict:
     """A diffuse material of this reflectance."""
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": value}}
 
 
-def rectangle(half: list[float], at: list[float], facing: list[float], **more: Any) -> Scene:
+def rectangle(half: list[float], at: list[float], facing: list[float], **more: Any) -> SceneDict:
     """A rectangle of half sizes ``half`` around ``at`` whose front looks along ``facing``."""
     up = [0, 1, 0] if abs(facing[1]) < 0.9 else [0, 0, 1]
     frame = mi.ScalarTransform4f().look_at(origin=at, target=list(np.add(at, facing)), up=up)
     return {"type": "rectangle", "to_world": frame @ mi.ScalarTransform4f().scale([half[0], half[1], 1]), **more}
 
 
-def shining(radiance: float | list[float]) -> Scene:
+def shining(radiance: float | list[float]) -> SceneDict:
     """An area emitter of this radiance, grey or RGB."""
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
 
 
-def room(reflectance: float = 0.6) -> Scene:
+def room(reflectance: float = 0.6) -> SceneDict:
     """Inside of the box [−1, 1]²×[0, 2], without its wall at y = −1."""
     return {
         "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=grey(reflectance)),
@@ -61,7 +61,7 @@ def room(reflectance: float = 0.6) -> Scene:
     }
 
 
-def lit_room(size: int) -> Scene:
+def lit_room(size: int) -> SceneDict:
     """The open room with a rectangle light under its ceiling, just out of the picture (its rim would be noise)."""
     return {
         "type": "scene",
@@ -87,14 +87,14 @@ def environment(width: int = 32) -> Any:
 # ------------------------------------------------ The scenes ------------------------------------------------
 
 
-def cornell(size: int) -> Scene:
+def cornell(size: int) -> SceneDict:
     """Mitsuba's Cornell box."""
-    scene: Scene = mi.cornell_box()
+    scene: SceneDict = mi.cornell_box()
     scene["sensor"]["film"].update(width=size, height=size, rfilter={"type": "box"})
     return scene
 
 
-def glass_caustic(size: int) -> Scene:
+def glass_caustic(size: int) -> SceneDict:
     """A glass sphere between a small area light and a floor: the caustic is hardly found from the camera."""
     return {
         "type": "scene",
@@ -110,7 +110,7 @@ def glass_caustic(size: int) -> Scene:
     }
 
 
-def floor_caustic(size: int) -> Scene:
+def floor_caustic(size: int) -> SceneDict:
     """The caustic of a glass sphere in the light of a small area light, with the sphere out of the picture.
 
     So every path to the light that the image needs has one diffuse vertex at which a light path can be joined to the
@@ -129,7 +129,7 @@ def floor_caustic(size: int) -> Scene:
     }
 
 
-def cove(size: int) -> Scene:
+def cove(size: int) -> SceneDict:
     """A room lit by a light that shines at the ceiling from above a shelf: all light in the image is indirect."""
     return {
         "type": "scene",
@@ -140,7 +140,7 @@ def cove(size: int) -> Scene:
     }
 
 
-def rotated_envmap(size: int) -> Scene:
+def rotated_envmap(size: int) -> SceneDict:
     """A concentrated environment map, turned about two axes, over a floor and a ball."""
     turn = mi.ScalarTransform4f().rotate([1, 0, 0], 70) @ mi.ScalarTransform4f().rotate([0, 1, 0], 130)
     return {
@@ -152,7 +152,7 @@ def rotated_envmap(size: int) -> Scene:
     }
 
 
-def constant_environment(size: int) -> Scene:
+def constant_environment(size: int) -> SceneDict:
     """A constant environment around a room that is open to the front."""
     ball = {"type": "sphere", "center": [0, 0, 0.5], "radius": 0.4, "bsdf": {"type": "roughconductor", "alpha": 0.2}}
     return {
@@ -164,7 +164,7 @@ def constant_environment(size: int) -> Scene:
     }
 
 
-def bump_floor(size: int) -> Scene:
+def bump_floor(size: int) -> SceneDict:
     """A strongly bump-mapped rough floor in a room with an area light.
 
     Shading and geometric normals differ everywhere.
@@ -178,7 +178,7 @@ def bump_floor(size: int) -> Scene:
     return {**lit_room(size), "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=bumped)}
 
 
-def normal_floor(size: int) -> Scene:
+def normal_floor(size: int) -> SceneDict:
     """A floor with a strong normal map in a room with an area light."""
     slope = (bumps()[..., 0] - 0.5) * 0.9
     normals = np.stack([slope, slope.T, np.sqrt(1 - slope**2 - slope.T**2)], axis=-1) * 0.5 + 0.5
@@ -190,13 +190,13 @@ def normal_floor(size: int) -> Scene:
     return {**lit_room(size), "floor": rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=mapped)}
 
 
-def rough_dielectric(size: int) -> Scene:
+def rough_dielectric(size: int) -> SceneDict:
     """A ball of rough glass in a lit room."""
     glass = {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.5, "distribution": "ggx"}
     return {**lit_room(size), "ball": {"type": "sphere", "center": [0, -0.2, 0.5], "radius": 0.45, "bsdf": glass}}
 
 
-def mask(size: int) -> Scene:
+def mask(size: int) -> SceneDict:
     """A half-transparent screen before the light and another before the camera."""
     veil = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "twosided", "b": grey(0.5)}}
     return {
@@ -206,7 +206,7 @@ def mask(size: int) -> Scene:
     }
 
 
-def twosided(size: int) -> Scene:
+def twosided(size: int) -> SceneDict:
     """Thin two-sided sheets with different sides, and a coarse ball with smooth normals."""
     sheet = {"type": "twosided", "front": grey(0.8), "back": {"type": "roughconductor", "alpha": 0.3}}
     return {
@@ -216,7 +216,7 @@ def twosided(size: int) -> Scene:
     }
 
 
-def plastics(size: int) -> Scene:
+def plastics(size: int) -> SceneDict:
     """Layered materials whose lobes are chosen at random, one of them a mirror: plastic, principled, blends."""
     balls = {
         "plastic": {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0.1, 0.3, 0.6]}},
@@ -229,7 +229,7 @@ def plastics(size: int) -> Scene:
     return scene
 
 
-def textured_light(size: int) -> Scene:
+def textured_light(size: int) -> SceneDict:
     """A room lit by a rectangle with a texture of dark and bright texels."""
     pattern = np.zeros((4, 4, 3), np.float32)
     pattern[0, 1], pattern[2, 3], pattern[3, 0] = [40.0, 10.0, 5.0], [5.0, 30.0, 10.0], [5.0, 5.0, 50.0]
@@ -239,7 +239,7 @@ def textured_light(size: int) -> Scene:
     return scene
 
 
-def many_lights(size: int) -> Scene:
+def many_lights(size: int) -> SceneDict:
     """Lights of every kind at once: area (rectangle, sphere, disk, mesh), point, spot, directional, constant."""
     light_cube = mi.ScalarTransform4f().translate([0.6, 0.4, 1.4]) @ mi.ScalarTransform4f().scale(0.08)
     beam = mi.ScalarTransform4f().look_at(origin=[0, -0.5, 1.8], target=[0.2, 0.5, 0], up=[0, 1, 0])
@@ -263,7 +263,7 @@ def many_lights(size: int) -> Scene:
     }
 
 
-def door_gap(size: int) -> Scene:
+def door_gap(size: int) -> SceneDict:
     """A room lit through a narrow gap in its right wall; the light in the hall beyond shines away from the gap."""
     return {
         "type": "scene",
@@ -276,7 +276,7 @@ def door_gap(size: int) -> Scene:
     }
 
 
-def _hall(reflectance: float = 0.7) -> Scene:
+def _hall(reflectance: float = 0.7) -> SceneDict:
     """The hall 1 < x < 3 beside the room of `door_gap`, closed but for the gap."""
     return {
         "hall_floor": rectangle([1, 1], [2, 0, 0], [0, 0, 1], bsdf=grey(reflectance)),
@@ -287,7 +287,7 @@ def _hall(reflectance: float = 0.7) -> Scene:
     }
 
 
-def mirror_room(size: int) -> Scene:
+def mirror_room(size: int) -> SceneDict:
     """A corridor between two mirrors, with a small light: most light arrives by several mirrorings."""
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": 0.9}}
     scene = lit_room(size)
@@ -298,7 +298,7 @@ def mirror_room(size: int) -> Scene:
     return scene
 
 
-def hundred_lights(size: int) -> Scene:
+def hundred_lights(size: int) -> SceneDict:
     """A room under a hundred small lights whose radiances span 1:10⁴; every tenth is dead (radiance 0)."""
     scene = lit_room(size)
     del scene["light"]
@@ -310,7 +310,7 @@ def hundred_lights(size: int) -> Scene:
     return scene
 
 
-HARD_SCENES: dict[str, Callable[[int], Scene]] = {
+HARD_SCENES: dict[str, Callable[[int], SceneDict]] = {
     scene.__name__: scene
     for scene in (
         cornell,

@@ -17,7 +17,7 @@ from photonfarm.renderer.verify.scenes.case import (
     Effort,
     HardScene,
     Images,
-    Scene,
+    SceneDict,
     Truth,
 )
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
@@ -29,7 +29,7 @@ from photonfarm.renderer.verify.scenes.truths import PATH, TRUTH_SEEDS, load, re
 SHIFT = [4.5, 0.0, 0.0]
 
 
-def _under_sky_and_sun(size: int, block: Any) -> Scene:
+def _under_sky_and_sun(size: int, block: Any) -> SceneDict:
     return {
         "type": "scene",
         "sensor": camera(size, [2, -8, 3], [2, 0, 0.4], 42),
@@ -40,12 +40,12 @@ def _under_sky_and_sun(size: int, block: Any) -> Scene:
     }
 
 
-def block_at_home(size: int) -> Scene:
+def block_at_home(size: int) -> SceneDict:
     """A block on a floor, under a sky and a sun."""
     return _under_sky_and_sun(size, mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.8))
 
 
-def block_far_away(size: int) -> Scene:
+def block_far_away(size: int) -> SceneDict:
     """The scene of `block_at_home`, its block outside of the former bounding sphere but still in the picture."""
     return _under_sky_and_sun(size, mi.ScalarTransform4f().translate(SHIFT).translate([0, 0, 0.8]).scale(0.8))
 
@@ -61,7 +61,7 @@ def move_block(scene: Any) -> None:
 # ------------------------------------------------ Light through glass ------------------------------------------------
 
 
-def point_caustic(size: int) -> Scene:
+def point_caustic(size: int) -> SceneDict:
     """The caustic of a point light under a glass ball, which is itself out of the picture."""
     glass = {"type": "dielectric", "int_ior": 1.5}
     return {
@@ -73,7 +73,7 @@ def point_caustic(size: int) -> Scene:
     }
 
 
-def bulb(size: int) -> Scene:
+def bulb(size: int) -> SceneDict:
     """A room lit by a ball in a hollow bulb of glass: no technique joins anything to the light itself."""
     scene = lit_room(size)
     at = [0, 0, 1.2]
@@ -88,7 +88,7 @@ def bulb(size: int) -> Scene:
 # ------------------------------------------------ Shapes of lights ------------------------------------------------
 
 
-def _cube_light(size: int, mirrored: bool) -> Scene:
+def _cube_light(size: int, mirrored: bool) -> SceneDict:
     sign = -1 if mirrored else 1
     scene = lit_room(size)
     to_world = mi.ScalarTransform4f().translate([0.2, 0.1, 1.2]) @ mi.ScalarTransform4f().scale([sign * 0.2, 0.1, 0.3])
@@ -96,24 +96,24 @@ def _cube_light(size: int, mirrored: bool) -> Scene:
     return scene
 
 
-def mirrored_light(size: int) -> Scene:
+def mirrored_light(size: int) -> SceneDict:
     """A room lit by a box whose transformation mirrors it."""
     return _cube_light(size, mirrored=True)
 
 
-def unmirrored_light(size: int) -> Scene:
+def unmirrored_light(size: int) -> SceneDict:
     """The room of `mirrored_light`, its box not mirrored; as the box is symmetric, the images must be equal."""
     return _cube_light(size, mirrored=False)
 
 
-def grid_light(size: int) -> Scene:
+def grid_light(size: int) -> SceneDict:
     """A room lit by a flat mesh of 1058 triangles of unequal sizes."""
     scene = lit_room(size)
     scene["light"] = grid("light", 23, emitter=shining([8.0, 7.0, 6.0]))
     return scene
 
 
-def round_lights(size: int) -> Scene:
+def round_lights(size: int) -> SceneDict:
     """A room lit by a cylinder, a disk and a sphere."""
     scene = lit_room(size)
     disk = mi.ScalarTransform4f().look_at(origin=[0.95, 0, 1], target=[0, 0, 0.8], up=[0, 0, 1])
@@ -124,27 +124,27 @@ def round_lights(size: int) -> Scene:
     return scene
 
 
-def smooth_mesh_light(size: int) -> Scene:
+def smooth_mesh_light(size: int) -> SceneDict:
     """A room lit by an octahedron with smooth normals, which only hits find."""
     scene = lit_room(size)
     scene["light"] = octahedron("light", [0, 0, 1.5], 0.35, emitter=shining(8.0))
     return scene
 
 
-def textured_ball_light(size: int) -> Scene:
+def textured_ball_light(size: int) -> SceneDict:
     """A room lit by a ball with a texture, which only hits find."""
     emitter = hard_scenes.textured_light(size)["light"]["emitter"]
     return {**lit_room(size), "light": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.3, "emitter": emitter}}
 
 
-def sun_and_sky(size: int) -> Scene:
+def sun_and_sky(size: int) -> SceneDict:
     """A room open to a sky model with its sun, for which `bdpt` has no emission sampling."""
     scene = lit_room(size)
     del scene["light"]
     return {**scene, "sky": {"type": "sunsky", "sun_direction": [0.2, -0.8, 0.5]}}
 
 
-def projector(size: int) -> Scene:
+def projector(size: int) -> SceneDict:
     """A room lit by a projector that throws a pattern of dark and bright texels."""
     pattern = np.random.default_rng(3).uniform(0, 1, (8, 8, 3)).astype(np.float32) ** 3
     to_world = mi.ScalarTransform4f().look_at(origin=[-0.5, -0.8, 1.6], target=[0.2, 0.6, 0.3], up=[0, 0, 1])

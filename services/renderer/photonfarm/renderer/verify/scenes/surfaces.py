@@ -9,20 +9,20 @@ import mitsuba as mi
 import numpy as np
 
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import LONG, QUICK, HardScene, Scene
+from photonfarm.renderer.verify.scenes.case import LONG, QUICK, HardScene, SceneDict
 from photonfarm.renderer.verify.scenes.closed_form import point_in_sphere
 from photonfarm.renderer.verify.scenes.hard_scenes import bumps, grey, lit_room, rectangle
 from photonfarm.renderer.verify.scenes.meshes import smooth_ball
 from photonfarm.renderer.verify.scenes.truths import PATH
 
 
-def glass_plate(size: int) -> Scene:
+def glass_plate(size: int) -> SceneDict:
     """The lit room behind a thick plate of glass, through which nothing joins the camera."""
     plate = mi.ScalarTransform4f().translate([0, -2, 1]) @ mi.ScalarTransform4f().scale([2, 0.1, 2])
     return {**lit_room(size), "plate": {"type": "cube", "to_world": plate, "bsdf": {"type": "dielectric"}}}
 
 
-def null_veils(size: int) -> Scene:
+def null_veils(size: int) -> SceneDict:
     """Sheets that are not there (`null`), before light and camera: next event estimation stops at them."""
     return {
         **lit_room(size),
@@ -31,7 +31,7 @@ def null_veils(size: int) -> Scene:
     }
 
 
-def smooth_balls(size: int) -> Scene:
+def smooth_balls(size: int) -> SceneDict:
     """Two coarse balls with smooth normals, one-sided and two-sided."""
     metal = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.3}}
     return {
@@ -41,7 +41,7 @@ def smooth_balls(size: int) -> Scene:
     }
 
 
-def bumped_sphere(size: int) -> Scene:
+def bumped_sphere(size: int) -> SceneDict:
     """The closed sphere with a point light, strongly bump-mapped: shading and geometry disagree everywhere."""
     scene = point_in_sphere(size)
     texture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(bumps())}
@@ -49,7 +49,7 @@ def bumped_sphere(size: int) -> Scene:
     return scene
 
 
-def touching(size: int) -> Scene:
+def touching(size: int) -> SceneDict:
     """Boxes that share edges, corners and faces with each other and with the room; the floor is there twice."""
     scene = lit_room(size)
     scene["floor_again"] = rectangle([1, 1], [0, 0, 0], [0, 0, 1], bsdf=grey(0.6))
@@ -59,10 +59,10 @@ def touching(size: int) -> Scene:
     return scene
 
 
-def rough_glass(alpha: float) -> Callable[[int], Scene]:
+def rough_glass(alpha: float) -> Callable[[int], SceneDict]:
     """A ball of rough glass of this roughness in the lit room."""
 
-    def build(size: int) -> Scene:
+    def build(size: int) -> SceneDict:
         scene = hard_scenes.rough_dielectric(size)
         scene["ball"]["bsdf"]["alpha"] = alpha
         return scene
@@ -70,7 +70,7 @@ def rough_glass(alpha: float) -> Callable[[int], Scene]:
     return build
 
 
-def _balls(size: int, **bsdfs: Scene) -> Scene:
+def _balls(size: int, **bsdfs: SceneDict) -> SceneDict:
     scene = lit_room(size)
     for k, (name, bsdf) in enumerate(bsdfs.items()):
         x = -0.66 + 1.32 * k / max(len(bsdfs) - 1, 1)
@@ -78,7 +78,7 @@ def _balls(size: int, **bsdfs: Scene) -> Scene:
     return scene
 
 
-def rough_surfaces(size: int) -> Scene:
+def rough_surfaces(size: int) -> SceneDict:
     """Rough plastic, anisotropic metal, a mirror of gold, a normal-mapped metal."""
     texels = np.random.default_rng(2).uniform(0.35, 0.65, (8, 8, 3)).astype(np.float32)
     texels[..., 2] = 1
@@ -100,7 +100,7 @@ def rough_surfaces(size: int) -> Scene:
     )
 
 
-def sheets(size: int) -> Scene:
+def sheets(size: int) -> SceneDict:
     """Thin things: a pane, a thin principled sheet, a cut-out with holes, a blend of two."""
     holes = (np.indices((8, 8)).sum(axis=0) % 2).astype(np.float32)[..., None]
     opacity = {"type": "bitmap", "raw": True, "filter_type": "nearest", "data": mi.TensorXf(holes)}

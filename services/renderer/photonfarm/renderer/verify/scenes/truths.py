@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, Scene, Truth
+from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, SceneDict, Truth
 
 LANES = 1 << 20
 """The largest number of samples of one launch, which bounds the memory of Mitsuba's own integrators."""
@@ -39,7 +39,7 @@ def render(scene: Any, integrator: dict[str, Any], spp: int, seeds: range) -> Im
     return np.stack([image(seed) for seed in seeds])
 
 
-def load(scene: Scene) -> Any:
+def load(scene: SceneDict) -> Any:
     """The scene loaded with one shape for each entry."""
     return mi.load_dict(scene, optimize=False)
 
@@ -51,7 +51,7 @@ def _truth_seeds(effort: Effort, seed: int) -> range:
 # ------------------------------------------------ Renders ------------------------------------------------
 
 
-def rendered(integrator: str, name: str, build: Callable[[int], Scene] | None = None, **parameters: Any) -> Truth:
+def rendered(integrator: str, name: str, build: Callable[[int], SceneDict] | None = None, **parameters: Any) -> Truth:
     """Images by one of Mitsuba's integrators, of the scene itself or of the one that ``build`` describes instead.
 
     Depth and roulette are the scene's own unless given.
@@ -68,7 +68,7 @@ def rendered(integrator: str, name: str, build: Callable[[int], Scene] | None = 
 PATH = rendered("path", "`path`")
 
 
-def crop_of_full_image(full: Callable[[int], Scene], rows: slice, columns: slice) -> Truth:
+def crop_of_full_image(full: Callable[[int], SceneDict], rows: slice, columns: slice) -> Truth:
     """The part of the whole image, by `path`, that the scene's crop window shows (fractions of 16 pixels)."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:
@@ -83,7 +83,7 @@ def _scaled(part: slice, unit: int) -> slice:
     return slice(part.start * unit, part.stop * unit)
 
 
-def same_by_bdpt(build: Callable[[int], Scene], name: str) -> Truth:
+def same_by_bdpt(build: Callable[[int], SceneDict], name: str) -> Truth:
     """Images by `bdpt` itself, of a scene that must look the same."""
 
     def images(scene: HardScene, effort: Effort, seed: int) -> Images:

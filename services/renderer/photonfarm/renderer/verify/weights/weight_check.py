@@ -11,7 +11,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt.emission import read_lights
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import BdptSettings, Scene
+from photonfarm.renderer.verify.scenes.case import BdptSettings, SceneDict
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
@@ -28,7 +28,7 @@ _GRAZING = 4.0  # proportion of densities beyond which the ray's offset decides 
 _NEGLIGIBLE = 1e-5  # weights below this are compared in absolute terms
 
 
-def shiny_room(size: int) -> Scene:
+def shiny_room(size: int) -> SceneDict:
     """The lit room with a large light, a ball of glass, a mirror, and rough plastic all around."""
     rough = {"type": "roughplastic", "alpha": 0.3}
     scene = {
@@ -42,7 +42,7 @@ def shiny_room(size: int) -> Scene:
     }
 
 
-def bulb_room(size: int) -> Scene:
+def bulb_room(size: int) -> SceneDict:
     """The room with a point light alone."""
     scene = {name: entry for name, entry in lit_room(size).items() if name != "light"}
     return {
@@ -51,7 +51,7 @@ def bulb_room(size: int) -> Scene:
     }
 
 
-def ball_light(size: int) -> Scene:
+def ball_light(size: int) -> SceneDict:
     """A floor and a plastic ball lit by a shining ball."""
     return {
         "type": "scene",
@@ -62,7 +62,7 @@ def ball_light(size: int) -> Scene:
     }
 
 
-SCENES: dict[str, Callable[[int], Scene]] = {
+SCENES: dict[str, Callable[[int], SceneDict]] = {
     "cornell": hard_scenes.cornell,
     "shiny-room": shiny_room,
     "bulb-room": bulb_room,
@@ -99,7 +99,7 @@ class WeightComparison:
 
 
 def compare_weights(
-    build: Callable[[int], Scene], settings: BdptSettings, *, lanes: int, seed: int = 0
+    build: Callable[[int], SceneDict], settings: BdptSettings, *, lanes: int, seed: int = 0
 ) -> WeightComparison:
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
     scene = load(build(_SIZE))

@@ -10,7 +10,7 @@ import pytest
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import METRICS
-from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, waits
+from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, wait_shares
 from photonfarm.trainer.training.loop import Hooks, train
 
 BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
@@ -27,7 +27,7 @@ BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
 )
 def test_what_most_of_the_time_since_goes_to_is_the_bottleneck(spent: dict[str, float], slow: str) -> None:
     now = {name: value + spent.get(name, 0.0) for name, value in BEFORE.items()}
-    shares = waits(now, BEFORE)
+    shares = wait_shares(now, BEFORE)
     assert shares["samples"] == pytest.approx(spent.get("wait_data", 0) / sum(spent.values()), abs=1e-4)
     assert shares["reading"] == pytest.approx(spent.get("wait_read", 0) / sum(spent.values()), abs=1e-4)
     assert bottleneck(shares) == slow
@@ -54,7 +54,7 @@ def test_at_any_moment_time_goes_to_one_kind_and_all_kinds_together_are_the_wall
 
 
 def test_before_any_time_has_gone_by_nothing_has_been_waited_for() -> None:
-    assert bottleneck(waits(BEFORE, BEFORE)) == "training"
+    assert bottleneck(wait_shares(BEFORE, BEFORE)) == "training"
 
 
 @pytest.mark.parametrize(("samples", "draws", "each"), [(100, 0, 100.0), (100, 40, 2.5), (100, 4000, 1.0), (0, 0, 0)])
@@ -93,10 +93,10 @@ def slowed(plain: Callable[..., Any], seconds: float) -> Callable[..., Any]:
 
 def test_a_run_that_waits_for_reading_says_so(make_source, tiny, run) -> None:
     source: Any = make_source(24)
-    source.read_batch = slowed(source.read_batch, 0.3)
+    source.read_samples = slowed(source.read_samples, 0.3)
     train(source, tiny(validate_every=100), run)
     last = metrics_log.read(run / METRICS)[-1]
-    assert bottleneck(waits(last["seconds"])) == "reading"
+    assert bottleneck(wait_shares(last["seconds"])) == "reading"
 
 
 def test_what_is_no_training_is_counted_as_what_it_is_and_not_as_waiting(

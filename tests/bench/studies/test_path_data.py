@@ -250,7 +250,7 @@ def test_networks_with_guides_can_be_trained_on_chosen_samples(roots: dict[str, 
     source = FirstSamples(*roots["path"], SAMPLES)
     source.follow_guides()
     rows = source.refresh().tolist()
-    assert all(sample.guides is not None for sample in source.read_batch(rows[:2]))
+    assert all(sample.guides is not None for sample in source.read_samples(rows[:2]))
     assert sum(are_held_out(source.modification_keys(rows), HELD_OUT)) == 1
 
 

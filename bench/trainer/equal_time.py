@@ -34,7 +34,7 @@ from photonfarm.trainer.runs import settings
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner
 
-Changes = Mapping[str, Any]
+PresetChanges = Mapping[str, Any]
 """Changes to the preset, by key."""
 
 HOLD_OUT = 1 / 8
@@ -102,7 +102,7 @@ class Gap:
         return "better" if self.high < 0 else "not told apart"
 
 
-def parser(about: str | None, candidates: Mapping[str, Changes]) -> argparse.ArgumentParser:
+def parser(about: str | None, candidates: Mapping[str, PresetChanges]) -> argparse.ArgumentParser:
     """A parser with the options of such a study."""
     made = results.parser(about)
     made.add_argument("--rooms", nargs="+", default=["room"], help="specs (%(default)s)")
@@ -134,7 +134,7 @@ def write(name: str, text: str, found: Mapping[str, Sequence[Result]], told: arg
 # ---------------------------------------------------------------------------------------------------------- measuring
 
 
-def measured(room: str, candidates: Mapping[str, Changes], told: argparse.Namespace, folder: str) -> list[Result]:
+def measured(room: str, candidates: Mapping[str, PresetChanges], told: argparse.Namespace, folder: str) -> list[Result]:
     """Render a room, train all candidates on it in a folder of this name, and measure them."""
     spec = in_passes(square(room_study.named_room(room), 64), 4)
     store = Store(told.work / room / "store", create=True)
@@ -167,13 +167,13 @@ def _errors(runs: Sequence[room_study.Run], references: room_study.ReferenceView
     return Errors(errors, references.units), float(np.mean([mssim(metric_space(images), shown) for images in made]))
 
 
-def settings_of(changes: Changes, seed: int, steps: int) -> TrainSettings:
+def settings_of(changes: PresetChanges, seed: int, steps: int) -> TrainSettings:
     """The preset `small` with these changes."""
     run = {"seed": seed, "max_steps": steps, "hold_out": HOLD_OUT, "validate_every": max(1, steps // 4)}
     return settings.settings_of("small", {**changes, **run, "validation_samples": 24})
 
 
-def step_seconds(source: Callable[[], StoreSource], candidates: Mapping[str, Changes]) -> dict[str, float]:
+def step_seconds(source: Callable[[], StoreSource], candidates: Mapping[str, PresetChanges]) -> dict[str, float]:
     """Processor seconds of a step of each on one thread, the median of some, on samples that are there.
 
     They take turns, so that the machine's moods reach all alike. The first step of a turn, for which another network
@@ -190,7 +190,7 @@ def step_seconds(source: Callable[[], StoreSource], candidates: Mapping[str, Cha
 
 
 @contextmanager
-def _stepping(source: StoreSource, changes: Changes) -> Iterator[Callable[[], float]]:
+def _stepping(source: StoreSource, changes: PresetChanges) -> Iterator[Callable[[], float]]:
     """What takes a step and returns its processor seconds."""
     chosen = settings_of(changes, 0, 1000)
     with Feed(source, chosen) as feed:

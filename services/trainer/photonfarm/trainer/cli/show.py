@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from photonfarm.shared.core.estimate import stated
-from photonfarm.trainer.runs import wait_times as waits
+from photonfarm.trainer.runs import wait_times
 
 
 def record(of: dict[str, Any]) -> None:
@@ -24,7 +24,7 @@ def record(of: dict[str, Any]) -> None:
         click.echo(
             f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
             f"({stated(of['shown_error'], None)} up to white) {there}"
-            + waits.stated(of["waits"], of["samples_per_used"]),
+            + wait_times.stated(of["waits"], of["samples_per_used"]),
             err=True,
         )
 

@@ -25,7 +25,7 @@ Architecture = Literal[
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
-Emission = Literal["linear", "log"]
+EmissionScale = Literal["linear", "log"]
 PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
@@ -63,7 +63,7 @@ class NetworkSettings(Frozen):
     octaves: Annotated[int, Field(ge=0, le=16)] = 2  # of sines and cosines of each position, beside the position
     maxima: Maxima = "absolute"  # over the points [S Fig. 1]; "relative": less those of the base configuration (ours),
     # with which it takes fewer steps to learn what lights do
-    emission: Emission = "linear"  # of the points, over its root mean square; "log" (ours): its logarithm, so that
+    emission: EmissionScale = "linear"  # of the points, over its root mean square; "log" (ours): its logarithm, so that
     # bright windows do not hide lamps from the maxima
     photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
     # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons

@@ -22,6 +22,7 @@ from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store, store_status
 from photonfarm.shared.store.read.find import Query
 from photonfarm.shared.store.read.merge import MergedView, merge_views
@@ -32,6 +33,7 @@ from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import gathered
+from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
 from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
@@ -282,6 +284,14 @@ def test_the_dataset_s_card_says_whom_it_is_owed_to_and_how_it_was_made(measured
     assert card["versions"] == {"test": ["1"]}
     page = (tmp_path / "out/report.html").read_text()
     assert "“A closed form” by Lambert &amp; Sons, CC0-1.0" in page, "what a spec says is text and no markup"
+
+
+def test_the_dataset_s_card_has_the_settings_that_guides_are_rendered_with(measured, scene, tmp_path) -> None:
+    store, *_ = measured
+    copied = shutil.copytree(store, tmp_path / "copied")
+    assert DatasetCard.of(copied, scene.scene_id).document()["guides"] is None
+    Store(copied).scene(scene.scene_id).guides.want(GuideSpec(light_samples=5))
+    assert DatasetCard.of(copied, scene.scene_id).document()["guides"] == {"light_samples": 5}
 
 
 def test_the_paper_s_rows_go_by_architecture_also_where_runs_are_called_by_their_folders(measured, tmp_path) -> None:

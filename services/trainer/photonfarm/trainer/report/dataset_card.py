@@ -8,7 +8,7 @@ from typing import Any
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.store import SceneStatus, SceneStore, Store, store_status
 
 SAMPLES = "samples"
@@ -29,6 +29,7 @@ class DatasetCard:
     """A scene of a store, described by its plans and markers."""
 
     spec: SceneSpec
+    guides: GuideSpec | None  # the settings of the scene's guides, if it has some
     status: SceneStatus
     requests: tuple[dict[str, Any], ...]  # of each plan: all rows follow from them
     versions: dict[str, list[str]]  # of the packages that rendered, each with all versions
@@ -57,7 +58,7 @@ class DatasetCard:
                 versions.setdefault(package, set()).add(version)
         requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
         known = {package: sorted(found) for package, found in sorted(versions.items())}
-        return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
+        return cls(scene.spec, scene.guides.settings(), status, requests, known, len(workers), _spent(scene, core_s))
 
     @property
     def samples(self) -> PlanTotals:
@@ -90,7 +91,7 @@ class DatasetCard:
             "points": spec.points,
             "transport": spec.transport.model_dump(),
             "photons": spec.photons.model_dump(),
-            "guides": spec.guides.model_dump(),
+            "guides": None if self.guides is None else self.guides.model_dump(),
             "spp_per_sample": 2 * spec.transport.half_spp,
             "samples_planned": status.samples_planned,
             "samples_complete": status.samples_complete,

@@ -94,6 +94,20 @@ def test_nothing_is_read_that_is_not_needed(make_source, architecture: str) -> N
     assert there == (needs.points, needs.photons, bool(needs.kept))
 
 
+@pytest.mark.parametrize("architecture", [name for name in EVERY if name.startswith("guided")])
+def test_what_reflects_nothing_shows_what_it_emits_and_nothing_else(make_source, architecture: str) -> None:
+    """A lamp, or a window at night: the left half of the image; the other half is learned."""
+    source = make_source(1, photons=64)
+    inputs = batch_of(source, (0,), architecture).inputs
+    left = (slice(None), slice(None), slice(None, 8))
+    for what in (inputs.albedo, inputs.guides.specular, inputs.guides.throughput):
+        what[left] = 0
+    inputs.guides.direct[left], inputs.guides.gloss[left] = 0, 0
+    made = image(network(source, architecture), inputs)
+    torch.testing.assert_close(made[left], inputs.guides.emission[left])
+    assert not torch.isclose(made, inputs.guides.emission).all()
+
+
 def test_inputs_that_lack_what_a_network_needs_are_named(make_source) -> None:
     source = make_source(1)
     with pytest.raises(ValueError, match="inputs"):

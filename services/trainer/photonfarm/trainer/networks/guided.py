@@ -30,13 +30,22 @@ roughness, mean depth and depth beyond, 1 each.
 """
 
 REFLECTANCE_FLOOR = 0.2
-"""The least factor of the U-Net's output: guides may be wrong, and blends and edges reflect more."""
+"""The least factor of the U-Net's output on surfaces that reflect: guides may be wrong, and blends reflect more."""
+
+BLACK = 0.05
+"""The reflectance below which that floor falls, to 0 for what reflects nothing, such as lamps, and windows at night."""
 
 
 def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
     """The reflectance of a pixel, (B, H, W, 3): of its surface, or of the one seen in mirrors and through glass."""
     own = albedo + (guides.specular - guides.throughput).clamp(min=0)
     return own + guides.throughput * guides.beyond_albedo
+
+
+def floor(albedo: Tensor, guides: GuideInputs) -> Tensor:
+    """The least factor of the U-Net's output, (B, H, W, 1): 0 where nothing reflects or is seen through."""
+    anything = (albedo + guides.specular + guides.throughput).amax(dim=-1, keepdim=True)
+    return REFLECTANCE_FLOOR * (anything / BLACK).clamp(max=1)
 
 
 class Guided(Network):
@@ -66,10 +75,12 @@ class Guided(Network):
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure."""
         guides = given(inputs.guides)
-        scale = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
+        reflected = reflectance(inputs.albedo, guides)
         further = self.further(inputs)
-        channels = torch.cat([*further, *self.guide_channels(guides, scale), self.image_space(inputs)], dim=-1)
-        return self.known(inputs, further) + scale * self.synthesise(channels)
+        of_guides = self.guide_channels(guides, reflected + REFLECTANCE_FLOOR)
+        channels = torch.cat([*further, *of_guides, self.image_space(inputs)], dim=-1)
+        learned = (reflected + floor(inputs.albedo, guides)) * self.synthesise(channels)
+        return self.known(inputs, further) + learned
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """log(1 + light), (B, H, W, 3) each: of lit points, then of photons in each window."""

@@ -222,8 +222,8 @@ class Stages:
         the files `of` is newer than its last end.
         """
         log, done = (self.folder / "logs" / f"{stage}{suffix}" for suffix in (".log", ".done"))
-        told = json.dumps([*map(str, arguments)])
-        if made and _is_done(done, told, made, of):
+        asked = json.dumps([*map(str, arguments)])
+        if made and _is_done(done, asked, made, of):
             return
         log.parent.mkdir(exist_ok=True)
         began = time.monotonic()
@@ -234,13 +234,13 @@ class Stages:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise StageError(f"{self.experiment.name}: {stage} ended with exit code {code}; {log} says: {last}")
         if made:
-            done.write_text(told)
+            done.write_text(asked)
         tell(f"{self.experiment.name}: {stage} {time.monotonic() - began:.0f} s")
 
 
-def _is_done(done: Path, told: str, made: Iterable[Path], of: Iterable[Path]) -> bool:
+def _is_done(done: Path, asked: str, made: Iterable[Path], of: Iterable[Path]) -> bool:
     """Whether a verb's last end was that of these arguments, after all it is made of, and left what it makes."""
-    if not done.is_file() or done.read_text() != told or not all(file.is_file() for file in made):
+    if not done.is_file() or done.read_text() != asked or not all(file.is_file() for file in made):
         return False
     return all(source.stat().st_mtime_ns < done.stat().st_mtime_ns for source in of)
 

@@ -31,16 +31,16 @@ STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker
 AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
 
 Process = subprocess.Popen[bytes]
-Count = tuple[int, int]
-"""The number committed, and the number planned."""
+CommittedAndPlanned = tuple[int, int]
+"""How many rows are committed, and how many are planned."""
 
 
 @dataclass(frozen=True, slots=True)
 class FarmProgress:
     """How far rendering and training are."""
 
-    samples: Count
-    passes: Count  # further ones, of views that have samples
+    samples: CommittedAndPlanned
+    passes: CommittedAndPlanned  # further ones, of views that have samples
     step: int
     steps: int
     note: str  # the last held-out error, in words
@@ -53,7 +53,7 @@ class Talk(Protocol):
         """Say a sentence."""
 
     def progress(self, steps: int) -> AbstractContextManager[Callable[[FarmProgress, bool], None]]:
-        """A function that shows progress towards so many training steps, and is told when it shows the last."""
+        """A context manager that gives a function: call it with each progress, and with True for the last."""
 
 
 def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
@@ -137,8 +137,8 @@ def _unwound_by_sigterm() -> Iterator[None]:
 def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]:
     """The environment of the child processes; it adds the spec's folder, where its scene file may lie."""
     scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
-    told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
-    return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
+    variables = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
+    return {**os.environ, **variables, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
 
 
 def _call(arguments: list[str], environment: Mapping[str, str]) -> None:

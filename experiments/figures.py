@@ -60,7 +60,8 @@ class Report:
         if shown is None:
             raise IncompleteError(
                 f"{folder}: an earlier version's report, which does not say of which views its pictures are; delete "
-                f"report.json, and `python experiments/run.py {folder.parent.name}` makes it anew"
+                f"report.json, and `python experiments/run.py {folder.parent.name}` makes it anew "
+                "(runs of an earlier version are trained anew)"
             )
         names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
         sheet = read_png(folder / COMPARISON)

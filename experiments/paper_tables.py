@@ -96,7 +96,7 @@ def _time_ratio(rooms: Sequence[Room], name: str) -> str:
 
 
 def mean(estimates: Sequence[Estimate]) -> Estimate:
-    """The mean over several rooms of their means, each room alike; each is known as well as its views tell."""
+    """The mean over several rooms of their means, each room alike; each with the standard error over its views."""
     errors = [each.standard_error for each in estimates if each.standard_error is not None]
     spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
     return Estimate(float(np.mean([e.mean for e in estimates])), spread, sum(e.count for e in estimates))
@@ -187,9 +187,9 @@ def gap(room: Room, first: str, second: str) -> str:
     if interval is None:
         return f"{share:+.0%}"
     seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in found.of_seeds)
-    told = f"{share:+.0%} ({interval[0] / found.unit:+.0%} … {interval[1] / found.unit:+.0%}; {seeds}) {sign(share)}"
+    text = f"{share:+.0%} ({interval[0] / found.unit:+.0%} … {interval[1] / found.unit:+.0%}; {seeds}) {sign(share)}"
     agree = len({of_seed > 0 for of_seed in found.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
-    return told if agree else f"{told}, not told apart"
+    return text if agree else f"{text}, not told apart"
 
 
 def sign(share: float) -> str:

@@ -80,7 +80,7 @@ def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
 
 
 def wrapped(text: str, first: str = "", others: str = "") -> str:
-    """A paragraph in lines of at most WIDTH characters, which begin as told; code and links are not broken."""
+    """A paragraph in lines of at most WIDTH characters after `first` and `others`; code and links are not broken."""
     whole = re.sub(r"`[^`]*`|\[[^\]]*\]", lambda found: found[0].replace(" ", "\0"), text)
     filled = textwrap.fill(
         whole, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False

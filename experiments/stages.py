@@ -18,6 +18,7 @@ from typing import Any
 
 from bench.harness import results
 from experiments.experiment import Experiment, Run
+from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.processes import tied
@@ -162,8 +163,7 @@ class Stages:
     def _keep_commit(self, run: Run) -> None:
         """Add this checkout's commit to those at which a run was trained: several, if it was interrupted."""
         if (now := results.commit()) not in (found := self._commits(run)):
-            self._folder(run).mkdir(parents=True, exist_ok=True)
-            (self._folder(run) / COMMITS).write_text(json.dumps([*found, now]) + "\n")
+            write_whole(self._folder(run) / COMMITS, json.dumps([*found, now]) + "\n")
 
     def _commits(self, run: Run) -> list[str]:
         """The commits at which a run was trained; none where an earlier version trained it."""
@@ -201,7 +201,7 @@ class Stages:
         trained_at = {run.name: self._commits(run) for run in self._runs()}
         if document.get("trained_at") != trained_at:
             text = json.dumps({**document, "trained_at": trained_at}, indent=2, ensure_ascii=False)
-            report.write_text(text + "\n", encoding="utf-8")
+            write_whole(report, text + "\n")
 
     def _measure(self, verb: str, runs: Sequence[Run], more: Sequence[Any], made: Path) -> None:
         """What a verb makes of some runs against the references."""
@@ -222,8 +222,8 @@ class Stages:
         the files `of` is newer than its last end.
         """
         log, done = (self.folder / "logs" / f"{stage}{suffix}" for suffix in (".log", ".done"))
-        told = json.dumps([*map(str, arguments)])
-        if made and _is_done(done, told, made, of):
+        asked = json.dumps([*map(str, arguments)])
+        if made and _is_done(done, asked, made, of):
             return
         log.parent.mkdir(exist_ok=True)
         began = time.monotonic()
@@ -234,13 +234,13 @@ class Stages:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise StageError(f"{self.experiment.name}: {stage} ended with exit code {code}; {log} says: {last}")
         if made:
-            done.write_text(told)
+            done.write_text(asked)
         tell(f"{self.experiment.name}: {stage} {time.monotonic() - began:.0f} s")
 
 
-def _is_done(done: Path, told: str, made: Iterable[Path], of: Iterable[Path]) -> bool:
+def _is_done(done: Path, asked: str, made: Iterable[Path], of: Iterable[Path]) -> bool:
     """Whether a verb's last end was that of these arguments, after all it is made of, and left what it makes."""
-    if not done.is_file() or done.read_text() != told or not all(file.is_file() for file in made):
+    if not done.is_file() or done.read_text() != asked or not all(file.is_file() for file in made):
         return False
     return all(source.stat().st_mtime_ns < done.stat().st_mtime_ns for source in of)
 

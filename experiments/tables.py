@@ -42,11 +42,11 @@ PARTS: Mapping[Part, tuple[str, PublishedTable]] = {
 """The page's parts: title, and the paper's figures."""
 
 RECIPES: Mapping[SizeName, str] = {
-    "small": "a relative loss, demodulation 0.2, relative maxima, 2 octaves, exact occlusion, a cosine schedule and "
-    "averaged weights",
-    "paper": "a paired loss, demodulation 0.2, 2 octaves and exact occlusion",
+    "small": "demodulation 0.2, relative maxima, the logarithm of emission, 2 octaves, exact occlusion, a cosine "
+    "schedule and averaged weights",
+    "paper": "demodulation 0.2, 2 octaves and exact occlusion",
 }
-"""What differs from the supplement in the training of its networks."""
+"""What differs from the supplement in the training of its networks, beside the loss."""
 
 
 def page(found: Sequence[Room], size: SizeName) -> str:
@@ -55,7 +55,7 @@ def page(found: Sequence[Room], size: SizeName) -> str:
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
-    parts.append(reading(size))
+    parts.append(reading(size, said(found, lambda room: str(room.experiment.size.train["loss"]))))
     for part, (title, published) in PARTS.items():
         if rooms := [room for room in found if room.experiment.part == part]:
             parts += _part(rooms, title, published)
@@ -123,7 +123,7 @@ READING = """\
 ## How to read the tables
 
 **Networks.** Rows named cnn, feature_projection, light_transport and light_transport_photons are the paper's networks
-trained by our recipe ({recipe}), not by the supplement's to the letter; what differs is in
+trained by our recipe (a {loss} loss, {recipe}), not by the supplement's to the letter; what differs is in
 [Train and evaluate](../training.md#presets). Those named guided are ours.
 
 **Errors** are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
@@ -149,9 +149,9 @@ renderer costs most.
 n/a: not measured, or a row that a room lacks. –: not in the paper."""
 
 
-def reading(size: SizeName) -> str:
+def reading(size: SizeName, loss: str) -> str:
     """What the tables' figures are, and what they can be compared with."""
-    paragraphs = READING.format(recipe=RECIPES[size], close=100 * CLOSE).split("\n\n")
+    paragraphs = READING.format(loss=loss, recipe=RECIPES[size], close=100 * CLOSE).split("\n\n")
     return "\n\n".join(wrapped(paragraph) for paragraph in paragraphs)
 
 

@@ -92,8 +92,8 @@ are rendered, is spread over them.
 `photonfarm work --until-complete` with an embedded Redis, the same {options.jobs} jobs for one worker and for two.
 What is counted are whole jobs, from when each worker has ended its first until one has ended its last. All sides
 {options.repetitions} times by turns; medians. **Ratio**: of neighbouring runs, median (least … greatest). **By
-processor time**: twice what work takes with one at it over what the same takes with two (a worker's jobs as their
-markers tell, without the commit), which is the ratio if nobody had to wait: for a processor that others use, the disk,
+processor time**: twice what work takes with one at it over what the same takes with two (a worker's jobs by
+their markers, without the commit), which is the ratio if nobody had to wait: for a processor that others use, the disk,
 or each other.
 
 {pair_table(two)}"""

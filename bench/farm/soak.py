@@ -3,8 +3,8 @@
     python -m bench.farm.soak [--share 1] [--workers 3] [--seed 1] [--out DIR]
 
 The one of tests/faults/soaking.py, whose short form is among the tests; `--share 0.1` does a tenth of it. Exit code 0
-if all that must hold held. What does not hold on the way ends it at once; what does not in the end is told line by
-line.
+if all that must hold held. What does not hold on the way ends it at once; what does not in the end is printed
+line by line.
 """
 
 from __future__ import annotations

@@ -43,10 +43,10 @@ def save(stem: str, text: str, document: dict[str, Any], out: Path) -> None:
 def command(name: str) -> str:
     """How to make the table again."""
     given = iter(sys.argv[1:])
-    told = [argument for argument in given if not (argument == "--out" and next(given))]
+    options = [argument for argument in given if not (argument == "--out" and next(given))]
     (script,) = (ROOT / "bench").glob(f"*/{name}.py")
     module = f"bench.{script.parent.name}.{name}"
-    return shlex.join(["python", "-m", module, *told]) if told else f"make bench-{name.replace('_', '-')}"
+    return shlex.join(["python", "-m", module, *options]) if options else f"make bench-{name.replace('_', '-')}"
 
 
 def machine() -> dict[str, Any]:

@@ -103,7 +103,7 @@ def _renderer(root: str) -> ShardRenderer:
 
 
 def in_processes(task: Callable[..., Any], items: Sequence[tuple[Any, ...]], processes: int, what: str) -> list[Any]:
-    """The task's result for each item, from so many processes at a time, which end with this one; tells how far."""
+    """The task's result for each item, from so many processes at a time, which end with this one; says how far."""
     if not items:
         return []
     context = multiprocessing.get_context("spawn")  # Dr.Jit does not outlive a fork
@@ -141,7 +141,7 @@ class ChosenSamples(StoreSource):
         self.trainable = [row for row, held in zip(complete, held_out, strict=True) if not held]
         self.chosen: list[int] = []
         self._looked_at = [row for row, held in zip(complete, held_out, strict=True) if held][:1]
-        self._told = False
+        self._has_answered = False
         if not self._looked_at:
             raise ValueError(f"{root}: none of {len(complete)} samples is held out")
 
@@ -152,8 +152,8 @@ class ChosenSamples(StoreSource):
 
     def refresh(self) -> NDArray[np.int64]:
         """The chosen samples at the first call, and the one that is held out; none after it."""
-        new = [] if self._told else [*self.chosen, *self._looked_at]
-        self._told = True
+        new = [] if self._has_answered else [*self.chosen, *self._looked_at]
+        self._has_answered = True
         return np.array(new, np.int64)
 
     @property

@@ -9,18 +9,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from bench.harness.room_study import HELD_OUT, ChosenSamples
-from photonfarm.shared.core.records import ViewBuffers, arrays_of
+from photonfarm.shared.core.records import Guides, ViewBuffers, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store.read.reader import SceneReader
 from photonfarm.trainer.data.dataset import RawSample
 
 HALF_SPP = 1  # of what is rendered
 PASS_SPP = 2 * HALF_SPP
+
+Images = TypeVar("Images", ViewBuffers, Guides)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +87,14 @@ class ArmSamples(ChosenSamples):
     def _mean(self, row: int) -> RawSample:
         read = super().read_samples(self._passes.get(row, [row]))
         halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
-        buffers: dict[str, Any] = {name: values.copy() for name, values in arrays_of(read[0].buffers).items()}
-        return replace(read[0], radiance=halves, scale=1.0, buffers=ViewBuffers(**buffers))
+        buffers, guides = _copied(read[0].buffers), read[0].guides and _copied(read[0].guides)
+        return replace(read[0], radiance=halves, scale=1.0, buffers=buffers, guides=guides)
+
+
+def _copied(record: Images) -> Images:
+    """The record in memory of its own, as the next read reuses that of a sample."""
+    copies: dict[str, Any] = {name: values.copy() for name, values in arrays_of(record).items()}
+    return replace(record, **copies)
 
 
 def _enough(reader: SceneReader, rows: Sequence[int], share: Share) -> list[list[list[int]]]:

@@ -6,9 +6,9 @@
 Takes the room of an experiment of experiments/, times both integrators, and renders a store of each kind whose
 samples cost the same; PHOTONFARM_SCENES names the folder of its scene files. A network is trained alike on
 the first samples of either store, for budgets of a quarter to 1 of `bdpt` and of a quarter to 4 of `path`, and
-measured on held-out views. Leaves docs/results/path_data.{md,json,png}; what is rendered and trained stays in
-build/path_data, and the next call goes on with it. Times are best taken on a quiet machine; the first call settles
-what a sample of `path` is. Exit code 0, whatever comes out.
+measured on held-out views. Leaves docs/results/path_data_EXPERIMENT.{md,json,png}; what is rendered and trained
+stays in build/path_data, and the next call goes on with it. Times are best taken on a quiet machine; the first call
+settles what a sample of `path` is. Exit code 0, whatever comes out.
 """
 
 from __future__ import annotations

@@ -158,9 +158,9 @@ The room of the experiment `{title}` at {spec.film.width}², connections {spec.t
 ratio {spec.transport.light_ratio:g}; Mitsuba's `path` has the same `max_depth` {spec.transport.max_depth} and
 `rr_depth` {spec.transport.rr_depth}, the box filter and Mitsuba's stratified samples `multijitter`, one render for
 each half; those of `bdpt` are stratified too. Its samples per pixel fill a grid and are no power of two, with which
-images were seen to be too dark; a sample is meant to cost as much, by times that were taken before. Budgets are told as
-multiples of the samples of `bdpt`'s largest (“× samples”); core-seconds are those in the markers of the stores, medians
-over jobs, with editing, buffers, guides, photons and visibility, and factors are of them. Both
+images were seen to be too dark; a sample is meant to cost as much, by times that were taken before. Budgets are given
+as multiples of the samples of `bdpt`'s largest (“× samples”); core-seconds are those in the markers of the stores,
+medians over jobs, with editing, buffers, guides, photons and visibility, and factors are of them. Both
 stores are of one spec: the views, point clouds, photons and held-out configurations of `path`'s are those of `bdpt`'s
 bit by bit, and its first {study.of("bdpt")[-1].arm.samples} training samples are of the same views. What `path` has
 beyond, at budgets above 1, are further configurations.

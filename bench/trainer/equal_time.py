@@ -117,41 +117,43 @@ def parser(about: str | None, candidates: Mapping[str, PresetChanges]) -> argpar
     return made
 
 
-def conditions(told: argparse.Namespace) -> str:
+def conditions(options: argparse.Namespace) -> str:
     """What a page says of its figures."""
-    seeds = ", ".join(map(str, told.seeds))
-    return f"""{told.modifications} samples of 64², 8 samples per pixel, {told.references} held-out references of
-{told.reference_spp}; {told.seconds:g} s of one core for each run, seeds {seeds}. MSE and MSSIM in the metric space.
-Gaps have their 95 % interval and the gap of each seed in brackets. {of_intervals(len(told.seeds))}"""
+    seeds = ", ".join(map(str, options.seeds))
+    return f"""{options.modifications} samples of 64², 8 samples per pixel, {options.references} held-out references of
+{options.reference_spp}; {options.seconds:g} s of one core for each run, seeds {seeds}. MSE and MSSIM in the metric
+space. Gaps have their 95 % interval and the gap of each seed in brackets. {of_intervals(len(options.seeds))}"""
 
 
-def write(name: str, text: str, found: Mapping[str, Sequence[Result]], told: argparse.Namespace) -> None:
+def write(name: str, text: str, found: Mapping[str, Sequence[Result]], options: argparse.Namespace) -> None:
     """Save a page and the figures of each room."""
     rooms = {room: [result.document() for result in each] for room, each in found.items()}
-    results.write(name, text, {"seconds": told.seconds, "rooms": rooms}, told.out)
+    results.write(name, text, {"seconds": options.seconds, "rooms": rooms}, options.out)
 
 
 # ---------------------------------------------------------------------------------------------------------- measuring
 
 
-def measured(room: str, candidates: Mapping[str, PresetChanges], told: argparse.Namespace, folder: str) -> list[Result]:
+def measured(
+    room: str, candidates: Mapping[str, PresetChanges], options: argparse.Namespace, folder: str
+) -> list[Result]:
     """Render a room, train all candidates on it in a folder of this name, and measure them."""
     spec = in_passes(square(room_study.named_room(room), 64), 4)
-    store = Store(told.work / room / "store", create=True)
-    passes = TopUp.of(str(told.reference_spp), [f"held-out={HOLD_OUT}", f"views=first:{told.references}"])
-    room_study.render(spec, store, [Request(modifications=told.modifications), passes], told.processes)
+    store = Store(options.work / room / "store", create=True)
+    passes = TopUp.of(str(options.reference_spp), [f"held-out={HOLD_OUT}", f"views=first:{options.references}"])
+    room_study.render(spec, store, [Request(modifications=options.modifications), passes], options.processes)
     source = functools.partial(StoreSource, store.root, spec.scene_id)
     step_s = step_seconds(source, candidates)
-    steps = {name: max(1, round(told.seconds / seconds)) for name, seconds in step_s.items()}
+    steps = {name: max(1, round(options.seconds / seconds)) for name, seconds in step_s.items()}
     runs = {
         name: [
-            room_study.Run(source, settings_of(changes, seed, steps[name]), told.work / room / folder, name)
-            for seed in told.seeds
+            room_study.Run(source, settings_of(changes, seed, steps[name]), options.work / room / folder, name)
+            for seed in options.seeds
         ]
         for name, changes in candidates.items()
     }
-    room_study.train_all([run for each in runs.values() for run in each], told.processes)
-    references = room_study.ReferenceViews.of(store, spec, told.reference_spp, HOLD_OUT)
+    room_study.train_all([run for each in runs.values() for run in each], options.processes)
+    references = room_study.ReferenceViews.of(store, spec, options.reference_spp, HOLD_OUT)
     frame_s = frame_seconds({name: each[0] for name, each in runs.items()}, references.rows)
     return [
         Result(name, step_s[name], steps[name], frame_s[name], *_errors(each, references))

@@ -49,18 +49,18 @@ CANDIDATES: dict[str, Mapping[str, str]] = {
 
 def main() -> None:
     """Render, train and measure; write the page."""
-    told = parser(__doc__, CANDIDATES).parse_args()
-    chosen = {name: CANDIDATES[name] for name in told.candidates}
-    found = {room: measured(room, chosen, told, "guided_networks") for room in told.rooms}
-    write("guided_networks", page(found, told), found, told)
+    options = parser(__doc__, CANDIDATES).parse_args()
+    chosen = {name: CANDIDATES[name] for name in options.candidates}
+    found = {room: measured(room, chosen, options, "guided_networks") for room in options.rooms}
+    write("guided_networks", page(found, options), found, options)
 
 
-def page(found: Mapping[str, Sequence[Result]], told: argparse.Namespace) -> str:
+def page(found: Mapping[str, Sequence[Result]], options: argparse.Namespace) -> str:
     """The tables as Markdown."""
     parts = [
         f"""# What the parts of guided networks are worth
 
-{conditions(told)} “Without” is how far above its MSE the same network without a part is.
+{conditions(options)} “Without” is how far above its MSE the same network without a part is.
 
 Tried and not kept, with how far their MSE is above that of the network that was kept:""",
         results.table(("network", "what it is"), [(kind.__name__, inspect.getdoc(kind)) for kind in TRIED]),

@@ -100,7 +100,7 @@ def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """A view of one configuration, and all that a network may be told of it."""
+    """A view of one configuration, and all that a network may be given of it."""
 
     sample: RawSample  # its halves are the reference's
     photons: Photons | None  # None: the scene has none
@@ -249,7 +249,7 @@ class Stage:
         return cls(spec, stored.base(), guides, load_scene(in_passes(spec, half_spp)))
 
     def look(self, modification: Modification, view: View) -> Look:
-        """Render a view, and what a network is told of it, which is what `photonfarm infer` tells.
+        """Render a view, and what a network is given of it, which is what `photonfarm infer` gives.
 
         The seeds of the halves are of this benchmark alone, so that no guide and no sample has their noise.
         """

@@ -35,18 +35,18 @@ CANDIDATES: dict[str, dict[str, str]] = {
 
 def main() -> None:
     """Render, train and measure; write the page."""
-    told = parser(__doc__, CANDIDATES).parse_args()
-    chosen = {name: CANDIDATES[name] for name in told.candidates}
-    found = {room: measured(room, chosen, told, "recipe") for room in told.rooms}
-    write("recipe", page(found, told), found, told)
+    options = parser(__doc__, CANDIDATES).parse_args()
+    chosen = {name: CANDIDATES[name] for name in options.candidates}
+    found = {room: measured(room, chosen, options, "recipe") for room in options.rooms}
+    write("recipe", page(found, options), found, options)
 
 
-def page(found: Mapping[str, Sequence[Result]], told: argparse.Namespace) -> str:
+def page(found: Mapping[str, Sequence[Result]], options: argparse.Namespace) -> str:
     """The tables as Markdown."""
     parts = [
         f"""# What the settings of the recipe are worth
 
-`guided_transport` by the preset `small`, and with one of its settings changed. {conditions(told)} “Above” is how far
+`guided_transport` by the preset `small`, and with one of its settings changed. {conditions(options)} “Above” is how far
 above the MSE of `small` it is; the verdict is that of the interval."""
     ]
     for room, each in found.items():

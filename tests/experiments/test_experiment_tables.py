@@ -151,13 +151,16 @@ def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
 
 @pytest.mark.parametrize("size", ["small", "paper"])
 def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is(size: SizeName) -> None:
-    page = tables.page([Room.of(Experiment.load("night-living-room", size), report(), "1234567")], size)
+    experiment = Experiment.load("night-living-room", size)
+    page = tables.page([Room.of(experiment, report(), "1234567")], size)
     heads = [line for line in page.splitlines() if line.startswith("## ")]
     findings = ["## What agrees with the paper, and what does not"] if size == "small" else []
     assert heads[: len(findings) + 1] == [*findings, "## How to read the tables"]
     assert heads[-1] == "## Error against the time of a frame"
-    assert f"by our recipe (a {'relative' if size == 'small' else 'paired'} loss, demodulation 0.2, " in page
-    assert "not by the supplement's to the letter" in " ".join(page.split())
+    words = " ".join(page.split())
+    assert f"by our recipe (a {experiment.size.train['loss']} loss, demodulation 0.2, " in words
+    assert ("the logarithm of emission" in words) == (size == "small")
+    assert "not by the supplement's to the letter" in words
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -280,6 +281,27 @@ def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_th
     written = report.stat().st_mtime_ns
     stages._tell_commits(report)
     assert report.stat().st_mtime_ns == written
+
+
+def test_a_write_of_commits_or_report_that_is_cut_leaves_what_was_there(
+    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = Stages(with_size(tiny, architectures=("light_transport",)), tmp_path / "work", workers=1)
+    first, report = stages._runs()[0], tmp_path / "report.json"
+    stages._keep_commit(first)
+    report.write_text(json.dumps({"edit_seconds": 0.1}))
+    files = {file: file.read_bytes() for file in (tmp_path / "work/runs" / first.name / COMMITS, report)}
+    monkeypatch.setattr("bench.harness.results.commit", lambda: "89abcde")
+
+    def cut(file: Path, *_: Any, **__: Any) -> None:
+        file.write_bytes(b"[")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", cut)
+    for write in (lambda: stages._keep_commit(first), lambda: stages._tell_commits(report)):
+        with pytest.raises(OSError, match="No space"):
+            write()
+    assert {file: file.read_bytes() for file in files} == files
 
 
 @pytest.mark.parametrize("workers", ["0", "-1", "two"])

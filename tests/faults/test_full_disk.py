@@ -4,6 +4,7 @@ The disk is a small tmpfs. Mounting needs root; without, all of this runs once m
 """
 
 import contextlib
+import errno
 import os
 import subprocess
 import sys
@@ -236,6 +237,8 @@ def test_a_store_that_is_read_only_refuses_to_be_written_with_a_sentence_and_rea
         ):
             with pytest.raises(StoreError) as caught:
                 work()
+            assert isinstance(caught.value.__cause__, OSError)
+            assert caught.value.__cause__.errno == errno.EROFS
             assert not is_full(caught.value)
             assert caught.value.exit_code == 4
         assert len(read_all(scene)) == 2

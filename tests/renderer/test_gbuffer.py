@@ -109,6 +109,24 @@ def test_the_back_of_a_one_sided_surface_is_black(bsdf: dict[str, Any]) -> None:
     assert centre(back.depth) == pytest.approx(3, abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("bsdf", "albedo"),
+    [
+        ({"type": "principled", "base_color": DIFFUSE["reflectance"]}, COLOUR),
+        ({"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}, COLOUR),
+        ({"type": "blendbsdf", "weight": 0.5, "one": {"type": "twosided", "bsdf": RED}, "two": DIFFUSE},
+         (0.55, 0.25, 0.35)),
+    ],
+    ids=lambda value: value["type"] if isinstance(value, dict) else "",
+)  # fmt: skip
+def test_what_mitsuba_flags_as_two_sided_keeps_its_front_s_albedo_from_behind(
+    bsdf: dict[str, Any], albedo: tuple[float, ...]
+) -> None:
+    front, back = of(bsdf), of(bsdf, BEHIND)
+    np.testing.assert_allclose(centre(front.albedo), albedo, atol=1e-6)
+    np.testing.assert_allclose(centre(back.albedo), albedo, atol=1e-6)
+
+
 def test_a_ray_that_hits_nothing_gives_zeros() -> None:
     buffers = of(DIFFUSE, View(np.array([0, 0, 3], np.float32), np.array([0, 0, 9], np.float32)))
     for image in (buffers.depth, buffers.albedo, buffers.normal):

@@ -456,6 +456,24 @@ def test_beyond_a_mirror_lies_the_wall_that_it_shows() -> None:
     assert len(np.unique(found.beyond_albedo[..., 0].round(4))) > 2, "the mean over pixels at edges of the texture"
 
 
+@pytest.mark.parametrize(
+    ("bsdf", "albedo"),
+    [
+        (diffuse(), np.zeros(3)),
+        ({"type": "twosided", "bsdf": diffuse()}, GREY),
+        ({"type": "principled", "base_color": rgb(GREY)}, GREY),
+        ({"type": "mask", "opacity": 0.5, "bsdf": diffuse()}, GREY),
+    ],
+    ids=lambda value: value["type"] if isinstance(value, dict) else "",
+)
+def test_the_back_of_a_one_sided_wall_in_a_mirror_is_black(bsdf: Shape, albedo: Images) -> None:
+    """That of a principled one and of a mask, which Mitsuba flags as two-sided, has the albedo of its front."""
+    mirror = square((0, 0, 0), (0, 0, 1), 3, bsdf={"type": "conductor"})
+    found = known(scene_of(mirror=mirror, wall=square((0, 0, 6), (0, 0, 1), 8, bsdf=bsdf)))
+    np.testing.assert_allclose(centre(found.beyond_albedo), albedo, atol=1e-6)
+    assert centre(found.beyond_depth) == pytest.approx(9, rel=1e-2)
+
+
 def test_what_scatters_by_itself_has_nothing_beyond() -> None:
     texture = {"type": "diffuse", "reflectance": rgb(GREY)}
     scene = scene_of(

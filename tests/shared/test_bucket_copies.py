@@ -66,7 +66,7 @@ def test_nothing_of_a_bucket_that_was_emptied_is_taken_for_missing(url: str, sto
         lambda: scene.plan(Request(modifications=9)),
         lambda: samples.commit(scene, 1, given),
     ):
-        with pytest.raises(StoreError) as caught:
+        with pytest.raises(StoreError, match="gone") as caught:
             look()
         assert not isinstance(caught.value, CorruptError)
     assert objects_below(url)[1] == [], "nothing of it is begun anew"

@@ -80,7 +80,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "lacking.npz", **{name: arrays[name] for name in arrays if name != "kept"})
     np.savez(tmp_path / "unfit.npz", **{**arrays, "kept": np.array([12])})
     for name in ("text", "cut", "changed", "lacking", "unfit"):
-        with pytest.raises(StoreError):
+        with pytest.raises(StoreError, match=rf"{name}\.npz: holds"):
             FrameCosts.read(tmp_path / f"{name}.npz")
     with pytest.raises(StoreError):
         FrameCosts.read(tmp_path / "missing.npz")

@@ -257,8 +257,9 @@ def test_a_chunk_whose_checksum_is_right_but_whose_content_is_not_a_row_raises(t
     parts = [content, index.tobytes()]
     path = tmp_path / "shard"
     path.write_bytes(b"".join(part + google_crc32c.value(part).to_bytes(4, "little") for part in parts))
+    shard = Shard(path, array, SHARD_ROWS)
     with pytest.raises(CorruptError):
-        Shard(path, array, SHARD_ROWS).read(0)
+        shard.read(0)
 
 
 # --------------------------------------------------------------------------------------------------- disks that refuse

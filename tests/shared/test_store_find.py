@@ -172,8 +172,14 @@ def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene:
     with pytest.raises(StoreError):
         scene_named(store, "other")
     other = store.add(samples.small_spec(exposure=2.0))
-    with pytest.raises(StoreError):
+    third = store.add(samples.small_spec(name="third", exposure=3.0))
+    assert len(store.scene_ids()) == 3
+    with pytest.raises(StoreError) as refused:
         scene_named(store, "small")
+    named = {each for each in store.scene_ids() if each in str(refused.value)}
+    assert named == {scene.scene_id, other.scene_id}, "those that fit, to choose from"
+    with pytest.raises(StoreError, match=third.scene_id):
+        scene_named(store, "fourth")
     assert find(store).count == 24
     assert find_samples(store, [other.scene_id], Query()).count == 0
 

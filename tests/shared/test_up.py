@@ -1,10 +1,13 @@
-"""What `photonfarm up` says of how far it is."""
+"""What `photonfarm up` refuses before it begins, and what it says of how far it is."""
 
 from pathlib import Path
+from typing import Any
 
+import pytest
 import store_samples as samples
 
 from photonfarm.shared.cli.show_up import progress_line
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.farm import up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
@@ -22,3 +25,13 @@ def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path
     samples.commit(scene, 2, samples.outputs(scene, 2))
     assert (farm.look().samples, farm.look().passes) == ((4, 6), (4, 6))
     assert progress_line(farm.look()) == "samples 4/6  further passes 4/6  steps 0/10"
+
+
+@pytest.mark.parametrize("train_steps", [0, 10])
+def test_a_spec_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path, train_steps: int) -> None:
+    talk: Any = None  # nothing is said
+    made = {"run": tmp_path / "run", "out": tmp_path / "out"}
+    with pytest.raises(SpecError):
+        up.run_farm(str(tmp_path / "none.toml"), tmp_path / "store", Request(modifications=3), talk, workers=1,
+                    train_steps=train_steps, hold_out=0.5, **made)  # fmt: skip
+    assert list(tmp_path.iterdir()) == []

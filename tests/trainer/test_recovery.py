@@ -288,7 +288,7 @@ def test_what_is_kept_is_refused_where_it_is_damaged_and_missed_by_nobody_where_
     train(make_source(24), tiny(), run)
     whole = (run / GOOD).read_bytes()
     (run / GOOD).write_bytes(whole[:-2000])
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match=r"good\.safetensors.*run goes on"):
         train(make_source(24), tiny(max_steps=14), run)
     (run / GOOD).unlink()
     (run / NEXT).write_bytes(whole)

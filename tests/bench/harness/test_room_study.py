@@ -21,7 +21,7 @@ from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors
 from bench.harness.room_study import HELD_OUT, ReferenceViews, Run
 from bench.studies.budget_arms import HALF_SPP, ArmSamples, Share, requests
-from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store
@@ -100,15 +100,22 @@ def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) 
 
 
 def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_path: Path) -> None:
+    """What is read together of a sample is what another source reads of it alone."""
     scene = Store(shutil.copytree(root[0], tmp_path / "store")).scene(root[1])
     scene.guides.want(GuideSpec())
     for job in scene.missing_jobs():
         commit_guides(scene, job)
-    arm = ArmSamples(tmp_path / "store", root[1], Share(2, 1, 1), 4)
-    arm.follow_guides()
-    rows = arm.refresh().tolist()
+    arm, source = ArmSamples(tmp_path / "store", root[1], Share(2, 1, 1), 4), StoreSource(tmp_path / "store", root[1])
+    for each in (arm, source):
+        each.follow_guides()
+    rows, _ = arm.refresh().tolist(), source.refresh()
     assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
-    assert all(sample.guides is not None for sample in arm.read_samples(rows))
+    for row, sample in zip(rows, arm.read_samples(rows), strict=True):
+        (alone,) = source.read_samples([row])
+        for part in ("guides", "buffers", "visibility"):
+            read = arrays_of(getattr(sample, part))
+            for name, values in arrays_of(getattr(alone, part)).items():
+                np.testing.assert_array_equal(read[name], values, err_msg=f"{part} {name} of row {row}")
 
 
 @pytest.mark.parametrize("number", [0, 1])

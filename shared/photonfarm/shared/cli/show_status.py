@@ -20,8 +20,8 @@ IDLE_SHOWN = 10
 
 def document(scenes: Sequence[SceneStatus], found: StoreQueue | NoQueue, store: str | Path) -> None:
     """Print a store's scenes and its queue as JSON."""
-    told = None if isinstance(found, NoQueue) else _queue_document(found, store)
-    print_json({"scenes": [asdict(scene) for scene in scenes], "queue": told})
+    document = None if isinstance(found, NoQueue) else _queue_document(found, store)
+    print_json({"scenes": [asdict(scene) for scene in scenes], "queue": document})
 
 
 def scenes(found: Sequence[SceneStatus]) -> None:

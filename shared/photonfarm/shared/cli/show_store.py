@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -14,6 +13,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from photonfarm.shared.cli.show import print_json
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
@@ -54,7 +54,7 @@ def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
 def check(report: StoreReport, as_json: bool) -> None:
     """Print what a check read and found, by scene and cause, and what to do about it."""
     if as_json:
-        click.echo(json.dumps(_document(report), indent=2))
+        print_json(_document(report))
         return
     for scene in report.scenes:
         _scene(scene)
@@ -129,7 +129,7 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
     """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
         samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
-        click.echo(json.dumps({"count": matches.count, "nearest": matches.nearest, "samples": samples}, indent=2))
+        print_json({"count": matches.count, "nearest": matches.nearest, "samples": samples})
         return
     for sample in matches.samples:
         _sample(sample, store)
@@ -149,7 +149,7 @@ def merged(view: WrittenView) -> None:
 
 def merged_document(views: Iterable[WrittenView]) -> None:
     """Print merged views as JSON."""
-    click.echo(json.dumps([asdict(view) for view in views], indent=2))
+    print_json([asdict(view) for view in views])
 
 
 def _sample(sample: FoundSample, store: str | Path) -> None:
@@ -199,7 +199,7 @@ def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
     Raises StoreError at the end if a scene cannot be upgraded.
     """
     if as_json:
-        click.echo(json.dumps(asdict(result), indent=2))
+        print_json(asdict(result))
     else:
         for scene in result.scenes:
             _upgraded(scene, dry_run=result.dry_run)

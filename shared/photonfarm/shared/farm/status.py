@@ -25,13 +25,13 @@ class StoreQueue:
 
 @dataclass(frozen=True, slots=True)
 class NoQueue:
-    """A Redis that tells nothing of a store's queue."""
+    """Why nothing is known of a store's queue."""
 
     reason: str
 
 
 def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
-    """The queue of a store, or the reason why Redis tells nothing of it; raises StoreError if the store is gone."""
+    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone."""
     try:
         with queue.connect(redis_url, only_s=ANSWER_S) as connection:
             queue.check_served(connection, store)
@@ -79,7 +79,7 @@ def lost_plan(scene: SceneStatus) -> str:
         return ""
     return (
         f"{scene.markers_without_plan} of {_markers(scene)} markers are of jobs that no plan has; "
-        "`photonfarm store check` tells whether the last plan is missing"
+        "`photonfarm store check` reports whether the last plan is missing"
     )
 
 

@@ -23,7 +23,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import spp_per_pass
-from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec, load_spec
+from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5
@@ -31,16 +31,16 @@ STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker
 AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
 
 Process = subprocess.Popen[bytes]
-Count = tuple[int, int]
-"""The number committed, and the number planned."""
+CommittedAndPlanned = tuple[int, int]
+"""How many rows are committed, and how many are planned."""
 
 
 @dataclass(frozen=True, slots=True)
 class FarmProgress:
     """How far rendering and training are."""
 
-    samples: Count
-    passes: Count  # further ones, of views that have samples
+    samples: CommittedAndPlanned
+    passes: CommittedAndPlanned  # further ones, of views that have samples
     step: int
     steps: int
     note: str  # the last held-out error, in words
@@ -53,7 +53,7 @@ class Talk(Protocol):
         """Say a sentence."""
 
     def progress(self, steps: int) -> AbstractContextManager[Callable[[FarmProgress, bool], None]]:
-        """A function that shows progress towards so many training steps, and is told when it shows the last."""
+        """A context manager that gives a function: call it with each progress, and with True for the last."""
 
 
 def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
@@ -81,21 +81,22 @@ def run_farm(
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
     with them.
 
-    A hold-out that leaves one side empty is refused before anything is written, by a SpecError. After any interruption
-    the same call resumes, as the store and the trainer's checkpoints remain.
+    A wrong spec, and a hold-out that leaves one side empty, are refused before anything is written, by a SpecError.
+    After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
+    named = NamedSpec.load(spec)
     if train_steps:
-        check_hold_out(load_spec(spec), store, hold_out, request)
+        check_hold_out(named.spec, store, hold_out, request)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(NamedSpec.load(spec), store, redis.url, request, retry=True, shard_rows=shard_rows)
+        planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows)
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references := train_steps > 0 and reference_views > 0:
             where = (f"held-out={hold_out}", f"views=first:{reference_views}")
-            added = top_up(NamedSpec.load(spec), store, redis.url, str(reference_spp), where=where, retry=True)
+            added = top_up(named, store, redis.url, str(reference_spp), where=where, retry=True)
             talk.say(f"{added.planned} passes more for references, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
@@ -137,8 +138,8 @@ def _unwound_by_sigterm() -> Iterator[None]:
 def _environment(spec: str, store: str | Path, redis_url: str) -> dict[str, str]:
     """The environment of the child processes; it adds the spec's folder, where its scene file may lie."""
     scenes = (os.environ.get(SCENES_VARIABLE), str(find_spec(spec).absolute().parent))
-    told = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
-    return {**os.environ, **told, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
+    variables = {"PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": redis_url}
+    return {**os.environ, **variables, SCENES_VARIABLE: os.pathsep.join(filter(None, scenes))}
 
 
 def _call(arguments: list[str], environment: Mapping[str, str]) -> None:

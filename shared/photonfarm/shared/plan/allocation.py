@@ -122,7 +122,7 @@ class CostModel:
         return min(found, key=self.excess)
 
     def improved(self, asked: Allocation) -> tuple[float, Allocation]:
-        """The best allocation of what another one costs, after the share of that one's excess that it saves, ≥ 0."""
+        """The share of `asked`'s excess that the best allocation of the same cost saves, ≥ 0, and that allocation."""
         found = self.best(self.seconds(asked))
         return max(0.0, 1 - self.excess(found) / self.excess(asked)), found
 

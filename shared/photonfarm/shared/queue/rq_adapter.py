@@ -102,7 +102,7 @@ class RenderQueue(Queue):
         self.enqueue_many(data)
 
     def withdraw(self, names: Iterable[str]) -> None:
-        """Remove jobs, each the last one of its name."""
+        """Remove jobs by name: the last entry of each name, and RQ's record of it."""
         with self.connection.pipeline(transaction=False) as pipeline:
             for name in names:
                 pipeline.lrem(self.key, -1, name)

@@ -75,7 +75,7 @@ def write_whole(file: Path, text: str) -> None:
     """Write a file that appears whole. Raises OSError if it cannot be written."""
     file.parent.mkdir(parents=True, exist_ok=True)
     aside = file.with_suffix(f".{os.getpid()}.part")
-    aside.write_text(text)
+    aside.write_text(text, encoding="utf-8")
     aside.replace(file)
 
 

@@ -246,7 +246,7 @@ class RenderWorker(QueueWorker):
     def on_failure(self, name: str, error: BaseException) -> None:
         """Decide the consequences of a failed job: for the job, for this worker, or none."""
         if self._is_committed(name):
-            log.warning("job %s is committed, and nothing lost; only Redis could not be told so: %s", name, error)
+            log.warning("job %s is committed, and nothing lost; only Redis does not know it: %s", name, error)
             return
         self._failed = True
         what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"

@@ -307,7 +307,7 @@ class _ConsumptionReporter:
             queue.report_consumed(self._connection, self._scene_id, self._used)
         except queue.OtherStoreError as error:
             if not self._refused:
-                self._log(f"no worker is told what is used: {error}")
+                self._log(f"used samples are not reported to workers: {error}")
             self._refused = True
         except (QueueError, RedisError, StoreError):
             pass

@@ -29,15 +29,15 @@ def record(of: dict[str, Any]) -> None:
         )
 
 
-def _recovered(record: dict[str, Any]) -> str:
+def _recovered(log_record: dict[str, Any]) -> str:
     """Why a run went back, and to which step."""
-    errors, back_to = record["errors"], f"the weights of step {record['back_to']}"
+    errors, back_to = log_record["errors"], f"the weights of step {log_record['back_to']}"
     if errors is None:
         found = "the loss is not finite"
     elif errors["now"] is None:
         found = "the held-out error is not finite"
     else:
         found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
-    if record["cause"] == "end":
+    if log_record["cause"] == "end":
         return f"{found}; ends with {back_to}"
-    return f"{found}; goes on from {back_to}, at {record['rate_factor']:g} of the rate"
+    return f"{found}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"

@@ -23,7 +23,7 @@ MIRRORS, SPECULAR, NEAR, SHADOWS, THIN, ALL = KINDS = (
 )  # fmt: skip
 LEAST = 0.005  # the least share of the image's pixels in a case
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
-THIN_PIXELS, THIN_DEPTH = 3, 0.9  # a thin object is at most so many pixels wide, and so much nearer than both sides
+THIN_PIXELS, THIN_DEPTH = 3, 0.9  # pixels whose neighbours so many to either side are farther; by this ratio
 SAME_ALBEDO, SAME_NORMAL, SAME_DEPTH = 0.03, 0.98, 0.03  # up to this difference, cosine and ratio surfaces are the same
 
 
@@ -110,7 +110,7 @@ def shadow_edges(view: HeldOutView) -> Mask:
 def thin_objects(depth: F32) -> Mask:
     """The pixels of objects that are a few pixels wide, such as the legs of a chair, (H, W), by their depth (H, W).
 
-    Along one axis, what lies `THIN_PIXELS` to either side is farther away.
+    They are those whose neighbours `THIN_PIXELS` to either side along one axis are farther away.
     """
     far = np.where(depth > 0, depth, np.inf)
     thin = np.zeros(depth.shape, np.bool_)

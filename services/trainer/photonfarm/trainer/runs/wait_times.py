@@ -85,7 +85,7 @@ def samples_per_used(samples: int, draws: int) -> float:
 
 
 def stated(shares: Mapping[str, float], ahead: float) -> str:
-    """The shares of `waits`, the arrived samples for each used one, and the bottleneck, as part of a line."""
+    """The shares of `wait_shares`, the arrived samples for each used one, and the bottleneck, as part of a line."""
     return (
         f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
         f"{ahead:.2f} samples there for each used (--ahead): {bottleneck(shares)} is the bottleneck"

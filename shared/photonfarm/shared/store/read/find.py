@@ -29,7 +29,7 @@ def scene_named(store: Store, text: str) -> str:
     found = found or [each for each in ids if _has_name(store, each, text)]
     if len(found) != 1:
         held = f"{len(found)} scenes have" if found else "no scene has"
-        known = f"give one of the ids {', '.join(ids)}" if ids else "the store has no scenes yet"
+        known = f"give one of the ids {', '.join(found or ids)}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return found[0]
 

@@ -3,7 +3,7 @@
 Eye paths walk as the integrator's do, each vertex is joined to a light by next event estimation, and each such path is
 then treated as made by any of the techniques: the sums of `bdpt.weights` are run from the lens towards the light
 and from the light towards the lens, in the order of the integrator's loops, with densities from the integrator
-(`emission`, `selection`, `camera`) and from Mitsuba.
+(`emission`, `light_selection`, `camera`) and from Mitsuba.
 
 Shape letters: N lanes, one path each; k edges.
 """

@@ -20,7 +20,7 @@ from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.io.local import LocalStorage
 
-DOCUMENT = Path(__file__).parents[2] / "docs/store-format.md"
+DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
 
 
 @pytest.fixture(scope="module")

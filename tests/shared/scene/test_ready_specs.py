@@ -6,7 +6,7 @@ import pytest
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.spec import BUILTIN_ROOMS, SCENES_VARIABLE, Emitters, Light, load_spec
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 READY = sorted((ROOT / "scenes").glob("*.toml"))
 STATIC = {"bathroom", "kitchen"}
 NIGHT = {"living-room-night", "living-room-2-night", "dining-room-night"}

@@ -7,7 +7,7 @@ import pytest
 
 from photonfarm.shared.store.write.findings import Cause
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_the_page_of_the_check_lists_every_cause_with_its_sentence_and_what_helps() -> None:

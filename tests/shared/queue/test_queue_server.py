@@ -27,8 +27,8 @@ from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
-START = Path(__file__).parents[2] / "docker/redis.sh"
-COMPOSE = Path(__file__).parents[2] / "docker-compose.yml"
+START = Path(__file__).parents[3] / "docker/redis.sh"
+COMPOSE = Path(__file__).parents[3] / "docker-compose.yml"
 
 
 @pytest.fixture(autouse=True)

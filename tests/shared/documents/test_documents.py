@@ -15,7 +15,7 @@ from photonfarm.shared.cli.verbs import options_by_command
 from photonfarm.shared.core import errors
 from photonfarm.shared.scene import spec as scene_spec
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted(DOCS.rglob("*.md"))]
 

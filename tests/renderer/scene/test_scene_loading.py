@@ -13,7 +13,7 @@ from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.spec import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec
 from photonfarm.shared.scene.view import sample_view
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_a_scene_file_that_changed_since_the_spec_was_read_is_refused(

@@ -15,7 +15,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.spec import Emitters, SceneSpec, find_spec, load_spec, parse_spec
 from photonfarm.shared.store import Store
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 SCENE = """<scene version="3.0.0">
   <emitter type="area" id="Panel"/>

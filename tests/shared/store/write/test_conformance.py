@@ -19,8 +19,8 @@ from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format import schema
 
-ROOT = Path(__file__).parents[2]
-PLAIN_READER = Path(__file__).with_name("plain_reader.py")
+ROOT = Path(__file__).parents[4]
+PLAIN_READER = Path(__file__).parents[2] / "plain_reader.py"
 
 
 WIDE_ROWS = (1, 9)

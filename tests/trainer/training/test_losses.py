@@ -23,7 +23,7 @@ from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, set
 from photonfarm.trainer.training.loop import train
 from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
-BENCH = Path(__file__).parents[2] / "bench"
+BENCH = Path(__file__).parents[3] / "bench"
 
 
 @pytest.fixture

@@ -180,7 +180,7 @@ sys.stdin.readline()
 for modifications in range(1, 13):
     store.plan(samples.small_spec(), Request(modifications=modifications, views_per_modification=2), shard_rows=4)
 """
-    helper = str(Path(__file__).with_name("store_samples.py"))
+    helper = str(Path(__file__).parents[1] / "store_samples.py")
     racers = [
         subprocess.Popen([sys.executable, "-c", code, helper, str(store.root)], stdin=subprocess.PIPE) for _ in range(2)
     ]

@@ -33,7 +33,7 @@ from photonfarm.trainer.predict.animation import read_png, write_png
 from photonfarm.trainer.report.pictures import OVERVIEW, coloured
 from photonfarm.trainer.report.worst_cases import caption as worst_view
 
-ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room-2",
+ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room",
          "fixed-veach-ajar"]  # fmt: skip
 METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
 COMPARED = ("oidn 1/1", "light_transport_photons", "guided", "guided_transport", "guided_transport_photons",

@@ -85,7 +85,7 @@ class Gap:
 
     @classmethod
     def of(cls, one: Result, other: Result) -> Gap:
-        """That of `one` above `other`; the interval is `Errors.interval`."""
+        """The gap of `one` above `other`; the interval is `Errors.interval`."""
         more = one.errors.less(other.errors)
         found = np.array([more.estimate().mean, *more.interval(), *more.of_seeds()]) / other.mse
         share, low, high, *seeds = found.tolist()

@@ -8,6 +8,7 @@ never read here: no function, arguments, callbacks, time limits or dependents; s
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
@@ -131,8 +132,8 @@ def open_queue(connection: Redis) -> RenderQueue:
     return queue
 
 
-class QueueWorker(SimpleWorker):
-    """RQ's in-process worker, on our queue and with our jobs alone. What raises NotImplementedError here is a hook.
+class QueueWorker(SimpleWorker, ABC):
+    """RQ's in-process worker, on our queue and with our jobs alone. Its abstract methods are hooks.
 
     It leaves out what RQ has too much of: commands over pub/sub, scheduled jobs, maintenance that loads strangers'
     jobs.
@@ -154,29 +155,29 @@ class QueueWorker(SimpleWorker):
 
     # ----------------------------------------------------------------------------------------------------------- hooks
 
+    @abstractmethod
     def next_job(self) -> RenderJob | None:
         """Take the next job; None if there was none for a while, or none should be taken."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_idle(self) -> int | None:
         """Use the time without a job; an exit code ends the worker."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_job(self, job: RenderJob, run: Callable[[], None]) -> None:
         """Run a job by calling `run`, which raises none of the job's errors."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_failure(self, name: str, error: BaseException) -> None:
         """Decide the consequences of a job's error, before RQ records that it failed."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_done(self) -> int | None:
         """Look back at a job that has ended; an exit code ends the worker."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_end(self) -> None:
         """Clean up before RQ forgets the worker; a redis.RedisError is ignored."""
-        raise NotImplementedError
 
     # ------------------------------------------------------------------------------------------------------------ work
 

@@ -18,9 +18,9 @@ from typing import Any
 
 from bench.harness import results
 from experiments.experiment import Experiment, Run
-from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.processes import tied
 from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.store import SceneReader, SceneStore, Store

@@ -30,6 +30,7 @@ from bench.renderer.peers import chosen, page, plot
 from bench.renderer.peers.measure import MeasureSettings, measure, say
 from bench.renderer.peers.plans import METHODS, PLANS, estimated_seconds
 from bench.renderer.scene_loading import load
+from photonfarm.shared.core.files import write_whole
 
 
 def parse() -> argparse.Namespace:
@@ -111,9 +112,7 @@ def run(pending: list[str], settings: MeasureSettings, folder: Path, key: dict[s
 
 def store(path: Path, result: dict[str, Any]) -> None:
     """Write the result as a whole or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(result, indent=1) + "\n")
-    partial.replace(path)
+    write_whole(path, json.dumps(result, indent=1) + "\n")
 
 
 def kept(folder: Path, name: str, key: dict[str, Any]) -> dict[str, Any] | None:

@@ -31,8 +31,8 @@ from bench.harness.room_study import HELD_OUT, ReferenceViews, Run, in_processes
 from bench.harness.scenes import in_passes
 from bench.studies.budget_arms import HALF_SPP, SHARES, ArmSamples, Share, requests
 from bench.studies.budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
-from photonfarm.renderer.strategy.cache import write_whole
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.plan.allocation import Allocation, CostModel, seconds
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import SampleCosts

@@ -26,7 +26,7 @@ from bench.harness.room_study import in_processes, planned, render_job
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.strategy.cache import write_whole
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp

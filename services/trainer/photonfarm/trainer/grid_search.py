@@ -21,6 +21,7 @@ from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.estimate import Estimate, group_means, stated
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import Key, make_key
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.scene.spec import sentences
@@ -233,6 +234,4 @@ def _write(folder: Path, about: Mapping[str, Any], known: Sequence[Cell], wanted
     document = json.dumps({**about, "cells": described}, indent=2)
     with store_errors("write the grid", folder):
         for name, text in ((JSON, document), (MARKDOWN, table(wanted))):
-            partial = folder / f"{name}.partial"
-            partial.write_text(text + "\n")
-            partial.replace(folder / name)
+            write_whole(folder / name, text + "\n")

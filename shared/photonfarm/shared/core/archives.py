@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import StoreError, store_errors
+from photonfarm.shared.core.files import whole_file
 
 _DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
 """The errors that reading raises for a file that is not such an archive."""
@@ -19,11 +20,8 @@ _DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZi
 
 def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> None:
     """Store arrays by name; messages call them `what`. Raises StoreError if the disk refuses."""
-    part = file.with_suffix(".partial.npz")
-    with store_errors(f"write the {what}", file):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(part, allow_pickle=False, **arrays)
-        part.replace(file)
+    with store_errors(f"write the {what}", file), whole_file(file) as part, part.open("wb") as archive:
+        np.savez(archive, allow_pickle=False, **arrays)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy import cache
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Photons
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
@@ -77,7 +78,7 @@ def find_or_measure(
     log(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
     costs = measured_costs(spec, beside, frames, log)
     try:
-        cache.write_whole(file, costs.json())
+        write_whole(file, costs.json())
     except OSError as error:
         log(f"the measurement could not be kept: {error}")
     return costs

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.strategy.measurement import GRID, Measurement
+from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
 
@@ -69,14 +70,6 @@ def file_of(folder: str, digest: str) -> Path:
     """The file of a measurement; each kind has a folder of its own."""
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(root) / "photonfarm" / folder / f"{digest}.json"
-
-
-def write_whole(file: Path, text: str) -> None:
-    """Write a file that appears whole. Raises OSError if it cannot be written."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    aside = file.with_suffix(f".{os.getpid()}.part")
-    aside.write_text(text, encoding="utf-8")
-    aside.replace(file)
 
 
 def _file(spec: SceneSpec) -> Path:

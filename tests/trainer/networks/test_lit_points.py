@@ -1,12 +1,14 @@
 """Light that points of a closed surface send on: inside a sphere all of it is known in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from photonfarm.shared.core.records import LIT_POINTS
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.projection import Optics
@@ -14,18 +16,24 @@ from photonfarm.trainer.networks.projection import Optics
 POINTS, ALBEDO, SENT = 1024, 0.6, 0.3
 
 
-@pytest.fixture
-def sphere() -> tuple[LitPoints, Tensor]:
-    """Points of a sphere of radius 1 that faces inwards, and where they are, (L, 3)."""
-    number = np.arange(POINTS) + 0.5
-    z, angle = 1 - 2 * number / POINTS, math.pi * (1 + 5**0.5) * number
+def frame_of(points: int) -> SceneFrame:
+    """The frame of a sphere of radius 1 that faces inwards."""
+    number = np.arange(points) + 0.5
+    z, angle = 1 - 2 * number / points, math.pi * (1 + 5**0.5) * number
     ring = np.sqrt(1 - z * z)
     position = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1).astype(np.float32)
-    appearance = np.concatenate([-position, np.full((POINTS, 3), ALBEDO), np.zeros((POINTS, 3))], axis=1)
+    appearance = np.concatenate([-position, np.full((points, 3), ALBEDO), np.zeros((points, 3))], axis=1)
     optics = Optics(16.0, 16, 16, 0.01, 10.0)
     centre, area = np.zeros(3, np.float32), 4 * math.pi
-    frame = SceneFrame(optics, centre, 1.0, position, appearance.astype(np.float32), 0, 0, 1.0, -1, area, 1.0)
-    return LitPoints(frame, POINTS), torch.from_numpy(position)
+    return SceneFrame(optics, centre, 1.0, position, appearance.astype(np.float32), 0, 0, 1.0, -1, area, 1.0)
+
+
+@pytest.fixture
+def sphere() -> tuple[LitPoints, Tensor]:
+    """Points of that sphere, with weights that are the same each time, and where they are, (L, 3)."""
+    torch.manual_seed(0)
+    frame = frame_of(POINTS)
+    return LitPoints(frame, POINTS), torch.from_numpy(frame.base)
 
 
 def surfaces() -> tuple[Tensor, Tensor]:
@@ -63,9 +71,47 @@ def test_where_all_is_hidden_no_light_comes_and_what_is_not_there_sends_none(sph
     assert all(each.max() == 0 for each in dark)
 
 
+@pytest.mark.parametrize(("max_depth", "bounces"), [(2, 0), (3, 1), (4, 2), (-1, 2)])
+def test_paths_longer_than_the_images_have_are_left_out(max_depth: int, bounces: int) -> None:
+    frame = replace(frame_of(POINTS), max_depth=max_depth)
+    layer, position, sent = LitPoints(frame, POINTS), torch.from_numpy(frame.base), torch.full((POINTS, 3), SENT)
+    with torch.no_grad():
+        layer.visibility.open.fill_(50.0)
+        leaving = layer.leaving(position, layer.albedo, sent)
+    assert [layer.reaches(edges) for edges in (2, 3, 4)] == [True, bounces > 0, bounces > 1]
+    torch.testing.assert_close(leaving, sent * (1 + ALBEDO * (bounces > 1)), rtol=0.03, atol=0)
+
+
+def lobe(layer: LitPoints, position: Tensor, roughness: float, sent: Tensor) -> Tensor:
+    """What a metal at the sphere's centre shows that is seen along its normal (0, 0, 1), (3,)."""
+    normal = torch.tensor([[0.0, 0.0, 1.0]])
+    return layer._lobes(torch.zeros(1, 3), normal, -normal, torch.tensor([roughness]), position, sent)[0]
+
+
+def test_a_lobe_shows_the_light_that_is_the_same_everywhere(sphere) -> None:
+    sent = torch.full((POINTS, 3), SENT)
+    for roughness in (0.0, 0.1, 0.5, 1.0):
+        torch.testing.assert_close(lobe(*sphere, roughness, sent), torch.full((3,), SENT))
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.2, 0.3])
+def test_a_lobe_is_as_wide_as_light_that_a_rough_metal_reflects(sphere, roughness: float) -> None:
+    """Its mean cosine is that of a ray that Beckmann's normals mirror, drawn by eq. 28 of Walter et al. (2007)."""
+    layer, position = sphere
+    found = lobe(layer, position, roughness, position[:, 2:].expand(-1, 3))
+    drawn = np.random.default_rng(0).random(100_000)
+    slope = roughness * np.sqrt(-np.log1p(-drawn))  # tan of a normal's angle
+    assert 1 - found[0] == pytest.approx(1 - np.cos(2 * np.arctan(slope)).mean(), rel=0.2)
+
+
+def test_more_points_than_are_lit_are_not_asked_for() -> None:
+    assert LitPoints(frame_of(LIT_POINTS + 1), LIT_POINTS + 1).albedo.shape == (LIT_POINTS, 3)
+
+
 def test_a_wall_between_is_learned(sphere) -> None:
     """The half of the sphere below is dark to whoever is above: by 60 steps most of its light is gone."""
     layer, position = sphere
+    torch.manual_seed(1)
     above = 0.3 * torch.rand(8, 8, 3) + torch.tensor([-0.15, -0.15, 0.2])
     facing = torch.tensor([0.0, 0.0, -1.0]).expand(8, 8, 3)
     sent = SENT * (position[:, 2:] < 0).float().expand(-1, 3)

@@ -90,8 +90,8 @@ def test_every_weight_gets_a_gradient(make_source, architecture: str) -> None:
 def test_nothing_is_read_that_is_not_needed(make_source, architecture: str) -> None:
     needs = ARCHITECTURES[named(architecture)["architecture"]].needs
     inputs = batch_of(make_source(1, photons=4), (0,), architecture).inputs
-    there = inputs.points is not None, inputs.photons is not None, inputs.noisy is not None
-    assert there == (needs.points, needs.photons, bool(needs.kept))
+    there = [each is not None for each in (inputs.points, inputs.photons, inputs.noisy, inputs.guides)]
+    assert there == [needs.points, needs.photons, bool(needs.kept), needs.guides]
 
 
 @pytest.mark.parametrize("architecture", [name for name in EVERY if name.startswith("guided")])
@@ -106,6 +106,17 @@ def test_what_reflects_nothing_shows_what_it_emits_and_nothing_else(make_source,
     made = image(network(source, architecture), inputs)
     torch.testing.assert_close(made[left], inputs.guides.emission[left])
     assert not torch.isclose(made, inputs.guides.emission).all()
+
+
+def test_a_scene_far_from_the_origin_gives_the_same_image(make_source) -> None:
+    source, chosen, kind, offset = make_source(1), NetworkSettings(width=4), "guided_transport", np.float32(1024)
+    inputs, frame = batch_of(source, (0,), kind).inputs, SceneFrame.of(source.spec, *source.base(), chosen)
+    inputs.guides.specular[:, :8], inputs.guides.roughness[:, :8] = 0.9, 0.3  # a metal: its lobe sums over points too
+    near = image(build(chosen, frame, 0), inputs)
+    away = replace(frame, centre=frame.centre + offset, base=frame.base + offset)
+    inputs.points.position[:] += offset
+    inputs.world_to_camera[:, :, 3] -= inputs.world_to_camera[:, :, :3].sum(-1) * offset
+    torch.testing.assert_close(image(build(chosen, away, 0), inputs), near, rtol=1e-2, atol=1e-3)
 
 
 def test_inputs_that_lack_what_a_network_needs_are_named(make_source) -> None:

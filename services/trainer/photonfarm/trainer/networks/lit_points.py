@@ -4,7 +4,7 @@ Each of the first points of the cloud stands for its share A of the scene's surf
 with its shadows. Its reflected light goes to every other point, and from all of these to every pixel, by the form
 factor F = cos θ cos θ′ A / (π r²):
 
-B₁ = ρ (F ∘ V) E / π        B₀ = ρ E / π        light of a pixel = (F ∘ V) (B₀ + B₁)
+B₀ = ρ E / π        B₁ = ρ (F ∘ V) B₀        light of a pixel = (F ∘ V) (B₀ + B₁)
 
 This is attention over points. Its kernel is the form factor, so that the light of a pixel depends on its position,
 which a maximum over points cannot express. The visibility V between two surfaces is learned, as a function of their
@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from photonfarm.shared.core.records import LIT_POINTS
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.network import with_octaves
@@ -33,13 +34,13 @@ COARSE = 4
 """The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
 
 GLOSSY = 0.2
-"""The directional albedo above which a pixel's glossy lobe is summed over the points; only metals exceed it.
+"""The directional albedo above which a pixel's glossy lobe is summed over the points.
 
-Glossy lobes are those that are neither diffuse nor followed by rays. Summing those of plastics and varnish took a third
-of a training step and gained nothing.
+Glossy lobes are those that are neither diffuse nor followed by rays. Metals and rough glass exceed it, and coats at
+grazing angles. Summing all lobes of plastics and varnish took a third of a training step and gained nothing.
 """
 
-SHARPEST = 0.15
+SHARPEST = 0.075
 """The least roughness of a glossy lobe: a narrower lobe would fall between points."""
 
 LEAST_LOGARITHM = -60.0
@@ -67,19 +68,16 @@ OPEN = 2.0
 class LearnedVisibility(nn.Module):
     """The learned visibility between two surfaces, in (0, 1)."""
 
-    centre: Tensor
-
     def __init__(self, frame: SceneFrame) -> None:
-        """Take the scene's centre and size from a frame."""
+        """Take the scene's size from a frame."""
         super().__init__()
         self._scale = frame.scale
-        self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
         self.receiver, self.sender = _factors(std=0.3 / HIDDEN**0.5), _factors()
         self.open = nn.Parameter(torch.tensor(OPEN))
 
     def surfaces(self, position: Tensor, normal: Tensor) -> Tensor:
         """The features of a surface: its place, in sines and cosines, and its normal, (N, C)."""
-        return torch.cat([with_octaves((position - self.centre) / self._scale, OCTAVES), normal], dim=-1)
+        return torch.cat([with_octaves(position / self._scale, OCTAVES), normal], dim=-1)
 
     def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
         """The visibility of each sender from each receiver, (N, C) and (L, C) → (N, L)."""
@@ -98,19 +96,22 @@ def _factors(std: float | None = None) -> nn.Sequential:
 class LitPoints(nn.Module):
     """The radiance of white diffuse surfaces, and of lobes over their albedo, by the light of lit points.
 
-    Other kinds override `form_factors`, `leaving` or `arriving`.
+    All positions within are about the scene's centre, as squares of large coordinates leave float32 no distances. Other
+    kinds override `form_factors`, `leaving` or `arriving`.
     """
 
+    centre: Tensor
     albedo: Tensor
     normal: Tensor
 
     def __init__(self, frame: SceneFrame, count: int) -> None:
         """Take the first `count` points of a frame's cloud, or all that are lit if these are fewer."""
         super().__init__()
-        self._optics = frame.optics
-        self._count = min(count, len(frame.appearance))
+        self._optics, self._max_depth = frame.optics, frame.max_depth
+        self._count = min(count, len(frame.appearance), LIT_POINTS)
         self._area = frame.area / self._count
         self.visibility = LearnedVisibility(frame)
+        self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
         self.register_buffer("normal", torch.from_numpy(frame.appearance[: self._count, 0:3].copy()), persistent=False)
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 
@@ -124,9 +125,9 @@ class LitPoints(nn.Module):
 
     def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = given(inputs.points), given(inputs.guides)
-        source, there = points.position[place, : self._count], points.visible[place, : self._count, None]
+        source, there = points.position[place, : self._count] - self.centre, points.visible[place, : self._count, None]
         reflects = self.albedo * there
-        sent = reflects * guides.point_light[place, : self._count] / math.pi
+        sent = reflects * guides.point_light[place, : self._count] / math.pi * self.reaches(edges=3)
         rays, surface, normal = self._surfaces(inputs, place)
         unhidden, light = self._diffuse(surface, normal, source, reflects, sent)
         glossy = (guides.specular[place] - guides.throughput[place]).mean(-1) > GLOSSY
@@ -140,7 +141,7 @@ class LitPoints(nn.Module):
         """The ray, position and normal of each pixel's surface, (H, W, 3) each."""
         guides, to_camera = given(inputs.guides), inputs.world_to_camera[place]
         rays = self._optics.rays(to_camera[None])[0]
-        eye = -to_camera[:, :3].T @ to_camera[:, 3]
+        eye = -to_camera[:, :3].T @ to_camera[:, 3] - self.centre
         distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
         return rays, eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
 
@@ -169,7 +170,11 @@ class LitPoints(nn.Module):
 
     def leaving(self, source: Tensor, reflects: Tensor, sent: Tensor) -> Tensor:
         """B₀ + B₁ of each point, (L, 3)."""
-        return sent + reflects * (self.between(source) @ sent)
+        return sent + reflects * (self.between(source) @ sent) * self.reaches(edges=4)
+
+    def reaches(self, edges: int) -> bool:
+        """Whether paths of so many edges are in the images."""
+        return self._max_depth < 0 or edges <= self._max_depth
 
     def between(self, source: Tensor) -> Tensor:
         """F ∘ V between the points, (L, L)."""
@@ -187,13 +192,14 @@ class LitPoints(nn.Module):
     ) -> Tensor:
         """The mean of the points' light over a lobe about the mirrored ray, (N, 3).
 
-        The lobe is a von Mises–Fisher distribution of κ = 2 / α²; each point has the weight of its solid angle.
+        The lobe is a von Mises–Fisher distribution; each point has the weight of its solid angle. Its κ is 1 / (2 α²):
+        Beckmann's normals of roughness α have 2 / α² about the surface's normal, and mirroring doubles their angles.
         """
         mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
         leaves, squared = self._between(at, source)
         distance = squared.sqrt()
         cosine = (mirrored @ source.T - (mirrored * at).sum(-1, keepdim=True)) / distance
-        sharpness = 2 / roughness.clamp(min=SHARPEST)[:, None] ** 2
+        sharpness = 0.5 / roughness.clamp(min=SHARPEST)[:, None] ** 2
         weight = (sharpness * (cosine - 1)).clamp(min=LEAST_LOGARITHM).exp() * leaves / (squared * distance)
         return (weight @ sent) / weight.sum(-1, keepdim=True).clamp(min=1e-12)
 

@@ -61,6 +61,7 @@ def measured(experiment: Experiment) -> Need:
 
 def operations(spec: SceneSpec, run: Run) -> float:
     """Floating-point operations of a run's convolutions and matrix products."""
+    from photonfarm.trainer.networks import kind_of
     from photonfarm.trainer.networks.summary import summary
     from photonfarm.trainer.runs.settings import NetworkSettings, preset
 
@@ -68,4 +69,5 @@ def operations(spec: SceneSpec, run: Run) -> float:
     network = {key: told.pop(key) for key in [*told] if key in NetworkSettings.model_fields}
     settings = preset(run.train["preset"], network=network, **told)
     of_image = sum(part.gmacs for part in summary(spec, settings.network)) * 2e9
-    return OF_A_STEP * of_image * settings.batch * settings.max_steps
+    images = settings.batch * (2 if kind_of(settings.network.architecture).needs.kept else 1)  # a denoiser's halves
+    return OF_A_STEP * of_image * images * settings.max_steps

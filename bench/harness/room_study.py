@@ -79,11 +79,11 @@ def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], p
 
 
 def planned(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], shard_rows: int) -> SceneStore:
-    """The scene in a store, with all requests planned and guides wanted."""
+    """The scene in a store, with all requests planned and guides wanted; a store of an experiment keeps its jobs."""
     scene = store.add(spec)
     scene.guides.want(spec.guides)
     for request in requests:
-        scene.plan(request, shard_rows=shard_rows)
+        scene.plan(request, shard_rows=None if scene.plans() else shard_rows)
     return scene
 
 

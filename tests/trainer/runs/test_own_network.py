@@ -12,7 +12,8 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.trainer import train
-from photonfarm.trainer.runs.run_folder import METRICS
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.training.losses import LOSSES, loss_of
 from photonfarm.trainer.training.unbiasedness import judged
 
@@ -32,6 +33,17 @@ class PerPixel(nn.Module):
     def forward(self, inputs):
         depth = inputs.depth[..., None] / self.scale
         return inputs.albedo * self.layers(torch.cat([inputs.albedo, inputs.normal, depth], dim=-1))
+
+
+class Normalised(PerPixel):
+    """The same with batch normalisation, whose running means no gradient changes, and with one weight in two places."""
+
+    def __init__(self, settings, frame):
+        super().__init__(settings, frame)
+        self.norm, self.again = nn.BatchNorm2d(3), self.layers
+
+    def forward(self, inputs):
+        return self.norm(super().forward(inputs).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
 
 def squared(prediction, target):
@@ -87,6 +99,20 @@ def test_a_network_and_a_loss_of_ones_own_are_trained_evaluated_and_reported(
     assert f"{mine}:PerPixel" in json.dumps(report)
     spec = photonfarm("train", "--store", store, "--architecture", f"{mine}:PerPixel", "--summary")
     assert "other" in spec.output
+
+
+def test_running_means_and_shared_weights_are_kept_and_validated_with(mine: str, store: Path, tmp_path: Path) -> None:
+    common = ["--store", store, "--set", "hold_out=0.4", "--steps", 4, "--batch", 2, "--set", "average=0.5"]
+    own = photonfarm("train", *common, "--run", "own", "--architecture", f"{mine}:Normalised")
+    assert own.exit_code == 0, own.output
+    weights = checkpoint.load(tmp_path / "own" / CHECKPOINT)["average"]["weights"]
+    assert weights["norm.num_batches_tracked"] == 4
+    assert weights["norm.running_mean"].abs().max() > 0
+    logged = [json.loads(line) for line in (tmp_path / "own" / METRICS).read_text().splitlines()]
+    last = [record["error"] for record in logged if record["kind"] == "validation"][-1]
+    assert photonfarm("evaluate", "--store", store, "--run", "own").exit_code == 0
+    evaluated = json.loads((tmp_path / "own/evaluation.json").read_text())
+    assert evaluated["rows"][0]["linear_mse"]["mean"] == pytest.approx(last, rel=1e-5)
 
 
 def test_every_loss_of_ours_is_found_unbiased_and_a_biased_one_is_refused(mine: str) -> None:

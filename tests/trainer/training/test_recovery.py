@@ -214,6 +214,13 @@ def test_a_loss_that_is_not_finite_once_costs_a_run_what_it_learned_since_its_la
     assert checkpoint.load(run / CHECKPOINT)["following"]["drawn"] == 12, "the order of samples goes on"
 
 
+def test_without_recovery_a_held_out_error_that_is_not_finite_ends_the_run(make_source, tiny, run, monkeypatch) -> None:
+    as_if(monkeypatch, {0: [1.0], 4: [math.nan]})
+    with pytest.raises(DivergedError, match="held-out error of step 4 is nan"):
+        train(make_source(24), tiny(validate_every=4, recover=False), run)
+    assert [record["step"] for record in records(run, "validation")] == [0]
+
+
 def test_it_gives_up_after_eight_times(make_source, tiny, run) -> None:
     source = spoilt(make_source(24), lambda reads: reads > 20)
     with pytest.raises(DivergedError) as diverged:

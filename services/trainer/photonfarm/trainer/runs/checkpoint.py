@@ -107,7 +107,7 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
 def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
     """The value with a reference in place of each tensor; the tensors are put into `tensors`, by their names."""
     if isinstance(value, Tensor):
-        tensors[name] = value.detach().cpu().contiguous()
+        tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)  # none share memory
         return {TENSOR: name}
     if isinstance(value, Mapping):
         return {key: _apart(member, f"{name}.{key}".lstrip("."), tensors) for key, member in value.items()}

@@ -72,7 +72,8 @@ class NetworkSettings(Frozen):
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
-    demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not
+    demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
+    # guided networks have a rule of their own, and ignore it
 
     @model_validator(mode="after")
     def _fits_its_architecture(self) -> Self:

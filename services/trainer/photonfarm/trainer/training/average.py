@@ -15,7 +15,7 @@ class WeightAverage:
 
     def __init__(self, network: Network, decay: float) -> None:
         """Begin with the network's present weights."""
-        self.network = copy.deepcopy(network).requires_grad_(False)
+        self.network = copy.deepcopy(network).requires_grad_(False).eval()
         self._decay = decay
         self._steps = 0
 
@@ -24,11 +24,14 @@ class WeightAverage:
         """Add the weights after a step: mean ← d · mean + (1 − d) · weights, d = min(decay, (1 + n) / (10 + n)).
 
         n is the number of steps added before: so the first weights, which are random, are soon forgotten. That is the
-        correction of tf.train.ExponentialMovingAverage, with its num_updates (Abadi et al., TensorFlow, 2016).
+        correction of tf.train.ExponentialMovingAverage, with its num_updates (Abadi et al., TensorFlow, 2016). Buffers,
+        such as the running means of batch normalisation, are copied.
         """
         decay = min(self._decay, (1 + self._steps) / (10 + self._steps))
         for mean, weight in zip(self.network.parameters(), network.parameters(), strict=True):
             mean.lerp_(weight, 1 - decay)
+        for kept, buffer in zip(self.network.buffers(), network.buffers(), strict=True):
+            kept.copy_(buffer)
         self._steps += 1
 
     def state(self) -> dict[str, Any]:

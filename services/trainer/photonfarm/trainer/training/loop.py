@@ -27,7 +27,7 @@ from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, wait_shares
-from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.learner import DivergedError, Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 
@@ -244,16 +244,19 @@ class Session:
             self._stream.drop()
             found = batches(self._feed, rows, self._settings.batch)
             try:
-                predict, loss = network_predictor(self._learner.predicting), self._settings.loss
+                predict, loss = network_predictor(self._learner.predicting.eval()), self._settings.loss
                 now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
             except IncompleteError:  # a repair has removed all of them, for now
                 return
             finally:
+                self._learner.network.train()
                 self._stream.ask_again()
         self._validated = self._step
         if self._settings.recover:
             self._compare(now)
-        if now.is_finite or not self._settings.recover:
+        elif not now.is_finite:
+            raise DivergedError(f"the held-out error of step {self._step} is {now.held_out.error.mean}")
+        if now.is_finite:
             self._log_validation(now)
 
     def _log_validation(self, now: Validation) -> None:

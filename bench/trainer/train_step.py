@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from bench.harness import results
-from bench.harness.contents import Contents, commit
+from bench.harness.contents import Contents, commit, commit_guides
 from bench.harness.scenes import square
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
@@ -116,11 +116,14 @@ def filled(spec: SceneSpec, root: Path) -> str:
     contents = Contents(spec)
     scene = Store(root, create=True).add(spec)
     scene.write_base(*contents.base)
+    scene.guides.want(spec.guides)
     scene.plan(Request(modifications=SAMPLES // 2, views_per_modification=2), shard_rows=2 * RENDERED)
     commit(scene, 0, contents)
     pool = contents.pool()
     for job in range(1, scene.jobs()):
         commit(scene, job, pool)
+    for job in range(scene.jobs()):
+        commit_guides(scene, job, contents)
     return scene.scene_id
 
 
@@ -147,7 +150,7 @@ def timed(
     inputs = (batch.to(device).for_training() if gradients else batch.to(device)).inputs
     calls = projections(network, inputs)
     with torch.no_grad():
-        channels = torch.cat([*network.further(inputs), network.image_space(inputs)], dim=-1)
+        channels = network.channels(inputs, network.further(inputs))
     channels.requires_grad_(gradients)
     leaves = [(told[0].detach().requires_grad_(gradients), *told[1:]) for told in calls]
 

@@ -48,6 +48,28 @@ def floor(albedo: Tensor, guides: GuideInputs) -> Tensor:
     return REFLECTANCE_FLOOR * (anything / BLACK).clamp(max=1)
 
 
+def guide_channels(inputs: Inputs, scale: float) -> list[Tensor]:
+    """The guides as values near 1, each (B, H, W, C): light as log(1 + light), direct light over reflectance.
+
+    Depths are divided by `scale`.
+    """
+    guides = given(inputs.guides)
+    reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
+    return [
+        torch.log1p(guides.emission),
+        torch.log1p(guides.direct / reflects),
+        guides.gloss.sign() * torch.log1p(guides.gloss.abs() / reflects),
+        guides.specular,
+        guides.mean_normal,
+        guides.throughput,
+        guides.beyond_albedo,
+        guides.beyond_normal,
+        guides.roughness[..., None],
+        guides.mean_depth[..., None] / scale,
+        guides.beyond_depth[..., None] / scale,
+    ]
+
+
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
@@ -72,15 +94,14 @@ class Guided(Network):
         self.lit_points = transport(frame, settings.lit_points) if transport else None
         self.photon_light = photon_light
 
-    def forward(self, inputs: Inputs) -> Tensor:
-        """The image, (B, H, W, 3), linear radiance × exposure."""
+    def channels(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
+        """Further channels, guides, and the image-space channels, (B, H, W, C)."""
+        return torch.cat([*further, *guide_channels(inputs, self.scale), self.image_space(inputs)], dim=-1)
+
+    def factor(self, inputs: Inputs) -> Tensor:
+        """Reflectance, with its least value, (B, H, W, 3)."""
         guides = given(inputs.guides)
-        reflected = reflectance(inputs.albedo, guides)
-        further = self.further(inputs)
-        of_guides = self.guide_channels(guides, reflected + REFLECTANCE_FLOOR)
-        channels = torch.cat([*further, *of_guides, self.image_space(inputs)], dim=-1)
-        learned = (reflected + floor(inputs.albedo, guides)) * self.synthesise(channels)
-        return self.known(inputs, further) + learned
+        return reflectance(inputs.albedo, guides) + floor(inputs.albedo, guides)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """log(1 + light), (B, H, W, 3) each: of lit points, then of photons in each window."""
@@ -98,19 +119,3 @@ class Guided(Network):
         if self.lit_points is None and self.photon_light is None:
             return light
         return light + inputs.albedo * torch.expm1(further[-1] if self.lit_points is None else further[DIFFUSE])
-
-    def guide_channels(self, guides: GuideInputs, scale: Tensor) -> list[Tensor]:
-        """The guides as values near 1, each (B, H, W, C): light as log(1 + light), direct light over reflectance."""
-        return [
-            torch.log1p(guides.emission),
-            torch.log1p(guides.direct / scale),
-            guides.gloss.sign() * torch.log1p(guides.gloss.abs() / scale),
-            guides.specular,
-            guides.mean_normal,
-            guides.throughput,
-            guides.beyond_albedo,
-            guides.beyond_normal,
-            guides.roughness[..., None],
-            guides.mean_depth[..., None] / self.scale,
-            guides.beyond_depth[..., None] / self.scale,
-        ]

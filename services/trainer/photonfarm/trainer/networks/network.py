@@ -60,16 +60,22 @@ class Network(nn.Module):
         self.image_synthesis = ImageSynthesisLayer(further + IMAGE_CHANNELS, width, settings.precision)
 
     def forward(self, inputs: Inputs) -> Tensor:
-        """The image, (B, H, W, 3), linear radiance × exposure.
-
-        With demodulation, which is ours, it is the output × (albedo + ε): the network predicts the incident light.
-        Because of ε, lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets are not divided
-        by albedo, which would weight their noise by a factor per pixel.
-        """
+        """The image, (B, H, W, 3), linear radiance × exposure: what is known + the U-Net's output × its factor."""
         further = self.further(inputs)
-        output = self.synthesise(torch.cat([*further, self.image_space(inputs)], dim=-1))
-        made = output if self.demodulation is None else output * (inputs.albedo + self.demodulation)
-        return made + self.known(inputs, further)
+        return self.known(inputs, further) + self.factor(inputs) * self.synthesise(self.channels(inputs, further))
+
+    def channels(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
+        """All that the U-Net sees, (B, H, W, C)."""
+        return torch.cat([*further, self.image_space(inputs)], dim=-1)
+
+    def factor(self, inputs: Inputs) -> Tensor | float:
+        """The factor of the U-Net's output: 1, or (B, H, W, 3).
+
+        With demodulation, which is ours, it is albedo + ε: the network predicts the incident light. Because of ε,
+        lamps, mirrors and glass, whose diffuse albedo is 0, have an image at all. Targets are not divided by albedo,
+        which would weight their noise by a factor per pixel.
+        """
+        return 1.0 if self.demodulation is None else inputs.albedo + self.demodulation
 
     def further(self, inputs: Inputs) -> list[Tensor]:  # noqa: ARG002 - what the kinds see
         """The channels that this kind of network adds before the image-space channels, each (B, H, W, C)."""

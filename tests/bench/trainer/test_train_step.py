@@ -1,0 +1,19 @@
+"""Steps and images of every network are timed, those with guides too."""
+
+import pytest
+
+from bench.trainer import train_step
+from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, measure, resized, shown
+from photonfarm.trainer.runs.settings import preset
+
+
+def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_step, "SAMPLES", 16)
+    where = tmp_path, filled(resized(16, 64), tmp_path)
+    settings = preset("small", network={"width": 4, "points": 64})
+    timed = [measure(where, for_architecture(settings, name), WorkTimer("cpu", 1), 2) for name in shown()]
+    assert {row.architecture for row in timed} >= {"cnn", "guided", "guided_transport_photons", "denoise_4"}
+    for row in timed:
+        assert WHOLE not in row.step_parts_ms
+        assert row.step_parts_ms["U-Net"] > 0 < row.image_parts_ms["U-Net"]
+        assert row.step_ms > 0 < row.read_ms

@@ -156,6 +156,25 @@ def test_what_is_no_network_is_refused(mine: str, store: Path, name: str, lacks:
         )
 
 
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("    def __init__(self): super().__init__()", "made from (settings, frame)"),
+        ("    def forward(self, inputs): return self.layers(inputs.albedo)", "line 4, in forward: RuntimeError: mat1"),
+        ("    def forward(self, inputs): return super().forward(inputs)[..., :1]", "(2, 16, 16, 1)"),
+    ],
+)
+def test_an_error_in_a_users_network_is_one_sentence(
+    mine: str, store: Path, tmp_path: Path, body: str, said: str
+) -> None:
+    (tmp_path / f"{mine}_wrong.py").write_text(f"from {mine} import PerPixel\n\nclass Wrong(PerPixel):\n{body}\n")
+    settings = {"hold_out": 0.4, "batch": 2, "architecture": f"{mine}_wrong:Wrong", "width": 4}
+    with pytest.raises(SpecError) as refused:
+        train(store, Store(store).scenes()[0].spec.name, "run", max_steps=1, **settings)
+    assert f"architecture = '{mine}_wrong:Wrong'" in str(refused.value)
+    assert said in str(refused.value)
+
+
 def test_training_in_one_call_goes_on_where_the_command_line_left_off(mine: str, store: Path, tmp_path: Path) -> None:
     settings = {"hold_out": 0.4, "batch": 2, "architecture": f"{mine}:PerPixel", "width": 4, "validate_every": 2}
     pairs = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]

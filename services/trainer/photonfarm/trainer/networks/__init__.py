@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.networks.cnn import Cnn
@@ -16,7 +16,7 @@ from photonfarm.trainer.networks.denoiser import Denoiser
 from photonfarm.trainer.networks.feature_projection import FeatureProjection
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Inputs, Needs
 from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
@@ -73,4 +73,23 @@ def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return kind_of(settings.architecture).make(settings, frame)
+        try:
+            return kind_of(settings.architecture).make(settings, frame)
+        except TypeError as error:
+            if user_code.is_own(settings.architecture):
+                raise SpecError(
+                    f"architecture = {settings.architecture!r}: {error}; it is made from (settings, frame)"
+                ) from error
+            raise
+
+
+def image_of(network: nn.Module, inputs: Inputs) -> Tensor:
+    """A network's image, (B, H, W, 3); SpecError if a user's network makes one of another shape."""
+    image: Tensor = network(inputs)
+    if image.shape != inputs.albedo.shape:
+        name = f"{type(network).__module__}:{type(network).__qualname__}"
+        raise SpecError(
+            f"architecture = {name!r}: returns an image of shape {tuple(image.shape)}; (B, H, W, 3) = "
+            f"{tuple(inputs.albedo.shape)} is required"
+        )
+    return image

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks import image_of
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
 
@@ -101,7 +103,7 @@ def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatc
 
 def network_predictor(network: Network) -> DevicePredictor:
     """The network as a predictor, on the device of its parameters."""
-    return DevicePredictor(network, next(network.parameters()).device)
+    return DevicePredictor(partial(image_of, network), next(network.parameters()).device)
 
 
 def mean_colour(found: Iterator[TrainingBatch]) -> F32:

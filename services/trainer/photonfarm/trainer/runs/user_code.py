@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.errors import PhotonfarmError, SpecError
 
 _PATTERN = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 
@@ -38,3 +41,23 @@ def load(key: str, name: str) -> Any:
         exist = ", ".join(each for each in vars(found) if not each.startswith("_")) or "nothing"
         raise SpecError(f"{key} = {name!r}: {found.__file__} has no {attribute!r}; it has {exist}")
     return getattr(found, attribute)
+
+
+@contextmanager
+def named_in_errors(**own: str) -> Iterator[None]:
+    """Turn an error from inside a user's module into a SpecError of one sentence, which names the line.
+
+    `own` are settings and their values, of which those of the form `MODULE:NAME` count. Other errors pass.
+    """
+    try:
+        yield
+    except PhotonfarmError:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        for key, name in own.items():
+            file = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
+            if is_own(name) and (found := [frame for frame in frames if frame.filename == file]):
+                where = f"{file}, line {found[-1].lineno}, in {found[-1].name}"
+                raise SpecError(f"{key} = {name!r}: {where}: {type(error).__name__}: {error}") from error
+        raise

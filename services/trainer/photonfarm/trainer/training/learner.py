@@ -10,7 +10,7 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.networks import build
+from photonfarm.trainer.networks import build, image_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
@@ -69,7 +69,7 @@ class Learner:
         loss = torch.zeros((), device=self._device)
         if batch.rows:  # all samples of a part may have become incomplete
             batch = batch.to(self._device).for_training()
-            loss = self._loss(self.network(batch.inputs), batch.target)
+            loss = self._loss(image_of(self.network, batch.inputs), batch.target)
             torch.autograd.backward(loss)
         value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):

@@ -26,6 +26,7 @@ from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.runs.user_code import named_in_errors
 from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, wait_shares
 from photonfarm.trainer.training.learner import DivergedError, Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
@@ -94,7 +95,8 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
             if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
                 return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
-        with Feed(source, settings, hooks.clock) as feed:
+        own = {"architecture": settings.network.architecture, "loss": settings.loss}
+        with Feed(source, settings, hooks.clock) as feed, named_in_errors(**own):
             return Session(feed, settings, run, watch, hooks).run()
 
 

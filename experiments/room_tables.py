@@ -54,7 +54,7 @@ def _cost(room: Room) -> list[str]:
 
 
 def descriptions(rooms: Sequence[Room]) -> str:
-    """A list of the rooms: what moves, why they are rendered so, whom they are owed to, and commits."""
+    """A list of the rooms: what moves, why they are rendered so, who is credited for them, and commits."""
     return "\n".join(wrapped(_described(room), "- ", "  ") for room in rooms)
 
 

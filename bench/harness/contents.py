@@ -69,7 +69,7 @@ class Contents:
         return self._get("photons", modification, None, lambda: self._scene.photons(3))
 
     def guides(self, modification: Modification, view: View) -> Guides:
-        """What is known of a view beside its buffers."""
+        """The guides of a view."""
         from photonfarm.renderer.jobs.render import lit_points
 
         key, lit = modification.key(self.spec.scene_id), lit_points(self.base[1], modification)

@@ -1,4 +1,4 @@
-"""How much of what moved lamps change in an image networks explain, beside what is known without learning.
+"""How much of what moved lamps change in an image networks explain, beside the light of the guides.
 
     python -m bench.trainer.moved_lamps [--rooms NAME …] [--views 16] [--half-spp 64] [--work DIR] [--out DIR]
 
@@ -108,7 +108,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictorGroup:
-    """What predicts images: networks that differ in their seeds alone, or what is known without one."""
+    """What predicts images: networks that differ in their seeds alone, or the light of the guides without a network."""
 
     name: str
     seeds: tuple[int, ...]  # none where nothing is learned

@@ -124,7 +124,7 @@ class Sample:
 
     @property
     def guides(self) -> dict[str, F32]:
-        """The guides, which are images known before any learning, by name; empty unless the scene is read with guides.
+        """The guides, images that networks may be given, by name; empty unless the scene is read with guides.
 
         `photonfarm.shared.core.records.Guides` describes each. A guide is also an attribute of the sample.
         """

@@ -106,4 +106,4 @@ def test_the_configuration_file_has_tables_for_subcommands(install: Install, tmp
 def test_the_installed_verbs_are_listed_with_their_subcommands() -> None:
     assert {"scene", "submit", "status", "up"} <= set(umbrella.list_commands(click.Context(umbrella)))
     assert "show" in run("scene", "--help").output
-    assert "check it, and mend it" in run("store", "--help").output
+    assert "check it, and repair it" in run("store", "--help").output

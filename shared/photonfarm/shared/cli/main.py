@@ -25,8 +25,8 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     """Unbiased training data for neural light transport, and training on it while it grows.
 
     Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
-    to stdout, talk goes to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5 Redis, 6 this
-    machine cannot render, 7 incomplete, 8 training diverged, 130 `up` after Ctrl-C, 1 anything else.
+    to stdout, all other messages go to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5
+    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 130 `up` after Ctrl-C, 1 anything else.
     """
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():

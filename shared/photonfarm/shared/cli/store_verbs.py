@@ -26,11 +26,11 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
     """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
 
     Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
-    that differ by more than chance, views from behind. Safe while workers and trainers are at work.
+    that differ by more than chance, views that see only back faces. Safe while workers and trainers are at work.
 
     --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
     missing and render them again. Damaged inputs of a plan it copies there, and writes them again from the plan's
-    request. It deletes nothing.
+    request. It only moves files; in a bucket, a move is a copy and then a delete.
 
     Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
     4 something is wrong (also what --repair cannot repair, which the text says).
@@ -161,8 +161,8 @@ def upgrade(
 ) -> None:
     """Add guides to scenes that an older photonfarm has rendered; no sample is rendered again.
 
-    Guides are what is known of each view before anything is learned: noise-free buffers, and direct light. Networks may
-    be given them. Workers render them, job by job, and readers see them arrive; all else in the store stays as it is.
+    Guides are images that the renderer computes of each view for networks: noise-free buffers, and direct light with
+    noise of its own. Workers render them job by job, and readers see them arrive; all else in the store stays as it is.
     A scene that has guides, or has been asked for some, keeps its settings. It may be stopped and repeated at any time.
 
     Exit codes: 0 asked for, also before; 4 the store or one of its scenes cannot be read, and the others are done; 5

@@ -16,7 +16,7 @@ import click
 
 from photonfarm.shared.core.commands import GROUP
 
-_BARE = {"store": "Look into the sample store, check it, and mend it."}
+_BARE = {"store": "Look into the sample store, check it, and repair it."}
 """The help texts of groups that are not verbs themselves."""
 
 

@@ -66,7 +66,7 @@ class ViewBuffers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guides:
-    """The guides of a view, which are known before any learning: means over a grid of rays through each pixel.
+    """The guides of a view, which networks may be given: means over a grid of rays through each pixel.
 
     Pure mirrors, glass and null surfaces are followed, along their stronger lobe, to the first surface that scatters
     otherwise: `throughput` is the product of what they let through, and `beyond_*` describes that surface. All four are

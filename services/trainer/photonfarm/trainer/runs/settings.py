@@ -20,7 +20,7 @@ from photonfarm.trainer.runs.user_code import is_own
 Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
 Architecture = Literal[
     "cnn", "feature_projection", "light_transport", "light_transport_photons",  # of the paper
-    "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, given what is known of a view
+    "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, given the guides of a view
     "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
 ]  # fmt: skip
 Precision = Literal["float32", "bfloat16"]

@@ -176,7 +176,7 @@ class _SceneChecking:
             self._add([Finding(Cause.HALVES_DIFFER, halves_in_words(halves), self._scene_id)])
 
     def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
-        """Check the scene's guides, if it has some; returns what of their settings and declarations was mended."""
+        """Check the scene's guides, if it has some; returns what of their settings and declarations was repaired."""
         if not self._storage.names(guides.name):
             return []
         check = GuideCheck(guides, committed)

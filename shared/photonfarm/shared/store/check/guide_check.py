@@ -23,7 +23,7 @@ _GONE = "is missing, and guides are there"
 
 
 class GuideCheck:
-    """Checks settings and declarations of one scene's guides, and mends them."""
+    """Checks settings and declarations of one scene's guides, and repairs them."""
 
     def __init__(self, guides: CheckTarget, committed: Set[int]) -> None:
         """Take the guides, and the jobs that had their marker before anything else was read."""

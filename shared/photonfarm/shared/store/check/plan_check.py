@@ -156,8 +156,8 @@ class PlanCheck:
     def check_base(self, committed: Set[int]) -> Iterator[Finding]:
         """Yield what is wrong with geometry and base point cloud, which are there once a job is committed.
 
-        Any job writes them when it is rendered: if they are missing and a planned job is still to come, workers mend
-        that.
+        Any job writes them when it is rendered: if they are missing and a planned job is still to come, workers
+        repair that.
         """
         folder = f"{self._scene}/base"
         try:

@@ -1,4 +1,4 @@
-"""A scene's guides, which are known of each view before any learning, in a folder of their own below the scene's.
+"""A scene's guides, which the renderer computes of each view, in a folder of their own below the scene's.
 
 SCENE/guides/settings.json                  the settings they are rendered with; its presence gives the scene guides
 SCENE/guides/plans/000000/                  a Zarr group with the guides' arrays, beside the plan of that number

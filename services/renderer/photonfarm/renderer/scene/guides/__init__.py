@@ -1,4 +1,4 @@
-"""The guides of a view, known before any learning: emission, direct light, gloss, and what mirrors and glass show.
+"""The guides of a view, inputs of networks: emission, direct light, gloss, and what mirrors and glass show.
 
 All are means over a regular grid of rays in each pixel, as albedo is. A ray that meets a surface of delta lobes alone
 (a mirror, smooth glass, a null surface) is *followed* along the lobe that takes more than half of the light, to the

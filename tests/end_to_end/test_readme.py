@@ -46,8 +46,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def folder(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with that store in it."""
-    (tmp_path / "store").symlink_to(store)
+    """The current folder, with that store in it, and in that of the demo."""
+    (tmp_path / "demo").mkdir()
+    for place in ("store", "demo/store"):
+        (tmp_path / place).symlink_to(store)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -83,7 +85,7 @@ def test_the_network_and_the_loss_of_the_training_page_do_what_it_says() -> None
     mine = ran(module)
     network = mine["PerPixel"](SimpleNamespace(width=4), SimpleNamespace(scale=2.0))
     image = torch.ones(2, 8, 8, 3)
-    guides = SimpleNamespace(direct=image)
+    guides = SimpleNamespace(emission=image, direct=image, gloss=image, specular=image)
     inputs = SimpleNamespace(albedo=image, normal=image, depth=torch.ones(2, 8, 8), guides=guides)
     assert network(inputs).shape == image.shape
     assert network.needs.guides

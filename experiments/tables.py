@@ -173,7 +173,7 @@ what they say.
 
 
 def options() -> argparse.ArgumentParser:
-    """What can be told."""
+    """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
     parser.add_argument("--work", type=Path, default=results.ROOT / "build/experiments", help="(build/experiments)")

@@ -4,7 +4,7 @@
 
 Takes experiments that have run (`make experiments-small`), renders a view of each of some held-out configurations as it
 is, and again with the lamps as in another random configuration, and has every trained network predict both: nothing is
-trained. Denoisers are left out, as they are given an image of the very view. PHOTONFARM_SCENES names the folder of the
+trained. Denoisers are left out, as they are given an image of that same view. PHOTONFARM_SCENES names the folder of the
 rooms' scene files. Exit code 0, whatever comes out; 2 for a room that has not run, or without a lamp that moves.
 
 Shape letters: G movable groups, H W image, N views, S seeds.
@@ -351,7 +351,7 @@ of the light is not theirs.
 that moved; a mirror stays, whatever it shows. **{KNOWN.capitalize()}** is emission, direct light and gloss of the
 guides: nothing in it is learned. Intervals are of a bootstrap over configurations, for these networks, and rough where
 few views carry the sums; seeds of one network are averaged, and s is their standard deviation. Denoisers are left out:
-they are given an image of the very view.
+they are given an image of that same view.
 
 {parts}"""
 

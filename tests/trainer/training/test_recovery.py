@@ -285,7 +285,7 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     assert (found["cause"], found["back_to"], found["rate_factor"], found["recoveries"]) == ("end", 5, 1.0, 0)
     ended, five = (checkpoint.load(folder / CHECKPOINT)["network"] for folder in (run, tmp_path / "five"))
     assert all(torch.equal(ended[name], five[name]) for name in five)
-    said = "step 12: held-out error 0.70000, and 0.50000 at best; ends with the weights of step 5"
+    said = "step 12: held-out error 0.70000 (best so far 0.50000); ends with the weights of step 5"
     assert said in capsys.readouterr().err.splitlines()
 
 

@@ -37,7 +37,7 @@ def _recovered(log_record: dict[str, Any]) -> str:
     elif errors["now"] is None:
         found = "the held-out error is not finite"
     else:
-        found = f"held-out error {stated(errors['now'], None)}, and {stated(errors['best'], None)} at best"
+        found = f"held-out error {stated(errors['now'], None)} (best so far {stated(errors['best'], None)})"
     if log_record["cause"] == "end":
         return f"{found}; ends with {back_to}"
     return f"{found}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"

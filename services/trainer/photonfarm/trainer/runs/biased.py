@@ -30,11 +30,11 @@ class BiasReason:
         if self.ends_at is not None:
             values = ", ".join(f"{value:.2f}" for value in self.ends_at)
             measured = f"; a pixel of mean 0.90 ends at {values} with targets of 4, 16, 256 samples ({PAGE})"
-        return f"is refused, as it biases under noisy targets: {self.why}{measured}; {instead}"
+        return f"is refused because noisy targets bias it: {self.why}{measured}; {instead}"
 
 
-L1 = BiasReason("its least is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
-HUBER = BiasReason("its least is between the targets' median and their mean", (0.32, 0.39, 0.88))
+L1 = BiasReason("its minimum is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
+HUBER = BiasReason("its minimum is between the targets' median and their mean", (0.32, 0.39, 0.88))
 LOG = BiasReason("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
 DISPLAY = BiasReason("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
 TARGET_WEIGHT = BiasReason("the weight depends on the target's own noise", (0.20, 0.27, 0.59))

@@ -83,5 +83,5 @@ def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | No
     loss = user_code.load("loss", name)
     verdict = judged(loss)
     if not verdict.is_unbiased:
-        raise SpecError(f"loss = {name!r}: is refused, as it biases under noisy targets: {verdict}")
+        raise SpecError(f"loss = {name!r}: is refused because noisy targets bias it: {verdict}")
     return loss, verdict

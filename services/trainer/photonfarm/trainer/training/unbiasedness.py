@@ -49,7 +49,7 @@ class Verdict:
                 f"errors from 0 ({LIMIT:g} are allowed)"
             )
         if self.elsewhere <= LIMIT:
-            return f"{found} standard errors, and everywhere else it is that with the clean target"
+            return f"{found} standard errors, and elsewhere it equals the gradient with the clean target"
         return f"{found} standard errors; elsewhere it is not that with the clean target ({self.elsewhere:.0f})"
 
 

@@ -67,7 +67,10 @@ class _Path:
 
 
 def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
-    """The path of each ray, which meets `first`, to a surface that is no pure mirror, glass or null; that surface."""
+    """Follow each ray from `first`, which it meets, to the first surface that is no pure mirror, glass or null.
+
+    Returns the path, and that surface.
+    """
     active = dr.full(mi.Bool, True, dr.width(ray))
     start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
     start = _follow(scene, start, first, settings)

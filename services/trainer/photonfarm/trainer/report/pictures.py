@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from photonfarm.trainer.report.worst_cases import caption as worst_view
 OVERVIEW = "overview.png"
 OVERVIEW_WIDTH = 192  # px, at least, of each picture of it
 GAP = 8  # px between them
+TITLE = 26  # px, the height of the line above them
 
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
@@ -42,6 +44,7 @@ class Case:
 class Panel:
     """One picture of the report's first row."""
 
+    title: str
     caption: str
     picture: Picture
 
@@ -62,10 +65,22 @@ def first_row(contents: ReportContents) -> list[Panel]:
 
 
 def overview(contents: ReportContents) -> Picture:
-    """All rows as one picture without text, each pixel enlarged."""
-    lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in rows(contents)]
-    sheet: Picture = np.concatenate(lines)
-    return sheet[:-GAP, :-GAP]
+    """All rows as one picture with titles above, each pixel enlarged."""
+    found = rows(contents)
+    lines = [np.concatenate([_framed(panel.picture) for panel in row], axis=1) for row in found]
+    sheet = np.concatenate(lines)[:-GAP, :-GAP]
+    return np.concatenate([_titles([panel.title for panel in found[0]], sheet.shape[1]), sheet])
+
+
+def _titles(titles: Sequence[str], width: int) -> Picture:
+    """A line of titles, each at the left of its column."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    line = Image.new("RGB", (width, TITLE), "white")
+    for column, title in enumerate(titles):
+        left = column * (width + GAP) // len(titles)
+        ImageDraw.Draw(line).text((left, 2), title, "black", ImageFont.load_default(size=16))
+    return np.asarray(line)
 
 
 def _framed(picture: Picture) -> Picture:
@@ -77,13 +92,13 @@ def _framed(picture: Picture) -> Picture:
 
 
 def _panels(contents: ReportContents, shown: Shown, target: Target) -> list[Panel]:
-    right = f"reference, {target.spp} samples per pixel" if target.is_reference else "mean of both noisy halves"
+    right = "reference" if target.is_reference else "mean of both halves"
     half_spp = contents.card.spec.transport.half_spp
     return [
-        Panel(f"noisy half, {half_spp} samples per pixel", display(target.half_a, 1.0)),
-        Panel(f"prediction by {shown.name}", shown.picture),
-        Panel(right, display(target.image, 1.0)),
-        Panel(f"difference, MSE {shown.mse:.4f}", shown.difference),
+        Panel("noisy half", f"noisy half, {half_spp} samples per pixel", display(target.half_a, 1.0)),
+        Panel("prediction", f"prediction by {shown.name}", shown.picture),
+        Panel(right, f"{right}, {target.spp} samples per pixel", display(target.image, 1.0)),
+        Panel("difference", f"difference, MSE {shown.mse:.4f}", shown.difference),
     ]
 
 

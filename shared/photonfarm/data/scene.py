@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.data.sample import Sample
-from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.find import scene_named
@@ -20,7 +19,6 @@ from photonfarm.shared.store.read.find import scene_named
 if TYPE_CHECKING:
     from photonfarm.data.torch_dataset import SceneDataset
 
-HOLD_OUT = 0.125
 Split = Literal["train", "held-out", "all"]
 
 
@@ -153,7 +151,7 @@ class Scene(Sequence[Sample]):
             raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
         if split == "all":
             return self.snapshot()
-        held_out = np.array(are_held_out(self._units(), hold_out), np.bool_)
+        held_out = np.array(rows_held_out(self._reader, self._rows.tolist(), hold_out), np.bool_)
         return self._of(self._rows[held_out if split == "held-out" else ~held_out])
 
     def torch(
@@ -167,11 +165,6 @@ class Scene(Sequence[Sample]):
         from photonfarm.data.torch_dataset import SceneDataset
 
         return SceneDataset(self.split(split, hold_out=hold_out), fields)
-
-    def _units(self) -> list[Key]:
-        """The keys by which samples are held out."""
-        keys = self._reader.modification_keys if self.spec.groups else self._reader.view_keys
-        return keys(self._rows.tolist())
 
     def _of(self, rows: NDArray[np.int64]) -> Self:
         return type(self)(self._store, self._id, guides=self._guides, rows=rows.tolist())

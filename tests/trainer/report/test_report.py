@@ -20,13 +20,14 @@ from matplotlib.figure import Figure
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store, store_status
 from photonfarm.shared.store.read.find import Query
 from photonfarm.shared.store.read.merge import MergedView, merge_views
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into, rows_held_out
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun

@@ -39,7 +39,7 @@ def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> 
     return Scene(store, found.scene_id, guides=guides)
 
 
-class Scene(Sequence[Sample]):
+class Scene:
     """The complete samples of one scene, in the order of their rows; `refresh` adds those completed since.
 
     A pickled scene holds only its place in the store and its rows, so that spawned processes read the same samples.
@@ -115,6 +115,18 @@ class Scene(Sequence[Sample]):
     def __iter__(self) -> Iterator[Sample]:
         return (self._sample(int(row)) for row in self._rows)
 
+    __contains__ = None  # samples are not compared, and looking would read all of them; ask `row in scene.rows`
+
+    def row(self, number: int) -> Sample:
+        """The sample in a row of the store, by the number that `photonfarm store find` and other verbs print.
+
+        Raises LookupError if this scene or split has no complete sample there, and CorruptError as indexing does.
+        """
+        if number not in self._rows:
+            there = f", in rows {self._rows[0]} to {self._rows[-1]}" if len(self) else ""
+            raise LookupError(f"row {number} of scene {self.name}: is none of its {len(self)} complete samples{there}")
+        return self._sample(int(number))
+
     def _sample(self, row: int) -> Sample:
         return Sample(self._reader.read(row), self._reader, self._id, self._read_base()[1])
 
@@ -145,8 +157,11 @@ class Scene(Sequence[Sample]):
         """A snapshot of the samples to train on, of those that are held out, or of all.
 
         A share `hold_out` of the configurations (in a static scene, of the views) is held out whole, chosen by a hash
-        of their content: exactly those that `photonfarm train` holds out. Raises ValueError for another split.
+        of their content: exactly those that `photonfarm train --hold-out` of the same share holds out. Raises
+        ValueError for another split, and for a share that is not between 0 and 1.
         """
+        if not 0 < hold_out < 1:
+            raise ValueError(f"hold_out = {hold_out!r}: must lie between 0 and 1")
         if split not in (splits := ("train", "held-out", "all")):
             raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
         if split == "all":
@@ -159,8 +174,10 @@ class Scene(Sequence[Sample]):
     ) -> SceneDataset:
         """The samples of a split as a torch dataset of dictionaries; it pickles, so any DataLoader works.
 
-        `fields` are names of images and of `modification` and `view`; None takes all that there are. Raises ValueError
-        for another split, SpecError for another field, and ImportError without torch.
+        Without a split it has all samples of this scene, those to be held out among them: to train, name "train", or
+        take the dataset of a scene that is split already. `fields` are names of images and of `modification` and
+        `view`; None takes all that there are. Raises ValueError as `split` does, SpecError for another field, and
+        ImportError without torch.
         """
         from photonfarm.data.torch_dataset import SceneDataset
 

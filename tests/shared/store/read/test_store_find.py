@@ -1,6 +1,9 @@
 """`photonfarm store find` finds samples by what they are, and says where they lie."""
 
 import json
+import shlex
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -236,7 +239,11 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
     assert printed["samples"][0]["complete"]
-    assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
+    scene.write_base(*samples.base())
+    words = shlex.split(printed["samples"][0]["commands"]["look at it"])[1:]
+    looked = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert looked.returncode == 0, looked.stderr
+    assert looked.stdout.startswith("[[[[")
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
     scene.guides.want(GuideSpec())
     assert "guides        of job 2: missing" in run("--row", "8").stdout

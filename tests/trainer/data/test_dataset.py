@@ -62,12 +62,12 @@ def test_a_batch_holds_the_samples_exactly(make_source, tiny, exposure: float) -
         assert batch.rows == (4, 1)
         for place, row in enumerate(batch.rows):
             sample = source.read(row)
-            position, visible = source.cloud_at(row)
+            position, present = source.cloud_at(row)
             camera = Camera.of(sample.view, source.spec).world_to_camera
             for found, wanted in (
                 (batch.target, sample.radiance * np.float32(source.spec.exposure)),
                 (batch.inputs.points.position, position),
-                (batch.inputs.points.visible, visible),
+                (batch.inputs.points.present, present),
                 (batch.inputs.points.seen, sample.visibility.points),
                 (batch.inputs.world_to_camera, camera.astype(np.float32)),
                 (batch.inputs.depth, sample.buffers.depth),

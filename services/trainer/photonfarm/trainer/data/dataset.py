@@ -221,11 +221,11 @@ def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
 
 
 def _fill_points(
-    memory: PointInputs, place: int, position: F32, visible: NDArray[np.bool_], seen: NDArray[np.bool_]
+    memory: PointInputs, place: int, position: F32, present: NDArray[np.bool_], seen: NDArray[np.bool_]
 ) -> None:
     points = memory.position.shape[1]
     memory.position[place] = torch.from_numpy(position[:points])
-    memory.visible[place] = torch.from_numpy(visible[:points])
+    memory.present[place] = torch.from_numpy(present[:points])
     memory.seen[place] = torch.from_numpy(seen[:points])
 
 

@@ -181,7 +181,7 @@ class Stages:
     # -------------------------------------------------------------------------------------------------------- report
 
     def report(self) -> Path:
-        """The report of the networks from the first seed and of denoisers that nobody trained; all others' errors too.
+        """The report of the networks from the first seed and of ready denoisers; all others' errors too.
 
         Made anew where any of it is newer.
         """

@@ -156,7 +156,8 @@ def test_guides_are_listed_where_the_scene_is_to_have_some(store: Store, scene: 
     assert samples.commit_guides(scene, 0)
     found = {s.row: s for s in find(store).samples}
     assert (found[12].guided, found[4].guided) == (True, False)  # views of jobs 0 and 1
-    reader = SceneReader(store.root, scene.scene_id, guides=True)
+    reader = SceneReader(store.root, scene.scene_id)
+    reader.follow_guides()
     reader.refresh()
     known = reader.read(12).guides
     places = {place.array: place for place in found[12].places[len(before.places) :]}

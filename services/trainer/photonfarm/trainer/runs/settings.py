@@ -31,7 +31,7 @@ PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Schedule = Literal["epochs", "cosine"]
-UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
+ReadyDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
 
 def _one_of(kind: Any) -> BeforeValidator:

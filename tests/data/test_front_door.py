@@ -66,7 +66,10 @@ def test_public_names(package: ModuleType, names: list[str]) -> None:
     [
         (photonfarm.data.open_scene, "store, scene, *, guides=None"),
         (photonfarm.renderer.load_mitsuba, "threads=None"),
-        (photonfarm.trainer.train, "store, scene, run, *, preset='small', **settings"),
+        (
+            photonfarm.trainer.train,
+            "store, scene, run, *, preset='small', redis_url=None, log=<built-in function print>, **settings",
+        ),
     ],
 )
 def test_public_parameters(function: Callable[..., object], parameters: str) -> None:

@@ -22,7 +22,7 @@ from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.processes import tied
-from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format.markers import COMMITTED
 
@@ -92,9 +92,8 @@ class Stages:
         reader = SceneReader(self.folder / "store", self._scene_id)
         rows = {reader.view_row(row): row for row in reversed(reader.refresh().tolist())}
         shown = [row for _, row in sorted(rows.items())]
-        keys = reader.view_keys(shown)
-        held_out = are_held_out(reader.modification_keys(shown) if reader.spec.groups else keys, size.hold_out)
-        wanted = [key.hex() for key, held in zip(keys, held_out, strict=True) if held][: size.references.views]
+        sides = zip(reader.view_keys(shown), rows_held_out(reader, shown, size.hold_out), strict=True)
+        wanted = [key.hex() for key, is_held_out in sides if is_held_out][: size.references.views]
         return [self.folder / "references" / f"{key}.npz" for key in wanted]
 
     @property
@@ -182,7 +181,7 @@ class Stages:
     # -------------------------------------------------------------------------------------------------------- report
 
     def report(self) -> Path:
-        """The report of the networks from the first seed and of denoisers that nobody trained; all others' errors too.
+        """The report of the networks from the first seed and of ready denoisers; all others' errors too.
 
         Made anew where any of it is newer.
         """

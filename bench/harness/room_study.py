@@ -34,6 +34,7 @@ from experiments.experiment import Experiment, names
 from photonfarm.shared.core.estimate import clean_error
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec, load_spec
@@ -41,7 +42,7 @@ from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.merge import merge_view
 from photonfarm.shared.store.read.reader import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
+from photonfarm.trainer.data.dataset import SampleSource
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import metric_space

@@ -121,14 +121,14 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
             if key in seen:
                 continue
             seen.add(key)
-            position, visible = rebuild(base, modification)
+            position, present = rebuild(base, modification)
             photons = contents.photons(modification) if spec.photons.paths else None
             kept["radiance"].append({"radiance": contents.halves(modification, view)})
             shown = contents.buffers(modification, view), contents.visibility(modification, view)
             kept["buffers"].append(view_row(*shown))
             kept["cloud"].append(
                 {"position": position, "normal": base.normal, "albedo": base.albedo, "emission": base.emission,
-                 "visible": visible}
+                 "visible": present}
             )  # fmt: skip
             kept["photons"].append(
                 {f"photon_{name}": values for name, values in arrays_of(photons).items()} if photons else {}

@@ -98,13 +98,13 @@ def planned(name: str, arguments: argparse.Namespace) -> Planned:
     )
     file = folder / "costs.json"
     if not file.is_file():
-        (costs,) = in_processes(measured_costs, [(room_study.named_room(name),)], 1, f"{name}: measured costs")
+        (costs,) = in_processes(times_and_noise, [(room_study.named_room(name),)], 1, f"{name}: measured costs")
         write_whole(file, costs.json())
     costs = SampleCosts.read(file.read_text())
     return Planned(name, spec, folder, store, costs, {share: paid(costs, share, arguments.budget) for share in SHARES})
 
 
-def measured_costs(room: SceneSpec) -> SampleCosts:
+def times_and_noise(room: SceneSpec) -> SampleCosts:
     """Times at the samples per pixel that the room has, and the noise of the passes that samples are made of."""
     from photonfarm.renderer.measure.sample_costs import measured_costs
 

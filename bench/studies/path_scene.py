@@ -113,7 +113,7 @@ class Costs:
         return filling_a_grid((self.bdpt_s - self.path_fixed_s) / self.path_spp_s)
 
 
-def measured_costs(spec: SceneSpec, views: int) -> Costs:
+def integrator_costs(spec: SceneSpec, views: int) -> Costs:
     """Time both integrators by turns on one view each of so many configurations."""
     scene = load_path(spec, FEW)
     spent = {BDPT: 0.0, FEW: 0.0, MANY: 0.0}
@@ -136,7 +136,7 @@ def costs_of(spec: SceneSpec, folder: Path, views: int = 24) -> Costs:
     """What was measured when the folder was first worked in: later calls go on with the same samples per pixel."""
     file = folder / "costs.json"
     if not file.is_file():
-        (costs,) = in_processes(measured_costs, [(spec, views)], 1, "timed both integrators")
+        (costs,) = in_processes(integrator_costs, [(spec, views)], 1, "timed both integrators")
         write_whole(file, json.dumps(asdict(costs)) + "\n")
     return Costs(**json.loads(file.read_text(encoding="utf-8")))
 

@@ -168,10 +168,10 @@ class FilledProjection(LightTransport):
 
     needs = Needs()
 
-    def project(self, features: Tensor, position: Tensor, visible: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
+    def project(self, features: Tensor, position: Tensor, present: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """(B, P, C) → (B, H, W, C)."""
         counted = torch.cat([features, features.new_ones(*features.shape[:2], 1)], dim=-1)
-        found = super().project(counted, position, visible, seen, inputs)
+        found = super().project(counted, position, present, seen, inputs)
         near = functional.avg_pool2d(found.permute(0, 3, 1, 2), 2 * REACH + 1, 1, REACH).permute(0, 2, 3, 1)
         mean, there = near[..., :-1] / near[..., -1:].clamp(min=1e-6), found[..., -1:]
         return torch.where(there > 0, found[..., :-1], mean)

@@ -33,13 +33,14 @@ from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
 from photonfarm.shared.core.keys import Key, seed_of, view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.plan.hold_out import units_of
 from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons, units_of
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES

@@ -60,7 +60,7 @@ class Viewed:
 
     camera: Camera
     position: F32  # (P, 3)
-    visible: Mask  # (P,) not of a removed group
+    present: Mask  # (P,) not of a removed group
     moved: Mask  # (P,) of a group that stands elsewhere than at rest
     seen: Mask  # (P,) as the renderer stores it
     query_s: float  # CPU seconds that it took
@@ -71,10 +71,10 @@ class Viewed:
     def kept(self, optics: Optics) -> Mask:
         """What the projection keeps, (P,)."""
         to_camera = self.camera.world_to_camera.astype(np.float32)
-        arrays = (self.position, self.visible, self.seen, to_camera, self.buffers.depth, self.buffers.normal)
-        position, visible, seen, camera, depth, normal = (torch.from_numpy(array)[None] for array in arrays)
+        arrays = (self.position, self.present, self.seen, to_camera, self.buffers.depth, self.buffers.normal)
+        position, present, seen, camera, depth, normal = (torch.from_numpy(array)[None] for array in arrays)
         found = np.zeros(len(self.position), np.bool_)
-        found[footprint(position, visible, seen, camera, depth, normal, optics).point.numpy()] = True
+        found[footprint(position, present, seen, camera, depth, normal, optics).point.numpy()] = True
         return found
 
 
@@ -108,17 +108,17 @@ class LoadedRoom:
             self.loaded.apply(modification)
             corners = triangles(self.geometry, modification)
             view = sample_view(self.spec, modification.key(self.spec.scene_id), 0, index)
-            position, visible = rebuild(self.cloud, modification)
+            position, present = rebuild(self.cloud, modification)
             camera = Camera.of(view, self.spec)
-            inside = np.flatnonzero(visible & in_image(camera, self.spec, position))
+            inside = np.flatnonzero(present & in_image(camera, self.spec, position))
             some = rng.choice(inside, min(judged, len(inside)), replace=False)
             seen, query_s = self._query(view, position)
             yield Viewed(
                 camera=camera,
                 position=position,
-                visible=visible,
-                moved=(self.cloud.group != STATIC) & visible & (position != self.cloud.position).any(axis=1),
-                seen=seen & visible,
+                present=present,
+                moved=(self.cloud.group != STATIC) & present & (position != self.cloud.position).any(axis=1),
+                seen=seen & present,
                 query_s=query_s,
                 buffers=self.loaded.buffers(view),
                 judged=some,

@@ -66,7 +66,10 @@ def test_public_names(package: ModuleType, names: list[str]) -> None:
     [
         (photonfarm.data.open_scene, "store, scene, *, guides=None"),
         (photonfarm.renderer.load_mitsuba, "threads=None"),
-        (photonfarm.trainer.train, "store, scene, run, *, preset='small', **settings"),
+        (
+            photonfarm.trainer.train,
+            "store, scene, run, *, preset='small', redis_url=None, log=<built-in function print>, **settings",
+        ),
     ],
 )
 def test_public_parameters(function: Callable[..., object], parameters: str) -> None:
@@ -76,8 +79,7 @@ def test_public_parameters(function: Callable[..., object], parameters: str) -> 
 
 def test_public_members() -> None:
     assert {name for name in dir(Scene) if not name.startswith("_")} == {
-        "count", "geometry", "has_guides", "id", "index", "name", "refresh", "rows", "snapshot", "spec", "split",
-        "torch",
+        "geometry", "has_guides", "id", "name", "refresh", "row", "rows", "snapshot", "spec", "split", "torch",
     }  # fmt: skip
     assert {name for name in dir(photonfarm.data.Sample) if not name.startswith("_")} == {
         "albedo", "depth", "guides", "key", "modification", "normal", "pass_number", "photons", "point_cloud",
@@ -135,6 +137,22 @@ def test_what_is_held_out_is_what_training_holds_out(scene: Scene) -> None:
     assert all(are_held_out(keys, 0.4))
     with pytest.raises(ValueError, match="held-out"):
         scene.split("test")  # type: ignore[arg-type]
+    for share in (-0.5, 0, 1, 12.5):
+        with pytest.raises(ValueError, match="hold_out"):
+            scene.split("train", hold_out=share)
+
+
+def test_a_sample_is_had_by_its_row_and_never_searched_for(scene: Scene) -> None:
+    train = scene.split("train", hold_out=0.4)
+    (row, *_), (held_out, *_) = train.rows.tolist(), scene.split("held-out", hold_out=0.4).rows
+    assert train.row(row).row == row
+    for missing in (held_out, -1, 10):
+        with pytest.raises(LookupError, match=f"row {missing} .* {len(train)} complete samples"):
+            train.row(missing)
+    with pytest.raises(LookupError, match="0 complete samples"):
+        Scene(scene._store, scene.id, rows=[]).row(3)
+    with pytest.raises(TypeError):
+        train[0] in train  # noqa: B015
 
 
 def test_a_scene_grows_and_a_snapshot_does_not(tmp_path: Path) -> None:

@@ -147,10 +147,10 @@ def visibility(
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         return ahead & inside & sees(spec, modification, view, position)
 
-    position, visible = rebuild(cloud, modification)
+    position, present = rebuild(cloud, modification)
     if photons is None:
-        return Visibility(visible & seen(position), np.zeros(0, np.bool_))
-    return Visibility(visible & seen(position), (photons.bounce >= 0) & seen(photons.position))
+        return Visibility(present & seen(position), np.zeros(0, np.bool_))
+    return Visibility(present & seen(position), (photons.bounce >= 0) & seen(photons.position))
 
 
 def trace(spec: SceneSpec, modification: Modification, seed: int) -> Photons:

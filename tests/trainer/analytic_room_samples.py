@@ -78,7 +78,7 @@ class AnalyticSource:
         return [self.view_key(row) for row in rows]
 
     def cloud_at(self, row: int) -> tuple[F32, NDArray[np.bool_]]:
-        """The cloud of a row's configuration: positions and visibility flags."""
+        """The cloud of a row's configuration: positions, and which points are present."""
         return rebuild(self._base[1], self.modification(row))
 
     def sees(self, row: int, position: F32) -> NDArray[np.bool_]:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.data.sample import Sample
-from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.find import scene_named
@@ -20,7 +19,6 @@ from photonfarm.shared.store.read.find import scene_named
 if TYPE_CHECKING:
     from photonfarm.data.torch_dataset import SceneDataset
 
-HOLD_OUT = 0.125
 Split = Literal["train", "held-out", "all"]
 
 
@@ -41,7 +39,7 @@ def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> 
     return Scene(store, found.scene_id, guides=guides)
 
 
-class Scene(Sequence[Sample]):
+class Scene:
     """The complete samples of one scene, in the order of their rows; `refresh` adds those completed since.
 
     A pickled scene holds only its place in the store and its rows, so that spawned processes read the same samples.
@@ -117,6 +115,18 @@ class Scene(Sequence[Sample]):
     def __iter__(self) -> Iterator[Sample]:
         return (self._sample(int(row)) for row in self._rows)
 
+    __contains__ = None  # samples are not compared, and looking would read all of them; ask `row in scene.rows`
+
+    def row(self, number: int) -> Sample:
+        """The sample in a row of the store, by the number that `photonfarm store find` and other verbs print.
+
+        Raises LookupError if this scene or split has no complete sample there, and CorruptError as indexing does.
+        """
+        if number not in self._rows:
+            there = f", in rows {self._rows[0]} to {self._rows[-1]}" if len(self) else ""
+            raise LookupError(f"row {number} of scene {self.name}: is none of its {len(self)} complete samples{there}")
+        return self._sample(int(number))
+
     def _sample(self, row: int) -> Sample:
         return Sample(self._reader.read(row), self._reader, self._id, self._read_base()[1])
 
@@ -147,13 +157,16 @@ class Scene(Sequence[Sample]):
         """A snapshot of the samples to train on, of those that are held out, or of all.
 
         A share `hold_out` of the configurations (in a static scene, of the views) is held out whole, chosen by a hash
-        of their content: exactly those that `photonfarm train` holds out. Raises ValueError for another split.
+        of their content: exactly those that `photonfarm train --hold-out` of the same share holds out. Raises
+        ValueError for another split, and for a share that is not between 0 and 1.
         """
+        if not 0 < hold_out < 1:
+            raise ValueError(f"hold_out = {hold_out!r}: must lie between 0 and 1")
         if split not in (splits := ("train", "held-out", "all")):
             raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
         if split == "all":
             return self.snapshot()
-        held_out = np.array(are_held_out(self._units(), hold_out), np.bool_)
+        held_out = np.array(rows_held_out(self._reader, self._rows.tolist(), hold_out), np.bool_)
         return self._of(self._rows[held_out if split == "held-out" else ~held_out])
 
     def torch(
@@ -161,17 +174,14 @@ class Scene(Sequence[Sample]):
     ) -> SceneDataset:
         """The samples of a split as a torch dataset of dictionaries; it pickles, so any DataLoader works.
 
-        `fields` are names of images and of `modification` and `view`; None takes all that there are. Raises ValueError
-        for another split, SpecError for another field, and ImportError without torch.
+        Without a split it has all samples of this scene, those to be held out among them: to train, name "train", or
+        take the dataset of a scene that is split already. `fields` are names of images and of `modification` and
+        `view`; None takes all that there are. Raises ValueError as `split` does, SpecError for another field, and
+        ImportError without torch.
         """
         from photonfarm.data.torch_dataset import SceneDataset
 
         return SceneDataset(self.split(split, hold_out=hold_out), fields)
-
-    def _units(self) -> list[Key]:
-        """The keys by which samples are held out."""
-        keys = self._reader.modification_keys if self.spec.groups else self._reader.view_keys
-        return keys(self._rows.tolist())
 
     def _of(self, rows: NDArray[np.int64]) -> Self:
         return type(self)(self._store, self._id, guides=self._guides, rows=rows.tolist())

@@ -136,13 +136,13 @@ def test_pixels_without_a_point_are_filled_from_near_ones_and_others_left() -> N
     filled, ours = made("FilledProjection"), made("light_transport")
     given = inputs()
     points = given.points
-    there = ours.project(torch.ones(2, 256, 1), points.position, points.visible, points.seen, given)[..., 0] > 0
+    there = ours.project(torch.ones(2, 256, 1), points.position, points.present, points.seen, given)[..., 0] > 0
     features = torch.rand(2, 256, 8)
     one, other = (
-        each.project(features, points.position, points.visible, points.seen, given) for each in (filled, ours)
+        each.project(features, points.position, points.present, points.seen, given) for each in (filled, ours)
     )
     assert torch.equal(one[there], other[there])
     assert 0 < there.float().mean() < 0.9
-    constant = filled.project(torch.full((2, 256, 1), 0.7), points.position, points.visible, points.seen, given)
+    constant = filled.project(torch.full((2, 256, 1), 0.7), points.position, points.present, points.seen, given)
     near = torch.nn.functional.max_pool2d(there.float()[:, None], 2 * candidates.REACH + 1, 1, candidates.REACH)[:, 0]
     torch.testing.assert_close(constant[..., 0], 0.7 * near)

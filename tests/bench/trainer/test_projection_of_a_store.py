@@ -67,9 +67,9 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> Read:
     points, photons = [], []
     for row, sample, camera in zip(ROWS, samples, cameras, strict=True):
         corners = triangles(base[0], sample.modification)
-        position, visible = rebuild(base[1], sample.modification)
+        position, present = rebuild(base[1], sample.modification)
         stored = source.read_photons(row)
-        points.append(visible & sees(corners, camera, spec, position))
+        points.append(present & sees(corners, camera, spec, position))
         photons.append((stored.bounce >= 0) & sees(corners, camera, spec, stored.position))
     network = build(SETTINGS, SceneFrame.of(spec, *base, SETTINGS), 0)
     return Read(batch, network, cameras, np.stack(points), np.stack(photons))

@@ -114,11 +114,11 @@ def test_the_rebuilt_cloud_lies_on_the_moved_shapes(room: LoadedScene) -> None:
     modification.present[:3] = (True, False, True)
     room.apply(modification)
     moved = geometry_of(room.scene.shapes(), {})
-    position, visible = rebuild(cloud, modification)
+    position, present = rebuild(cloud, modification)
     a, b, c = (moved.vertices[moved.faces[cloud.face, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)
     with np.errstate(invalid="ignore"):
         off = np.abs(np.sum((position - a) * normal, axis=1)) / np.linalg.norm(normal, axis=1)
     mesh = np.array([shape.is_mesh() for shape in room.scene.shapes()])[moved.face_shape[cloud.face]]
-    assert 0.5 < visible.mean() < 1
-    assert off[visible & mesh].max() < 2e-6
+    assert 0.5 < present.mean() < 1
+    assert off[present & mesh].max() < 2e-6

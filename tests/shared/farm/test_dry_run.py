@@ -14,9 +14,9 @@ from click.testing import CliRunner, Result
 
 from photonfarm.shared.cli.farm_verbs import submit
 from photonfarm.shared.cli.show import bytes_per_sample
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.errors import BackendError, SpecError
 from photonfarm.shared.farm import dry_run
-from photonfarm.shared.farm.dry_run import DryRun, measured_costs, rehearse
+from photonfarm.shared.farm.dry_run import DryRun, costs_by_renderer, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
@@ -226,7 +226,8 @@ def test_nothing_is_measured_where_it_is_not_wanted_or_the_request_is_wrong(
 
 
 def test_a_verb_of_this_machine_that_is_not_there_is_named() -> None:
-    assert isinstance(measured_costs("no-such-spec"), str)
+    with pytest.raises(BackendError, match=r"photonfarm scene cost|not installed"):
+        costs_by_renderer("no-such-spec")
 
 
 # -------------------------------------------------------------------------------------------------------- as printed

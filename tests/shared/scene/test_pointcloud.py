@@ -76,15 +76,15 @@ def base() -> BasePointCloud:
 def test_points_move_with_their_group_and_no_others_do(base: BasePointCloud, dynamic_spec: SceneSpec) -> None:
     for index in range(20):
         modification = sample_modification(dynamic_spec, 0, index)
-        position, visible = rebuild(base, modification)
+        position, present = rebuild(base, modification)
         static = base.group == STATIC
         assert np.array_equal(position[static], base.position[static])
-        assert visible[static].all()
+        assert present[static].all()
         for g in range(4):
             of_group = base.group == g
             moved = position[of_group] - base.position[of_group]
             assert np.abs(moved - modification.translation[g]).max() < 1e-6
-            assert (visible[of_group] == modification.present[g]).all()
+            assert (present[of_group] == modification.present[g]).all()
 
 
 def test_the_number_of_points_is_constant_and_rebuilding_repeats_bit_by_bit(
@@ -98,6 +98,6 @@ def test_the_number_of_points_is_constant_and_rebuilding_repeats_bit_by_bit(
 
 
 def test_a_static_scene_has_its_base_cloud(base: BasePointCloud, static_spec: SceneSpec) -> None:
-    position, visible = rebuild(base, sample_modification(static_spec, 0, 0))
+    position, present = rebuild(base, sample_modification(static_spec, 0, 0))
     assert np.array_equal(position, base.position)
-    assert visible.all()
+    assert present.all()

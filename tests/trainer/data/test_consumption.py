@@ -1,18 +1,24 @@
 """The trainer tells Redis how many samples it has used; whether there is one is none of its trouble."""
 
+import threading
 import time
 from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, consumed_samples, serve
 from photonfarm.shared.store import Store
-from photonfarm.trainer.cli import service
+from photonfarm.trainer import service, train
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.loop import Hooks, train
+from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.loop import Hooks
 
 SCENE_ID = "0123456789abcdef" * 2
 
@@ -58,10 +64,10 @@ def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
 ) -> None:
     counts: list[tuple[int, int]] = []
     settings = tiny(validate_every=100, checkpoint_every=3, max_steps=4)
-    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
+    loop.train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(0, 0), (3, 20), (6, 20), (9, 20), (12, 20)]
     counts.clear()
-    train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
+    loop.train(make_source(20), settings, run, Hooks(on_draws=lambda *told: counts.append(told)))
     assert counts == [(12, 20)]
 
 
@@ -97,6 +103,29 @@ def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(tmp_path: 
     assert any("waiting for a store" in line for line in said)
     assert any("step 0" in line for line in said)
     assert not (tmp_path / "none").exists()
+
+
+def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene, commit, run: Path) -> None:
+    store, said = Path(scene.storage.where), []
+    settings = {"architecture": "cnn", "width": 4, "batch": 2, "hold_out": 0.4, "minimum_samples": 1, "max_steps": 3}
+    with EmbeddedRedis(run.parent / "redis") as server:
+        call = partial(train, store, scene.scene_id, run, redis_url=server.url, log=said.append, **settings)
+        thread = threading.Thread(target=call, daemon=True)
+        thread.start()
+        deadline = time.monotonic() + 60
+        while not (run / service.ALIVE_FILE).exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        service.check(run)
+        scene.plan(Request(modifications=12), shard_rows=6)
+        for job in range(scene.jobs()):
+            commit(scene, job)
+        thread.join(60)
+        assert consumed_samples(connect(server.url), [scene.scene_id]) == {scene.scene_id: 6}
+    assert said[-1] == "ended at step 3: steps"
+    assert (run / "tensorboard").is_dir() == (find_spec("tensorboard") is not None)
+    with pytest.raises(IncompleteError):
+        service.check(run)
 
 
 def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,11 @@ import torch
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.records import ViewBuffers, Visibility
+from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import Figures, Store
 from photonfarm.shared.store.check.check import check_store
-from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.runs import checkpoint
@@ -43,6 +43,16 @@ def test_a_static_scene_is_split_by_views(make_source) -> None:
     assert abs(held - 50) <= 3 * np.sqrt(200 * 3 / 16), "binomial, 3 σ"
 
 
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_batch_names_the_units_by_which_its_samples_are_held_out(make_source, tiny, moving: bool) -> None:
+    source = make_source(6, views=2, moving=moving)
+    with Feed(source, tiny()) as feed:
+        feed.ask([4, 5, 1])
+        units = feed.take().units
+    assert list(units) == (source.modification_keys if moving else source.view_keys)([4, 5, 1])
+    assert are_held_out(units, 0.5) == rows_held_out(source, [4, 5, 1], 0.5)
+
+
 @pytest.mark.parametrize("exposure", [1.0, 3.0])
 def test_a_batch_holds_the_samples_exactly(make_source, tiny, exposure: float) -> None:
     source = make_source(6, exposure=exposure)
@@ -52,12 +62,12 @@ def test_a_batch_holds_the_samples_exactly(make_source, tiny, exposure: float) -
         assert batch.rows == (4, 1)
         for place, row in enumerate(batch.rows):
             sample = source.read(row)
-            position, visible = source.cloud_at(row)
+            position, present = source.cloud_at(row)
             camera = Camera.of(sample.view, source.spec).world_to_camera
             for found, wanted in (
                 (batch.target, sample.radiance * np.float32(source.spec.exposure)),
                 (batch.inputs.points.position, position),
-                (batch.inputs.points.visible, visible),
+                (batch.inputs.points.present, present),
                 (batch.inputs.points.seen, sample.visibility.points),
                 (batch.inputs.world_to_camera, camera.astype(np.float32)),
                 (batch.inputs.depth, sample.buffers.depth),

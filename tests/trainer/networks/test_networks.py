@@ -22,13 +22,13 @@ def layer(seed: int = 0) -> LightTransportLayer:
     return made
 
 
-def as_drawn(made: LightTransportLayer, points: torch.Tensor, visible: torch.Tensor) -> torch.Tensor:
+def as_drawn(made: LightTransportLayer, points: torch.Tensor, present: torch.Tensor) -> torch.Tensor:
     """Figure 1 taken literally: every point carries its features and the maximum, 64 wide, into the next block."""
     x = made.preprocess(points)
     for block in made.blocks:
         hidden = block.hidden(functional.relu(x))
         local = block.shortcut(x) + block.out(functional.relu(hidden))
-        maximum = local.masked_fill(~visible[..., None], -torch.inf).amax(dim=1, keepdim=True)
+        maximum = local.masked_fill(~present[..., None], -torch.inf).amax(dim=1, keepdim=True)
         x = torch.cat([local, maximum.expand_as(local)], dim=2)
     return x
 
@@ -40,28 +40,28 @@ def test_the_image_synthesis_layer_has_the_published_size() -> None:
 def test_the_light_transport_layer_is_the_one_of_figure_1() -> None:
     made = layer().double()
     assert parameters(made) == (9 * 64 + 64) + 2 * (64 * 32 + 32 + 32 * 32 + 32 + 64 * 32)
-    varying, fixed, visible = torch.randn(2, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(2, 50) < 0.7
-    found = made(varying, fixed, visible)
+    varying, fixed, present = torch.randn(2, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(2, 50) < 0.7
+    found = made(varying, fixed, present)
     assert found.shape == (2, 50, 64)
-    torch.testing.assert_close(found, as_drawn(made, torch.cat([varying, fixed.expand(2, -1, -1)], dim=2), visible))
+    torch.testing.assert_close(found, as_drawn(made, torch.cat([varying, fixed.expand(2, -1, -1)], dim=2), present))
 
 
 def test_relative_maxima_are_less_those_of_the_reference() -> None:
     made = layer().double()
-    varying, fixed, visible = torch.randn(3, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(3, 50) < 0.7
-    visible[2] = False
-    reference, all_visible = torch.randn(50, 3).double(), torch.ones(1, 50, dtype=torch.bool)
+    varying, fixed, present = torch.randn(3, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(3, 50) < 0.7
+    present[2] = False
+    reference, all_present = torch.randn(50, 3).double(), torch.ones(1, 50, dtype=torch.bool)
     both = torch.cat([torch.cat([varying, reference[None]]), fixed.expand(4, -1, -1)], dim=2)
     x = made.preprocess(both)
     for block in made.blocks:
         local = block.shortcut(x) + block.out(functional.relu(block.hidden(functional.relu(x))))
-        maximum = masked_max(local, torch.cat([visible, all_visible]))
-        relative = (maximum - maximum[3]) * torch.tensor([1, 1, 0, 1])[:, None]  # zero where no point is visible
+        maximum = masked_max(local, torch.cat([present, all_present]))
+        relative = (maximum - maximum[3]) * torch.tensor([1, 1, 0, 1])[:, None]  # zero where no point is present
         x = torch.cat([local, relative[:, None].expand_as(local)], dim=2)
-    found = made(varying, fixed, visible, reference)
+    found = made(varying, fixed, present, reference)
     torch.testing.assert_close(found, x[:3])
     assert not found[2, :, 32:].any()
-    at_base = made(reference[None], fixed, all_visible, reference)
+    at_base = made(reference[None], fixed, all_present, reference)
     assert not at_base[..., 32:].any()
 
 
@@ -81,22 +81,22 @@ def test_a_residual_block_starts_as_its_shortcut() -> None:
 
 def test_the_order_of_the_points_does_not_matter() -> None:
     made, order = layer(), torch.randperm(50)
-    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
-    shuffled = made(varying[:, order], fixed[order], visible[:, order])
-    torch.testing.assert_close(shuffled, made(varying, fixed, visible)[:, order])
+    varying, fixed, present = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    shuffled = made(varying[:, order], fixed[order], present[:, order])
+    torch.testing.assert_close(shuffled, made(varying, fixed, present)[:, order])
 
 
-def test_invisible_points_never_leak_into_visible_ones() -> None:
+def test_absent_points_never_leak_into_present_ones() -> None:
     made = layer()
-    varying, fixed, visible = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
-    louder = torch.where(visible[..., None], varying, 1e4)  # would win every maximum
-    assert torch.equal(made(louder, fixed, visible)[visible], made(varying, fixed, visible)[visible])
+    varying, fixed, present = torch.randn(2, 50, 3), torch.randn(50, 6), torch.rand(2, 50) < 0.7
+    louder = torch.where(present[..., None], varying, 1e4)  # would win every maximum
+    assert torch.equal(made(louder, fixed, present)[present], made(varying, fixed, present)[present])
 
 
-def test_the_maximum_over_no_visible_point_is_zero() -> None:
+def test_the_maximum_over_no_present_point_is_zero() -> None:
     x = torch.randn(2, 5, 4)
-    visible = torch.tensor([[False] * 5, [True, False, True, False, False]])
-    found = masked_max(x, visible)
+    present = torch.tensor([[False] * 5, [True, False, True, False, False]])
+    found = masked_max(x, present)
     assert torch.equal(found[0], torch.zeros(4))
     assert torch.equal(found[1], torch.maximum(x[1, 0], x[1, 2]))
 
@@ -125,5 +125,5 @@ def test_in_bfloat16_the_image_is_nearly_the_same_and_stays_float32() -> None:
 def test_pointnet_takes_points_of_which_nothing_is_the_same_in_all_samples() -> None:
     """Photons are such points: all of them differ."""
     torch.manual_seed(0)
-    made, points, visible = LightTransportLayer(5, 0), torch.randn(2, 50, 5), torch.rand(2, 50) < 0.7
-    torch.testing.assert_close(made(points, torch.zeros(50, 0), visible), as_drawn(made, points, visible))
+    made, points, present = LightTransportLayer(5, 0), torch.randn(2, 50, 5), torch.rand(2, 50) < 0.7
+    torch.testing.assert_close(made(points, torch.zeros(50, 0), present), as_drawn(made, points, present))

@@ -170,7 +170,7 @@ def test_relative_maxima_are_zero_in_the_base_configuration_and_not_elsewhere(ma
     with torch.no_grad():
         moved = made.point_features(points)[..., 32:]
         points.position.copy_(made.base)
-        points.visible.fill_(True)
+        points.present.fill_(True)
         unmoved = made.point_features(points)[..., 32:]
     assert moved.abs().amax(dim=(1, 2)).min() > 1e-3
     assert unmoved.abs().max() < 1e-6
@@ -195,13 +195,13 @@ def test_the_order_of_points_and_photons_does_not_matter(make_source, architectu
 
 
 @pytest.mark.parametrize("architecture", WITH_POINTS)
-def test_points_that_are_flagged_invisible_change_nothing_wherever_they_are(make_source, architecture: str) -> None:
+def test_points_that_are_flagged_as_absent_change_nothing_wherever_they_are(make_source, architecture: str) -> None:
     source = make_source(2, photons=64)
     made, inputs = network(source, architecture), batch_of(source, (0, 1), architecture).inputs
-    inputs.points.visible[:, ::3] = False
+    inputs.points.present[:, ::3] = False
     inputs.points.seen.fill_(True)
     before = image(made, inputs)
-    hidden = ~inputs.points.visible[..., None]
+    hidden = ~inputs.points.present[..., None]
     inputs.points.position.copy_(torch.where(hidden, 1e4, inputs.points.position))  # would win every maximum
     if inputs.photons is not None:
         empty = ~inputs.photons.present[..., None]
@@ -209,8 +209,8 @@ def test_points_that_are_flagged_invisible_change_nothing_wherever_they_are(make
             x.copy_(torch.where(empty, 1e4, x))
     assert torch.equal(image(made, inputs), before)
     inputs.points.position.copy_(torch.from_numpy(source.base()[1].position))
-    inputs.points.visible.fill_(True)
-    assert not torch.equal(image(made, inputs), before), "they would be seen, were they visible"
+    inputs.points.present.fill_(True)
+    assert not torch.equal(image(made, inputs), before), "they would be seen, were they present"
 
 
 @pytest.mark.parametrize("architecture", WITH_POINTS)
@@ -219,7 +219,7 @@ def test_a_point_that_is_not_seen_is_in_no_pixel_of_what_is_projected(make_sourc
     source = make_source(2, photons=64)
     made, inputs = network(source, architecture), batch_of(source, (0, 1), architecture).inputs
     plain, project = made.further(inputs), made.project
-    hidden = [inputs.points.visible & ~inputs.points.seen]
+    hidden = [inputs.points.present & ~inputs.points.seen]
     if inputs.photons is not None:
         hidden.append(inputs.photons.present & ~inputs.photons.seen)
     assert all(flags.sum() > 10 for flags in hidden)
@@ -258,10 +258,10 @@ def test_what_is_seen_decides_what_is_projected_and_depth_does_not(make_source, 
 
 
 @pytest.mark.parametrize("architecture", WITH_POINTS)
-def test_without_any_visible_point_there_is_an_image_and_a_gradient(make_source, architecture: str) -> None:
+def test_without_any_present_point_there_is_an_image_and_a_gradient(make_source, architecture: str) -> None:
     source = make_source(2, photons=64)
     made, inputs = network(source, architecture), batch_of(source, (0, 1), architecture).inputs
-    inputs.points.visible.fill_(False)
+    inputs.points.present.fill_(False)
     if inputs.photons is not None:
         inputs.photons.present.fill_(False)
     made(inputs).square().sum().backward()
@@ -278,8 +278,8 @@ def test_a_moved_point_takes_its_descriptor_along(make_source) -> None:
     """One point alone, before one camera: its descriptor is in the pixel where it is, and nowhere else."""
     source = make_source(1)
     made, inputs = network(source, "feature_projection"), batch_of(source, (0,), "feature_projection").inputs
-    inputs.points.visible.fill_(False)
-    inputs.points.visible[0, 7] = inputs.points.seen[0, 7] = True
+    inputs.points.present.fill_(False)
+    inputs.points.present[0, 7] = inputs.points.seen[0, 7] = True
     for column in (3, 12):
         to_camera = inputs.world_to_camera[0].double()
         x = (column + 0.5 - 8) / made.optics.focal_px

@@ -46,8 +46,8 @@ def is_behind(at: np.ndarray, surface: float, rule: str, ray: np.ndarray, normal
 
 def keeps(p: int, u: int, v: int, sample: Sequence[np.ndarray], occlusion: str) -> bool:
     """Return whether a point of a sample is kept that lands in a pixel."""
-    position, visible, seen, camera, depth, normal = sample
-    if not visible[p]:
+    position, present, seen, camera, depth, normal = sample
+    if not present[p]:
         return False
     if occlusion == "exact":
         return bool(seen[p])
@@ -78,11 +78,11 @@ def random_scene(seed: int, batch: int = 3, points: int = 900) -> tuple[torch.Te
     generator = torch.Generator().manual_seed(seed)
     draw = {"generator": generator, "dtype": torch.float64}
     position, features = 4 * torch.randn(batch, points, 3, **draw), torch.randn(batch, points, 5, **draw)
-    visible, seen = (torch.rand(batch, points, generator=generator) < share for share in (0.8, 0.6))
+    present, seen = (torch.rand(batch, points, generator=generator) < share for share in (0.8, 0.6))
     depth = 8 * torch.rand(batch, H, W, **draw)
     depth[depth < 2] = 0  # nothing hit there
     normal = torch.nn.functional.normalize(torch.randn(batch, H, W, 3, **draw), dim=-1)
-    return features, (position, visible, seen, cameras(batch, seed), depth, normal)
+    return features, (position, present, seen, cameras(batch, seed), depth, normal)
 
 
 @pytest.mark.parametrize("occlusion", get_args(Occlusion))
@@ -97,12 +97,12 @@ def test_a_batch_projects_as_the_oracle_does_pixel_by_pixel(occlusion: str) -> N
 
 
 def test_exact_looks_at_no_depth_and_the_other_rules_at_nothing_that_is_seen() -> None:
-    _, (position, visible, seen, camera, depth, normal) = random_scene(1)
+    _, (position, present, seen, camera, depth, normal) = random_scene(1)
     wall = torch.full_like(depth, 1e-3)
     for rule in get_args(Occlusion):
-        plain = footprint(position, visible, seen, camera, depth, normal, optics(rule)).point
-        walled = footprint(position, visible, seen, camera, wall, normal, optics(rule)).point
-        unseen = footprint(position, visible, ~seen, camera, depth, normal, optics(rule)).point
+        plain = footprint(position, present, seen, camera, depth, normal, optics(rule)).point
+        walled = footprint(position, present, seen, camera, wall, normal, optics(rule)).point
+        unseen = footprint(position, present, ~seen, camera, depth, normal, optics(rule)).point
         assert torch.equal(walled, plain) is (rule == "exact")
         assert torch.equal(unseen, plain) is (rule != "exact")
         assert not set(unseen.tolist()) & set(plain.tolist()) or rule != "exact"
@@ -148,9 +148,9 @@ def test_points_that_share_a_pixel_share_its_gradient() -> None:
 
 
 def test_gradients_flow_through_light_transport_and_projection_to_weights_and_positions() -> None:
-    """Points are several to a pixel, some of them invisible or hidden, which gradcheck compares by differences."""
+    """Points are several to a pixel, some of them absent or hidden, which gradcheck compares by differences."""
     _, scene = random_scene(4, batch=2, points=400)
-    position, visible = scene[:2]
+    position, present = scene[:2]
     kept = footprint(*scene, optics())
     assert torch.bincount(kept.pixel).max() > 1
     torch.manual_seed(0)
@@ -162,17 +162,17 @@ def test_gradients_flow_through_light_transport_and_projection_to_weights_and_po
 
     def image(varying: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
         named = dict(zip(names, weights, strict=True))
-        features = torch.func.functional_call(layer, named, (varying, fixed, visible))
+        features = torch.func.functional_call(layer, named, (varying, fixed, present))
         return project_mean(features, kept, H, W)
 
     assert torch.autograd.gradcheck(image, (varying, *chosen), fast_mode=True)
 
 
 def test_the_order_of_the_points_does_not_matter_to_the_image() -> None:
-    features, (position, visible, seen, *view) = random_scene(5)
+    features, (position, present, seen, *view) = random_scene(5)
     order = torch.randperm(900, generator=torch.Generator().manual_seed(0))
-    plain = footprint(position, visible, seen, *view, optics())
-    shuffled = footprint(position[:, order], visible[:, order], seen[:, order], *view, optics())
+    plain = footprint(position, present, seen, *view, optics())
+    shuffled = footprint(position[:, order], present[:, order], seen[:, order], *view, optics())
     images = [project_mean(*told, H, W) for told in ((features, plain), (features[:, order], shuffled))]
     torch.testing.assert_close(images[1], images[0])
 
@@ -198,10 +198,10 @@ def test_the_points_kept_are_those_that_an_exact_ray_query_sees(make_source, occ
     right = seen = kept = 0
     for row in range(40):
         sample = source.read(row)
-        position, visible = source.cloud_at(row)
+        position, present = source.cloud_at(row)
         camera = Camera.of(sample.view, source.spec).world_to_camera.astype(np.float32)
         buffers = sample.buffers.depth, sample.buffers.normal
-        scene = position, visible, sample.visibility.points, camera, *buffers
+        scene = position, present, sample.visibility.points, camera, *buffers
         batch = [torch.from_numpy(x)[None] for x in scene]
         found = footprint(*batch, Optics.of(source.spec, occlusion)).point.numpy()
         batch[2].fill_(True)
@@ -262,7 +262,7 @@ def test_a_network_projects_by_the_rule_that_is_set(make_source, occlusion: str)
     (found,) = network.further(inputs)
     points = inputs.points
     view = inputs.world_to_camera, inputs.depth, inputs.normal
-    kept = footprint(points.position, points.visible, points.seen, *view, Optics.of(source.spec, occlusion))
+    kept = footprint(points.position, points.present, points.seen, *view, Optics.of(source.spec, occlusion))
     wanted = project_mean(network.descriptor.expand(1, -1, -1), kept, 64, 64)
     torch.testing.assert_close(found, wanted)
 

@@ -15,13 +15,13 @@ from PIL import Image
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.core.pictures import display
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.camera_path import orbit
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.trainer.data.dataset import rows_held_out
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict import animation, infer
 from photonfarm.trainer.predict.trained import TrainedRun

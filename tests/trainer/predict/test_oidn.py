@@ -1,4 +1,4 @@
-"""The untrained denoiser, as a predictor beside the trained ones."""
+"""The ready denoiser, as a predictor beside the trained ones."""
 
 import os
 import subprocess

@@ -15,6 +15,7 @@ from PIL import Image
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.pictures import display
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore
 from photonfarm.shared.store.read.merge import MergedView, merge_view
@@ -22,7 +23,7 @@ from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.evaluation_table import evaluation_text, notes
-from photonfarm.trainer.data.dataset import kept_count, kept_pixels, rows_held_out
+from photonfarm.trainer.data.dataset import kept_count, kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import find_weights, metric_space, mse

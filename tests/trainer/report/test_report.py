@@ -20,17 +20,18 @@ from matplotlib.figure import Figure
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import Store, store_status
 from photonfarm.shared.store.read.find import Query
 from photonfarm.shared.store.read.merge import MergedView, merge_views
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into, rows_held_out
+from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
+from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.dataset_card import DatasetCard
@@ -363,7 +364,7 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
     assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
     assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
     settings = TrainedRun.load(transport).settings
-    assert frame_time(UntrainedPredictor("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
+    assert frame_time(ReadyPredictor("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.cli import service
+from photonfarm.trainer import service
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, settings_of, small
 from photonfarm.trainer.training.losses import paired_loss
 

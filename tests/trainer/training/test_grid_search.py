@@ -13,10 +13,9 @@ import torch
 
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
-from photonfarm.trainer import grid_search
-from photonfarm.trainer.cli import service
-from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer import grid_search, service
 from photonfarm.trainer.grid_search import Cell, run_grid, table
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint

@@ -12,9 +12,10 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.scene.spec import load_spec
-from photonfarm.trainer.cli import service, show
-from photonfarm.trainer.data.dataset import rows_held_out
+from photonfarm.trainer import service
+from photonfarm.trainer.cli import show
 from photonfarm.trainer.data.growth import Growth
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.device import described, usable_device

@@ -8,6 +8,7 @@ In Python::
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,23 +18,36 @@ if TYPE_CHECKING:
 __all__ = ["train"]
 
 
-def train(store: str | Path, scene: str, run: str | Path, *, preset: str = "small", **settings: Any) -> TrainedRun:
-    """Train on a scene's samples, or continue a run; returns the run with its last weights.
+def train(
+    store: str | Path,
+    scene: str,
+    run: str | Path,
+    *,
+    preset: str = "small",
+    redis_url: str | None = None,
+    log: Callable[[str], object] = print,
+    **settings: Any,
+) -> TrainedRun:
+    """Train on a scene's samples, or continue a run, as `photonfarm train` does; returns the run with its last weights.
 
     `store` is a folder or the URL of a bucket, and `scene` a scene's name, its id, or the beginning of its id. The
     settings are a preset's with changes by key, such as `max_steps`, `architecture` or `width`; `photonfarm train
     --help` lists them. The folder `run` is that of `photonfarm train --run`: either goes on with what the other began.
+    While it trains, `photonfarm train --check` finds the run alive, and TensorBoard, if it is installed, its curves.
 
-    Raises SpecError for settings that cannot be, StoreError for a store that cannot be read and a folder that cannot be
-    written, and DivergedError if training diverges.
+    Training waits for samples that workers are still to render, also for the first ones; `log` is told of that, and
+    `max_seconds` limits it. With `redis_url`, the queue's Redis, workers learn how many samples are used; without it,
+    those of `photonfarm work --ahead` wait for a trainer once they are so many samples ahead. An interrupt (Ctrl-C, or
+    a notebook's stop button) ends training with a checkpoint, and the same call goes on.
+
+    Raises SpecError for settings that cannot be and a new run that ended before anything was rendered, StoreError for a
+    store that cannot be read and a folder that cannot be written, and DivergedError if training diverges.
     """
     from photonfarm.shared.store import Store  # torch is slow to load, and settings are read without it
     from photonfarm.shared.store.read.find import scene_named
-    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.trainer import service
     from photonfarm.trainer.predict.trained import TrainedRun
-    from photonfarm.trainer.runs.settings import settings_of
-    from photonfarm.trainer.training import loop
 
-    source = StoreSource(store, scene_named(Store(store), scene))
-    loop.train(source, settings_of(preset, settings), Path(run))
+    scene_id = scene_named(Store(store), scene)
+    service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)
     return TrainedRun.load(Path(run))

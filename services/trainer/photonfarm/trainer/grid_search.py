@@ -24,9 +24,10 @@ from photonfarm.shared.core.estimate import Estimate, group_means, stated
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import Key, make_key
 from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.compare.markdown import markdown_table
-from photonfarm.trainer.data.dataset import SampleSource, rows_held_out, units_of
+from photonfarm.trainer.data.dataset import SampleSource
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun

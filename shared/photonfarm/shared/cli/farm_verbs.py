@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from photonfarm.shared.cli.options import json_option, redis_option, request_options, store_option
+from photonfarm.shared.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
     from photonfarm.shared.plan.request import Request
@@ -154,7 +155,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
 @click.option(
     "--hold-out",
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    default=0.125,
+    default=HOLD_OUT,
     show_default=True,
     help="Share of the configurations never trained on; a small plan needs a large one.",
 )

@@ -175,10 +175,8 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
     """The command lines that read a sample, and those that render what is missing of it."""
     listed = {}
     if sample.complete:
-        program = (
-            "from photonfarm.shared.store import SceneReader; "
-            f"r = SceneReader({str(store)!r}, {sample.scene_id!r}); r.refresh(); print(r.read({sample.row}))"
-        )
+        scene = f"open_scene({str(store)!r}, {sample.scene_id!r}, guides={bool(sample.guided)})"
+        program = f"from photonfarm.data import open_scene; print({scene}.row({sample.row}).radiance)"
         listed["look at it"] = shlex.join(["python", "-c", program])
     lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
     if sample.guided is False:

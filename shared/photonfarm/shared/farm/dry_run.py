@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonfarm.shared.core.commands import command, is_installed
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import BackendError, StoreError
 from photonfarm.shared.core.processes import usable_cores
 from photonfarm.shared.farm.submission import Submission
 from photonfarm.shared.plan.allocation import Allocation, CostModel
@@ -63,10 +63,13 @@ def rehearse(
     `log` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
     found = _counted(named.spec, request, store, shard_rows)
-    costs = measured_costs(named.name) if measure and found.planned else None
-    if isinstance(costs, str):
-        log(f"cost and time are not known: {costs}")
-    return _priced(found, named.spec, request, costs) if isinstance(costs, SampleCosts) else found
+    if not (measure and found.planned):
+        return found
+    try:
+        return _priced(found, named.spec, request, costs_by_renderer(named.name))
+    except BackendError as error:
+        log(f"cost and time are not known: {error}")
+        return found
 
 
 def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
@@ -81,21 +84,21 @@ def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: 
     return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
 
 
-def measured_costs(spec: str) -> SampleCosts | str:
-    """The costs that the renderer measures for a spec, or has kept; else the reason why there are none.
+def costs_by_renderer(spec: str) -> SampleCosts:
+    """The costs that the renderer measures for a spec, or has kept. Raises BackendError with the reason for none.
 
     The renderer's own messages go to stderr.
     """
     name = " ".join(VERB)
     if not is_installed(".".join(VERB)):
-        return "the renderer, which measures them, is not installed here"
+        raise BackendError("the renderer, which measures them, is not installed here")
     done = subprocess.run(command(*VERB, "--json", "--", spec), stdout=subprocess.PIPE, check=False)
     if done.returncode:
-        return f"`photonfarm {name}` ended with exit code {done.returncode} here"
+        raise BackendError(f"`photonfarm {name}` ended with exit code {done.returncode} here")
     try:
         return SampleCosts.read(done.stdout)
     except StoreError as error:
-        return f"`photonfarm {name}` said {error}"
+        raise BackendError(f"`photonfarm {name}` said {error}") from error
 
 
 def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:

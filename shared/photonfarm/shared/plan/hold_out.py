@@ -3,8 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
-from photonfarm.shared.core.keys import Key, encoded, key_of
+if TYPE_CHECKING:
+    from photonfarm.shared.core.keys import Key
+    from photonfarm.shared.scene.spec import SceneSpec
+
+HOLD_OUT = 0.125
+"""The share that is held out unless another one is named, by `photonfarm up` and by the trainer's preset `small`."""
+
+Rows = TypeVar("Rows", contravariant=True)
+
+
+class Keyed(Protocol[Rows]):
+    """Anything with samples or views in rows, of which it knows the content keys."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    def modification_keys(self, rows: Rows) -> list[Key]:
+        """The content key of each row's configuration."""
+
+    def view_keys(self, rows: Rows) -> list[Key]:
+        """The content key of each row's configuration and view."""
+
+
+def units_of(source: Keyed[Rows], rows: Rows) -> list[Key]:
+    """The unit by which each row is held out: the key of its configuration or, in a static scene, of its view."""
+    return source.modification_keys(rows) if source.spec.groups else source.view_keys(rows)
+
+
+def rows_held_out(source: Keyed[Rows], rows: Rows, share: float) -> list[bool]:
+    """Whether each row is held out of training, by its content and not by its time of arrival.
+
+    All views and passes of a configuration are on one side. A static scene has one configuration; there the view
+    decides, and all passes of a view are on one side.
+    """
+    return are_held_out(units_of(source, rows), share)
 
 
 def are_held_out(units: Iterable[Key], share: float) -> list[bool]:
@@ -12,5 +48,7 @@ def are_held_out(units: Iterable[Key], share: float) -> list[bool]:
 
     They are if the first 8 bytes of the content key ("hold out", unit) are below the share.
     """
+    from photonfarm.shared.core.keys import encoded, key_of  # numpy is slow to load, and the constant needs none
+
     begin, limit = encoded("hold out"), share * 2.0**64
     return [int.from_bytes(key_of(begin + encoded(unit))[:8], "little") < limit for unit in units]

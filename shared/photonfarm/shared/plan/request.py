@@ -146,6 +146,15 @@ class PlannedContent:
             found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
         return found
 
+    def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
+        """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
+        of_row = np.searchsorted([first_row for first_row, _ in self.plans], rows, side="right") - 1
+        vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
+        for number, (first_row, inputs) in enumerate(self.plans):
+            own = of_row == number
+            vectors[own] = getattr(inputs, kind)[rows[own] - first_row]
+        return vectors
+
 
 def _add(found: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
     for key, row in zip(keys, rows.tolist(), strict=True):

@@ -20,22 +20,18 @@ from pydantic import Field, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key
-from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.plan.request import (
     MAX_SAMPLES,
     UNUSED,
     Expansion,
     PlannedContent,
-    PlannedRows,
     Request,
     SamplesToPlan,
     pack,
 )
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
-
-HELD_OUT = 0.125
-"""The share that `held-out` means without a number: the default of `photonfarm up` and `photonfarm train`."""
 
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -82,28 +78,28 @@ def expand_top_up(
 
     Raises SpecError if nothing is planned or selected, or if it is too much for one request.
     """
-    planned = _Planned.of(known)
-    views = np.flatnonzero(_selected(spec, request.where, planned))
+    planned = PlannedViews.of(spec, known)
+    views = np.flatnonzero(_selected(planned, request.where))
     views = views[np.lexsort((planned.view_row[views], planned.modification_row[views]))]
     wanted = request.passes(spec)
     have = np.zeros_like(views) if request.adds else np.minimum(planned.passes[views], wanted)
     count = wanted - have
     if count.sum() > MAX_SAMPLES:
         raise SpecError(f"the request names {count.sum()} new samples; at most {MAX_SAMPLES} fit one request")
-    candidates = _candidates(spec, planned, views, count)
+    candidates = _candidates(planned, views, count)
     rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
     return Expansion(rows, int(count.sum()), int(have.sum()))
 
 
-def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) -> SamplesToPlan:
+def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPlan:
     """The next `count` passes of each of some views."""
     modification_row, of_view = np.unique(planned.modification_row[views], return_inverse=True)
-    modification = planned.vectors("modification", modification_row)
-    view = planned.vectors("view", planned.view_row[views])
+    modification = planned.known.vectors("modification", modification_row)
+    view = planned.known.vectors("view", planned.view_row[views])
     of_sample = np.repeat(np.arange(len(views)), count)
     number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
-    keys = sample_keys(spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
+    keys = sample_keys(planned.spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
     return SamplesToPlan(
         modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
@@ -111,10 +107,11 @@ def _candidates(spec: SceneSpec, planned: _Planned, views: Rows, count: Rows) ->
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Planned:
+class PlannedViews:
     """The views of a scene in the order of their rows, and the samples that show them."""
 
-    plans: list[tuple[int, PlannedRows]]  # each with the number of its first row
+    spec: SceneSpec
+    known: PlannedContent
     sample_row: Rows  # (S,)
     sample_view: Rows  # (S,) row of the view
     view_row: Rows  # (V,)
@@ -123,7 +120,7 @@ class _Planned:
     next_pass: Rows  # (V,)
 
     @classmethod
-    def of(cls, known: PlannedContent) -> _Planned:
+    def of(cls, spec: SceneSpec, known: PlannedContent) -> PlannedViews:
         """Count the passes of every view; raises SpecError if there is none."""
         if not known.plans:
             raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")
@@ -137,60 +134,60 @@ class _Planned:
         next_pass = np.zeros(len(view_row), np.int64)
         np.maximum.at(next_pass, of_sample, pass_[used] + 1)
         passes = np.bincount(of_sample, minlength=len(view_row))
-        return cls(known.plans, row[used], view[used], view_row, modification[used][first], passes, next_pass)
+        return cls(spec, known, row[used], view[used], view_row, modification[used][first], passes, next_pass)
 
-    def vectors(self, kind: Literal["modification", "view"], rows: Rows) -> NDArray[np.float32]:
-        """The vectors in some rows of modifications (G, 4) or views (6,)."""
-        of_row = np.searchsorted([first for first, _ in self.plans], rows, side="right") - 1
-        vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
-        for number, (first, inputs) in enumerate(self.plans):
-            own = of_row == number
-            vectors[own] = getattr(inputs, kind)[rows[own] - first]
-        return vectors
+    def modification_keys(self, views: Rows | Mask) -> list[Key]:
+        """The content key of the configuration of each of some views, by their places here."""
+        rows, of_view = np.unique(self.modification_row[views], return_inverse=True)
+        keys = modification_keys(self.spec, self.known.vectors("modification", rows))
+        return [keys[m] for m in of_view.tolist()]
+
+    def view_keys(self, views: Rows | Mask) -> list[Key]:
+        """The content key of each of some views, by their places here."""
+        return view_keys(self.modification_keys(views), self.known.vectors("view", self.view_row[views]))
 
 
 # ---------------------------------------------------------------------------------------------------------- conditions
 
 
-def _selected(spec: SceneSpec, where: Sequence[str], planned: _Planned) -> Mask:
+def _selected(planned: PlannedViews, where: Sequence[str]) -> Mask:
     """Which of the views meet every condition; `views=first:N` counts those that meet all the others."""
     selected = np.ones(len(planned.view_row), np.bool_)
     parsed = [_parsed(condition) for condition in where]
     for find, value in sorted(parsed, key=lambda condition: condition[0] is _first):  # that one last
-        selected &= find(spec, planned, value, selected)
+        selected &= find(planned, value, selected)
     if not selected.any():
         raise SpecError(f"where {' and '.join(where)}: selects none of the {len(selected)} planned views")
     return selected
 
 
-def _first(spec: SceneSpec, planned: _Planned, count: int, selected: Mask) -> Mask:  # noqa: ARG001
+def _first(planned: PlannedViews, count: int, selected: Mask) -> Mask:  # noqa: ARG001
     return np.cumsum(selected) <= count
 
 
-def _of_plan(spec: SceneSpec, planned: _Planned, number: int, selected: Mask) -> Mask:  # noqa: ARG001
-    if number >= len(planned.plans):
-        raise SpecError(f"where plan={number}: the scene has {len(planned.plans)} plans, numbered from 0")
-    first, rows = planned.plans[number]
+def _of_plan(planned: PlannedViews, number: int, selected: Mask) -> Mask:  # noqa: ARG001
+    if number >= len(planned.known.plans):
+        raise SpecError(f"where plan={number}: the scene has {len(planned.known.plans)} plans, numbered from 0")
+    first, rows = planned.known.plans[number]
     return np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
 
 
-def _of_rows(spec: SceneSpec, planned: _Planned, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
+def _of_rows(planned: PlannedViews, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
     shown = planned.sample_view[(planned.sample_row >= ends[0]) & (planned.sample_row <= ends[1])]
     return np.isin(planned.view_row, shown)
 
 
-def _with_modification(spec: SceneSpec, planned: _Planned, begin: str, selected: Mask) -> Mask:
-    keys = _modification_keys(spec, planned, selected)
+def _with_modification(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+    keys = planned.modification_keys(selected)
     return _where(selected, [key.hex().startswith(begin) for key in keys])
 
 
-def _with_view(spec: SceneSpec, planned: _Planned, begin: str, selected: Mask) -> Mask:
-    return _where(selected, [key.hex().startswith(begin) for key in _view_keys(spec, planned, selected)])
+def _with_view(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+    return _where(selected, [key.hex().startswith(begin) for key in planned.view_keys(selected)])
 
 
-def _held_out(spec: SceneSpec, planned: _Planned, share: float, selected: Mask) -> Mask:
-    units = (_modification_keys if spec.groups else _view_keys)(spec, planned, selected)
-    return _where(selected, are_held_out(units, share))
+def _held_out(planned: PlannedViews, share: float, selected: Mask) -> Mask:
+    return _where(selected, rows_held_out(planned, selected, share))
 
 
 def _where(selected: Mask, found: list[bool]) -> Mask:
@@ -199,18 +196,7 @@ def _where(selected: Mask, found: list[bool]) -> Mask:
     return mask
 
 
-def _modification_keys(spec: SceneSpec, planned: _Planned, selected: Mask) -> list[Key]:
-    rows, of_view = np.unique(planned.modification_row[selected], return_inverse=True)
-    keys = modification_keys(spec, planned.vectors("modification", rows))
-    return [keys[m] for m in of_view.tolist()]
-
-
-def _view_keys(spec: SceneSpec, planned: _Planned, selected: Mask) -> list[Key]:
-    views = planned.vectors("view", planned.view_row[selected])
-    return view_keys(_modification_keys(spec, planned, selected), views)
-
-
-Condition = tuple[Callable[[SceneSpec, _Planned, Any, Mask], Mask], Any]
+Condition = tuple[Callable[[PlannedViews, Any, Mask], Mask], Any]
 
 
 def _parsed(condition: str) -> Condition:
@@ -232,7 +218,7 @@ def _parsed(condition: str) -> Condition:
                 "hexadecimal digits, a to f in lower case"
             )
         case ["held-out"]:
-            return _held_out, HELD_OUT
+            return _held_out, HOLD_OUT
         case ["held-out", value] if re.fullmatch(r"0?\.\d{1,9}", value):
             return _held_out, float(value)
     raise SpecError(

@@ -46,10 +46,10 @@ def _barycentric(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rebuild(base: BasePointCloud, modification: Modification) -> tuple[F32, NDArray[np.bool_]]:
-    """The point positions (P, 3) and visibility flags (P,) of one configuration [supplement 1.1, 2.1].
+    """The position (P, 3) of each point in one configuration, and whether it is present (P,) [supplement 1.1, 2.1].
 
-    Points of a moved group move by its translation, in float32; points of a removed group stay and are flagged
-    invisible, so that P is constant.
+    Points of a moved group move by its translation, in float32; points of a removed group stay where they are and are
+    not present, so that P is constant.
     """
     moves = base.group != STATIC
     group = np.where(moves, base.group, 0)

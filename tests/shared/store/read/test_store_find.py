@@ -1,6 +1,9 @@
 """`photonfarm store find` finds samples by what they are, and says where they lie."""
 
 import json
+import shlex
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -153,7 +156,8 @@ def test_guides_are_listed_where_the_scene_is_to_have_some(store: Store, scene: 
     assert samples.commit_guides(scene, 0)
     found = {s.row: s for s in find(store).samples}
     assert (found[12].guided, found[4].guided) == (True, False)  # views of jobs 0 and 1
-    reader = SceneReader(store.root, scene.scene_id, guides=True)
+    reader = SceneReader(store.root, scene.scene_id)
+    reader.follow_guides()
     reader.refresh()
     known = reader.read(12).guides
     places = {place.array: place for place in found[12].places[len(before.places) :]}
@@ -236,7 +240,11 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
     assert printed["samples"][0]["complete"]
-    assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
+    scene.write_base(*samples.base())
+    words = shlex.split(printed["samples"][0]["commands"]["look at it"])[1:]
+    looked = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert looked.returncode == 0, looked.stderr
+    assert looked.stdout.startswith("[[[[")
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
     scene.guides.want(GuideSpec())
     assert "guides        of job 2: missing" in run("--row", "8").stdout

@@ -10,7 +10,7 @@ import numpy as np
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import F32, Photons
+from photonfarm.shared.core.records import Photons
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store.read.reader import SceneReader, StoredSample
@@ -68,22 +68,10 @@ def photon_picture(sample: StoredSample, photons: Photons | None, spec: SceneSpe
     """The photons that this view sees, each as a dot of its colour on the dimmed albedo; (H, W, 3)."""
     canvas = 0.15 * sample.buffers.albedo
     if photons is not None:
-        u, v, power = _visible(sample, photons, spec)
+        seen, camera = sample.visibility.photons, Camera.of(sample.view, spec)
+        offset, power = photons.position[seen] - camera.origin, photons.power[seen]
+        scale = camera.focal_px / (offset @ camera.forward)
+        u = np.floor(scale * (offset @ camera.right) + camera.width / 2).clip(0, camera.width - 1).astype(int)
+        v = np.floor(scale * (offset @ camera.down) + camera.height / 2).clip(0, camera.height - 1).astype(int)
         canvas[v, u] = power / np.maximum(power.max(axis=1, keepdims=True), 1e-30)
     return pictures.of_albedo(canvas)
-
-
-def _visible(sample: StoredSample, photons: Photons, spec: SceneSpec) -> tuple[np.ndarray, np.ndarray, F32]:
-    """Pixel columns, rows and powers of the photons that lie on what the view's depth buffer shows."""
-    camera = Camera.of(sample.view, spec)
-    alive = photons.bounce >= 0
-    local = photons.position[alive] @ camera.world_to_camera[:, :3].T + camera.world_to_camera[:, 3]
-    x, y, z = local.T
-    front = z > spec.view.near
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.floor(camera.focal_px * x / z + camera.width / 2)
-        v = np.floor(camera.focal_px * y / z + camera.height / 2)
-    inside = front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    u, v, z, power = u[inside].astype(int), v[inside].astype(int), z[inside], photons.power[alive][inside]
-    seen = np.abs(sample.buffers.depth[v, u] - z) < 0.02 * z
-    return u[seen], v[seen], power[seen]

@@ -13,7 +13,7 @@ import click
 
 from photonfarm.shared.cli.options import json_option, store_option
 from photonfarm.trainer.cli.train_verb import run_option
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
 class RepeatableOption(click.Option):
@@ -39,8 +39,8 @@ references_option = click.option(
     help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
 )  # fmt: skip
 denoisers_option = click.option(
-    "--denoiser", "denoisers", type=click.Choice(get_args(UntrainedDenoiser)), cls=RepeatableOption, multiple=True,
-    help="Measure one that is not trained too, or several. none: dropped pixels stay black.",
+    "--denoiser", "denoisers", type=click.Choice(get_args(ReadyDenoiser)), cls=RepeatableOption, multiple=True,
+    help="Measure a ready one too, or several. none: dropped pixels stay black.",
 )  # fmt: skip
 kept_option = click.option(
     "--kept", type=click.IntRange(1), cls=RepeatableOption, multiple=True, metavar="K",
@@ -68,7 +68,7 @@ def measuring(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _how(
-    denoisers: tuple[UntrainedDenoiser, ...],
+    denoisers: tuple[ReadyDenoiser, ...],
     kept: tuple[int, ...],
     references: Path | None,
     inception: Path | None,
@@ -76,7 +76,7 @@ def _how(
 ) -> dict[str, Any]:
     """The arguments of `compare`: every denoiser with every share of the pixels. Raises UsageError."""
     if kept and not denoisers:
-        raise click.UsageError("--kept applies only to untrained denoisers; name one with --denoiser")
+        raise click.UsageError("--kept applies only to ready denoisers; name one with --denoiser")
     if inception and references is None:
         raise click.UsageError(
             "--inception is used only to compare with references; give their folder with --references"

@@ -122,7 +122,8 @@ def train(
     each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
     see the same run folder. Exits with 8 if training diverges.
     """
-    from photonfarm.trainer.cli import service, show
+    from photonfarm.trainer import service
+    from photonfarm.trainer.cli import show
 
     instead = [name for name, asked in (("--grid", grid), ("--summary", summary), ("--check", check)) if asked]
     if len(instead) > 1:

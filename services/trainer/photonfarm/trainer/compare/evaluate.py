@@ -45,10 +45,10 @@ from photonfarm.trainer.predict.evaluation import (
     by_turns,
     measure,
 )
+from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.runs.device import described, usable_device
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 EVALUATION = "evaluation.json"
 
@@ -149,7 +149,7 @@ class Evaluation:
 def compare(
     store: str | Path,
     runs: Sequence[TrainedRun],
-    denoisers: Sequence[tuple[UntrainedDenoiser, int]] = (),
+    denoisers: Sequence[tuple[ReadyDenoiser, int]] = (),
     *,
     references: Path | None = None,
     inception: Path | None = None,
@@ -178,8 +178,8 @@ def compare(
     shown = samples.to_show(found)
     network = load_inception(inception, str(place)) if found and not without_inception else None
     test = _Test(store, samples, found, shown, network, str(place), on_progress or (lambda *_: None))
-    untrained = [UntrainedPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
-    leading, *others = test.timed([*runs, *untrained])
+    ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    leading, *others = test.timed([*runs, *ready])
     first_of_all = test.measured(leading)
     if choose:
         shown += [row for row in dict.fromkeys(choose(first_of_all.images, found)) if row not in shown]
@@ -245,7 +245,7 @@ class _Watched:
 class _Timed:
     """A loaded predictor, and the time it takes for one image."""
 
-    predictor: TrainedRun | UntrainedPredictor
+    predictor: TrainedRun | ReadyPredictor
     predict: DevicePredictor
     seconds: Seconds
 
@@ -279,13 +279,13 @@ class _Test:
     on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def timed(self, predictors: Sequence[TrainedRun | UntrainedPredictor]) -> list[_Timed]:
+    def timed(self, predictors: Sequence[TrainedRun | ReadyPredictor]) -> list[_Timed]:
         """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
         ready = zip(predictors, calls, by_turns(calls), strict=True)
         return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
 
-    def _call(self, predictor: TrainedRun | UntrainedPredictor) -> tuple[DevicePredictor, Inputs]:
+    def _call(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
             for batch in batches(feed, self.samples.rows, 1):
@@ -305,7 +305,7 @@ class _Test:
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
         return _Measured(timed, held_out, metrics, watched.images)
 
-    def _feed(self, predictor: TrainedRun | UntrainedPredictor, *, batch: int) -> Feed:
+    def _feed(self, predictor: TrainedRun | ReadyPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
         source = StoreSource(self.store, self.samples.source.spec.scene_id)
         return Feed(source, settings, needs=predictor.needs)

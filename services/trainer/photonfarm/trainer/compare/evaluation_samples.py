@@ -12,8 +12,8 @@ import numpy as np
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.store.read.merge import MergedView
-from photonfarm.trainer.data.dataset import rows_held_out, units_of
 from photonfarm.trainer.data.store_source import StoreSource
 
 SHOWN = 4  # samples shown as pictures

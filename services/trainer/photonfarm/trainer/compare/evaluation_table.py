@@ -51,7 +51,7 @@ def place_of_networks(evaluation: Evaluation) -> str:
 
 
 def _of_time(evaluation: Evaluation) -> str:
-    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; untrained ones run on the cpu"
+    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; ready ones run on the cpu"
     return (
         f"network: one image, the median of {TIMED_ROUNDS} calls, taken by turns with the other predictors', on "
         f"{place_of_networks(evaluation)}; reading, or rendering buffers and photons, is not in it"

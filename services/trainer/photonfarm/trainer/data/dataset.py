@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.core.keys import Key, Stream
 from photonfarm.shared.core.records import (
     F32,
     BasePointCloud,
@@ -26,7 +26,7 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.plan.hold_out import are_held_out
+from photonfarm.shared.plan.hold_out import Keyed, units_of
 from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -59,7 +59,7 @@ class RawSample:
     guides: Guides | None = None  # if guides are followed
 
 
-class SampleSource(Protocol):
+class SampleSource(Keyed[Sequence[int]], Protocol):
     """The samples of one scene: the store's reader, or anything that behaves like it. Used by one thread at a time."""
 
     def ready(self) -> bool:
@@ -67,10 +67,6 @@ class SampleSource(Protocol):
 
     def follow_guides(self) -> None:
         """Read guides too, so that samples are complete only with them; SpecError if the scene has none."""
-
-    @property
-    def spec(self) -> SceneSpec:
-        """The scene's spec."""
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """The geometry and the base cloud."""
@@ -88,12 +84,6 @@ class SampleSource(Protocol):
     def read_photons(self, row: int) -> Photons:
         """The photons of a complete row's configuration; raises StoreError if the scene has none."""
 
-    def modification_keys(self, rows: Sequence[int]) -> list[Key]:
-        """The content key of each row's configuration."""
-
-    def view_keys(self, rows: Sequence[int]) -> list[Key]:
-        """The content key of each row's configuration and view."""
-
     @property
     def planned(self) -> int:
         """The number of samples in all plans so far, complete or not."""
@@ -101,20 +91,6 @@ class SampleSource(Protocol):
     @property
     def plan_requests(self) -> list[dict[str, Any]]:
         """The requests of all plans so far, in order, as JSON documents: all rows follow from them."""
-
-
-def rows_held_out(source: SampleSource, rows: Sequence[int], share: float) -> list[bool]:
-    """Whether each row is held out of training, by its content and not by its time of arrival.
-
-    All views and passes of a configuration are on one side. A static scene has one configuration; there the view
-    decides, and all passes of a view are on one side.
-    """
-    return are_held_out(units_of(source, rows), share)
-
-
-def units_of(source: SampleSource, rows: Sequence[int]) -> list[Key]:
-    """The unit by which each row is held out: the key of its configuration or, in a static scene, of its view."""
-    return source.modification_keys(rows) if source.spec.groups else source.view_keys(rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,15 +172,13 @@ def read_into(
 ) -> TrainingBatch:
     """Read complete rows of a source into the first places of a batch's memory; StoreError if one cannot be read."""
     spec = source.spec
-    units = []
     for place, (row, sample) in enumerate(zip(rows, source.read_samples(rows), strict=True)):
         fill(memory, place, sample, spec, cloud)
         if memory.inputs.photons is not None:
             fill_photons(memory.inputs.photons, place, source.read_photons(row))
         if needs.kept:
             _fill_noisy(memory, place, kept_pixels(sample, spec, needs.kept))
-        units.append(sample.modification.key(spec.scene_id) if spec.groups else make_key(sample.view.vector))
-    return memory.filled(tuple(rows), tuple(units))
+    return memory.filled(tuple(rows), tuple(units_of(source, rows)))
 
 
 def fill(batch: TrainingBatch, place: int, sample: RawSample, spec: SceneSpec, cloud: BasePointCloud) -> None:
@@ -247,11 +221,11 @@ def fill_photons(memory: PhotonInputs, place: int, photons: Photons) -> None:
 
 
 def _fill_points(
-    memory: PointInputs, place: int, position: F32, visible: NDArray[np.bool_], seen: NDArray[np.bool_]
+    memory: PointInputs, place: int, position: F32, present: NDArray[np.bool_], seen: NDArray[np.bool_]
 ) -> None:
     points = memory.position.shape[1]
     memory.position[place] = torch.from_numpy(position[:points])
-    memory.visible[place] = torch.from_numpy(visible[:points])
+    memory.present[place] = torch.from_numpy(present[:points])
     memory.seen[place] = torch.from_numpy(seen[:points])
 
 

@@ -11,7 +11,8 @@ from typing import Any, Self
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into, rows_held_out
+from photonfarm.shared.plan.hold_out import rows_held_out
+from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device

@@ -33,11 +33,6 @@ class RoundSampler:
         self._deck: deque[int] = deque()  # places in `rows`
         self._shuffles = 0
 
-    @property
-    def visits(self) -> dict[int, int]:
-        """The number of draws of each row."""
-        return dict(zip(self.rows, self._visits.tolist(), strict=True))
-
     def add(self, rows: Iterable[int]) -> None:
         """Add rows that have arrived; they join the current round at the next draw."""
         self.rows.extend(rows)

@@ -27,4 +27,4 @@ class FeatureProjection(Network):
         """The descriptors, averaged over the points in each pixel, (B, H, W, descriptor)."""
         points = given(inputs.points)
         features = self.descriptor.expand(len(points.position), -1, -1)
-        return [self.project(features, points.position, points.visible, points.seen, inputs)]
+        return [self.project(features, points.position, points.present, points.seen, inputs)]

@@ -43,7 +43,7 @@ class PointInputs:
     """The point cloud of each sample's configuration."""
 
     position: Tensor  # (B, P, 3) world, scene units
-    visible: Tensor  # (B, P) bool; False: of a removed group
+    present: Tensor  # (B, P) bool; False: of a removed group
     seen: Tensor  # (B, P) bool; in this view, as rendered
 
 

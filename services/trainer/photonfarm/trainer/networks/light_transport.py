@@ -38,13 +38,13 @@ class LightTransport(Network):
     def further(self, inputs: Inputs) -> list[Tensor]:
         """f_i, averaged over the points in each pixel, (B, H, W, 64)."""
         points = given(inputs.points)
-        return [self.project(self.point_features(points), points.position, points.visible, points.seen, inputs)]
+        return [self.project(self.point_features(points), points.position, points.present, points.seen, inputs)]
 
     def point_features(self, points: PointInputs) -> Tensor:
         """f_i (B, P, 64) from p_i: current world position, then normal, albedo, emission and learnable descriptor."""
         fixed = torch.cat([self.appearance, self.descriptor], dim=1)
         reference = self.coordinates(self.base) if self.relative else None
-        return self.light_transport(self.coordinates(points.position), fixed, points.visible, reference)
+        return self.light_transport(self.coordinates(points.position), fixed, points.present, reference)
 
 
 class LightTransportPhotons(LightTransport):

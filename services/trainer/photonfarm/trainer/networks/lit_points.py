@@ -125,7 +125,7 @@ class LitPoints(nn.Module):
 
     def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = given(inputs.points), given(inputs.guides)
-        source, there = points.position[place, : self._count] - self.centre, points.visible[place, : self._count, None]
+        source, there = points.position[place, : self._count] - self.centre, points.present[place, : self._count, None]
         reflects = self.albedo * there
         sent = reflects * guides.point_light[place, : self._count] / math.pi * self.reaches(edges=3)
         rays, surface, normal = self._surfaces(inputs, place)

@@ -101,8 +101,8 @@ class Network(nn.Module):
         """
         return with_octaves((position - self.centre) / self.scale, self.octaves)
 
-    def project(self, features: Tensor, position: Tensor, visible: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
+    def project(self, features: Tensor, position: Tensor, present: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""
         view = inputs.world_to_camera, inputs.depth, inputs.normal
-        kept = footprint(position, visible, seen, *view, self.optics)
+        kept = footprint(position, present, seen, *view, self.optics)
         return project_mean(features, kept, self.optics.height, self.optics.width)

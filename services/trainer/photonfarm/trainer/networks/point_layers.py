@@ -48,10 +48,10 @@ def _linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
     return functional.linear(local, own) + functional.linear(shared, common, layer.bias)[:, None]
 
 
-def masked_max(x: Tensor, visible: Tensor) -> Tensor:
-    """The maximum over visible points, (B, P, F) and (B, P) → (B, F); zero if no point is visible."""
-    maximum = x.masked_fill(~visible[..., None], -torch.inf).amax(dim=1)
-    return torch.where(visible.any(dim=1, keepdim=True), maximum, 0)
+def masked_max(x: Tensor, present: Tensor) -> Tensor:
+    """The maximum over present points, (B, P, F) and (B, P) → (B, F); zero if no point is present."""
+    maximum = x.masked_fill(~present[..., None], -torch.inf).amax(dim=1)
+    return torch.where(present.any(dim=1, keepdim=True), maximum, 0)
 
 
 class LightTransportLayer(nn.Module):
@@ -67,25 +67,25 @@ class LightTransportLayer(nn.Module):
         nn.init.kaiming_uniform_(self.preprocess.weight, nonlinearity="linear")
         self.blocks = nn.ModuleList([ResidualBlock(), ResidualBlock()])
 
-    def forward(self, varying: Tensor, fixed: Tensor, visible: Tensor, reference: Tensor | None = None) -> Tensor:
-        """p_i and visible (B, P) → f_i (B, P, 64).
+    def forward(self, varying: Tensor, fixed: Tensor, present: Tensor, reference: Tensor | None = None) -> Tensor:
+        """p_i and present (B, P) → f_i (B, P, 64).
 
         p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). With a reference, a
-        cloud (P, F) of which all points are visible, its maxima are subtracted, which is ours: the effect of a moved
+        cloud (P, F) of which all points are present, its maxima are subtracted, which is ours: the effect of a moved
         lamp on them is small beside what all configurations have in common, and would be lost in the optimiser's
         changes to that.
         """
         samples = len(varying)
         if reference is not None:
             varying = torch.cat([varying, reference[None]])
-            visible = torch.cat([visible, visible.new_ones(1, visible.shape[1])])
+            present = torch.cat([present, present.new_ones(1, present.shape[1])])
         own, common = torch.split(self.preprocess.weight, [varying.shape[-1], fixed.shape[-1]], dim=1)
         local = functional.linear(varying, own) + functional.linear(fixed, common, self.preprocess.bias)
         shared = local.new_zeros(len(local), 0)
         for block in self.blocks:
             local = block(local, shared)
-            shared = masked_max(local, visible)
+            shared = masked_max(local, present)
             if reference is not None:
-                shared = torch.where(visible.any(dim=1, keepdim=True), shared - shared[-1:], 0)
+                shared = torch.where(present.any(dim=1, keepdim=True), shared - shared[-1:], 0)
         local, shared = local[:samples], shared[:samples]
         return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)

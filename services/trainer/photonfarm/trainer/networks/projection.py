@@ -54,7 +54,7 @@ class Footprint:
 @torch.no_grad()
 def footprint(
     position: Tensor,
-    visible: Tensor,
+    present: Tensor,
     seen: Tensor,
     world_to_camera: Tensor,
     depth: Tensor,
@@ -63,14 +63,14 @@ def footprint(
 ) -> Footprint:
     """The kept points, and their pixels.
 
-    position (B, P, 3) world, visible and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
-    axis, normal (B, H, W, 3) world. Image coordinates are floored. Points are dropped if they are flagged invisible,
+    position (B, P, 3) world, present and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
+    axis, normal (B, H, W, 3) world. Image coordinates are floored. Points are dropped if they are flagged as absent,
     behind the camera, outside the image, or occluded. By the rule "exact", points that are not `seen` are occluded,
     whatever the depth; by the other rules, points that lie behind the rendered depth by more than the tolerance, seen
     or not, and none where the depth is 0, as nothing was hit there.
     """
     in_camera = position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]
-    kept = visible & seen if optics.occlusion == "exact" else visible
+    kept = present & seen if optics.occlusion == "exact" else present
     sample, point, u, v = _landing(in_camera, kept, optics)
     if optics.occlusion != "exact":
         at, surface = in_camera[sample, point], depth[sample, v, u]

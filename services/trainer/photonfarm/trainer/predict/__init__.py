@@ -1,1 +1,1 @@
-"""Predictors: trained runs and untrained denoisers, their images, and their held-out error."""
+"""Predictors: trained runs and ready denoisers, their images, and their held-out error."""

@@ -19,11 +19,12 @@ import torch
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.records import F32, BasePointCloud
+from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons, rows_held_out
+from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import given

@@ -1,4 +1,4 @@
-"""A denoiser that was not trained on the scene: Intel's Open Image Denoise, with the inputs of a trained one.
+"""A denoiser that was trained elsewhere: Intel's Open Image Denoise, with the inputs of a trained one.
 
 It takes colour, albedo and normals of one image, and its weights are part of the package `pyoidn` (the extra `oidn`),
 whose binding has the flag for HDR. Dropped pixels are filled in first. Shape letters: B batch, H W image.

@@ -21,7 +21,7 @@ from photonfarm.trainer.report.markdown_page import markdown
 from photonfarm.trainer.report.page import page
 from photonfarm.trainer.report.pictures import OVERVIEW, overview
 from photonfarm.trainer.report.plots import plots
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
 def write_report(
@@ -29,7 +29,7 @@ def write_report(
     runs: Sequence[Path],
     out: Path,
     *,
-    denoisers: Sequence[tuple[UntrainedDenoiser, int]] = (),
+    denoisers: Sequence[tuple[ReadyDenoiser, int]] = (),
     references: Path | None = None,
     inception: Path | None = None,
     most: int = MOST_HELD_OUT,

@@ -9,22 +9,23 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import UntrainedPredictor
 from photonfarm.trainer.report.baselines import Baselines
 from photonfarm.trainer.report.dataset_card import DatasetCard
-from photonfarm.trainer.report.frame_times import FrameTime, frame_time, measured_costs, points_used
+from photonfarm.trainer.report.frame_times import FrameTime, frame_costs, frame_time, points_used
 from photonfarm.trainer.report.machine import Machine
 from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, worst_cases
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, UntrainedDenoiser
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +33,7 @@ class ReportEntry:
     """A row of the report's tables."""
 
     name: str
-    architecture: str | None  # of a network; None for an untrained denoiser
+    architecture: str | None  # of a network; None for a ready denoiser
     row: PredictorRow
     time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
@@ -84,7 +85,7 @@ class ReportContents:
 def gathered(
     store: str | Path,
     runs: Sequence[TrainedRun],
-    denoisers: Sequence[tuple[UntrainedDenoiser, int]],
+    denoisers: Sequence[tuple[ReadyDenoiser, int]],
     *,
     references: Path | None,
     inception: Path | None,
@@ -122,13 +123,13 @@ def gathered(
 def _entries(
     evaluation: Evaluation,
     names: list[str],
-    measured: tuple[Sequence[TrainedRun], Sequence[tuple[UntrainedDenoiser, int]]],
+    measured: tuple[Sequence[TrainedRun], Sequence[tuple[ReadyDenoiser, int]]],
     costs: FrameCosts | None,
     table: Mapping[str, Published],
 ) -> list[ReportEntry]:
     runs, denoisers = measured
-    untrained = [UntrainedPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | UntrainedPredictor] = [*runs, *untrained]
+    ready = [ReadyPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
+    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
     entries = []
     for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
         name, architecture = row.name, None
@@ -157,8 +158,10 @@ class _CloseLook:
     def __call__(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
         if self._timed:
             rows = list(references or images)
-            found = measured_costs(self._store, self._scene_id, rows, self._kept, self._points)
-            self.costs, self.untimed = (None, found) if isinstance(found, str) else (found, "")
+            try:
+                self.costs = frame_costs(self._store, self._scene_id, rows, self._kept, self._points)
+            except BackendError as error:
+                self.untimed = str(error)
         self.machine = Machine.here()
         self.worst = worst_cases(self._views(images, references))
         return [case.row for case in self.worst]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.plan.request import UNUSED
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.store import SceneStatus, SceneStore, Store, store_status
+from photonfarm.shared.store import SceneStatus, SceneStore, Store
+from photonfarm.shared.store.write.status import scene_status
 
 SAMPLES = "samples"
 """The kind of plans whose rows are of new views; others add passes to these, which need no photons and no buffers."""
@@ -39,11 +39,8 @@ class DatasetCard:
     @classmethod
     def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
         """The card of one scene; raises StoreError for one that the store does not hold."""
-        opened = Store(store)
-        status = next((found for found in store_status(opened) if found.scene_id == scene_id), None)
-        if status is None:
-            raise StoreError(f"{store}: holds no scene {scene_id}")
-        scene = opened.scene(scene_id)
+        scene = Store(store).scene(scene_id)
+        status = scene_status(scene)
         versions: dict[str, set[str]] = {}
         workers = set()
         core_s: dict[int, float] = {}

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.shared.core.commands import command, is_installed
+from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
+from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.predict.untrained import UntrainedPredictor
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
@@ -52,15 +53,15 @@ class FrameTime:
         return {**medians, "total": self.total, "ranges": ranges}
 
 
-def measured_costs(
+def frame_costs(
     store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int], points: int | None
-) -> FrameCosts | str:
+) -> FrameCosts:
     """The renderer's measurement of the frames in some rows, with so many points of the cloud, or with all.
 
-    Or the reason why there is none; the renderer's own messages go to stderr.
+    The renderer's own messages go to stderr. Raises BackendError with the reason if there is no measurement.
     """
     if not is_installed(VERB):
-        return "the renderer, which makes buffers and photons, is not installed here"
+        raise BackendError("the renderer, which makes buffers and photons, is not installed here")
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
@@ -68,7 +69,7 @@ def measured_costs(
         asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
         if code := subprocess.run(command(VERB, *asked), stdout=subprocess.DEVNULL, check=False).returncode:
-            return f"`photonfarm {VERB}` ended with exit code {code} here"
+            raise BackendError(f"`photonfarm {VERB}` ended with exit code {code} here")
         return FrameCosts.read(file)
 
 
@@ -78,7 +79,7 @@ def points_used(runs: Sequence[TrainedRun]) -> int | None:
     return None if None in used else max((points for points in used if points), default=None)
 
 
-def frame_time(predictor: TrainedRun | UntrainedPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
+def frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
     return FrameTime(
@@ -91,6 +92,6 @@ def frame_time(predictor: TrainedRun | UntrainedPredictor, network: Seconds, cos
     )
 
 
-def _sees_points(predictor: TrainedRun | UntrainedPredictor) -> bool:
+def _sees_points(predictor: TrainedRun | ReadyPredictor) -> bool:
     projects = predictor.needs.points and not predictor.needs.guides  # lit points are summed over, seen or not
     return projects and predictor.settings.network.occlusion == "exact"

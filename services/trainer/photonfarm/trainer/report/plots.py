@@ -204,10 +204,10 @@ OF_TIME = (
 
 
 def _group(entry: ReportEntry) -> str:
-    networks, trained, untrained = GROUPS
+    networks, trained, ready = GROUPS
     if not entry.row.kept:
         return networks
-    return untrained if entry.architecture is None else trained
+    return ready if entry.architecture is None else trained
 
 
 def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[PlottedPredictor]) -> None:

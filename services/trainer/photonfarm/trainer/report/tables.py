@@ -132,7 +132,7 @@ def _of_time(contents: ReportContents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
     frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
-    on_cpu = ", untrained denoisers on the CPU" if any(entry.architecture is None for entry in contents.entries) else ""
+    on_cpu = ", ready denoisers on the CPU" if any(entry.architecture is None for entry in contents.entries) else ""
     return (
         f"time per frame: medians of {frames} frames for rendering, buffers, points and photons, on one core by LLVM's "
         f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {place_of_networks(contents.evaluation)}"

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.scene.spec import Count, Frozen, Positive, sentences
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.user_code import is_own
@@ -30,7 +31,7 @@ PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Schedule = Literal["epochs", "cosine"]
-UntrainedDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
+ReadyDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
 
 def _one_of(kind: Any) -> BeforeValidator:
@@ -188,7 +189,7 @@ def small(**changes: object) -> TrainSettings:
         "schedule": "cosine",
         "average": 0.99,
         "epoch_samples": 256,
-        "hold_out": 1 / 8,
+        "hold_out": HOLD_OUT,
         "max_steps": 4000,
     }
     return TrainSettings.model_validate({**described, **changes})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -49,9 +50,9 @@ class TrainingOutcome:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """A `Stop` for `train` that SIGTERM and SIGINT set; for the main thread of a process."""
+    """A `Stop` for `train` that SIGTERM and SIGINT set, unless this is not the main thread, which gets signals."""
     stop = Stop()
-    names = (signal.SIGTERM, signal.SIGINT)
+    names = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
     before = [signal.signal(name, lambda *_: stop.set()) for name in names]
     try:
         yield stop

@@ -38,7 +38,7 @@ from photonfarm.shared.store.write.store import check_format
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredSample:
-    """One complete sample, as the trainer uses it."""
+    """One complete sample in float32, in memory of its own; the trainer reads into a `Batch` instead."""
 
     row: int
     modification: Modification
@@ -59,9 +59,9 @@ OPEN_SHARDS = 400
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
-    def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
-        """Take the scene to follow; store, scene and plans may appear later. `guides` works as `follow_guides` does."""
-        self._with_guides = guides
+    def __init__(self, root: str | Path, scene_id: str) -> None:
+        """Take the scene to follow; store, scene and plans may appear later."""
+        self._with_guides = False
         self._guides: GuideStore | None = None
         self._guided: set[int] = set()  # jobs whose guides are there
         self._storage = open_storage(root)

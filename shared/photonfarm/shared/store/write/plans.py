@@ -121,11 +121,16 @@ def folder(scene: str, number: int) -> str:
     return f"{scene}/plans/{number:0{NAME_DIGITS}d}"
 
 
+def content(plans: list[StoredPlan]) -> PlannedContent:
+    """The content of plans, for lookup."""
+    return PlannedContent((plan.first_row, plan.rows) for plan in plans)
+
+
 def expanded(
     spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
     """The rows of a request that the earlier plans do not have: a function of these, the same each time."""
-    known = PlannedContent((plan.first_row, plan.rows) for plan in before)
+    known = content(before)
     if isinstance(request, TopUp):
         return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
@@ -239,12 +244,7 @@ def view_at(plans: list[StoredPlan], row: int) -> View:
 
 def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
     """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
-    of_row = np.searchsorted([plan.first_row for plan in plans], rows, side="right") - 1
-    vectors = np.empty((len(rows), *getattr(plans[0].rows, kind).shape[1:]), np.float32)
-    for number, plan in enumerate(plans):
-        own = of_row == number
-        vectors[own] = getattr(plan.rows, kind)[rows[own] - plan.first_row]
-    return vectors
+    return content(plans).vectors(kind, rows)
 
 
 def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:

@@ -1,4 +1,4 @@
-"""Denoisers that were not trained on the scene; they get the same inputs as the trained ones."""
+"""Denoisers that are ready without training on the scene; they get the same inputs as the trained ones."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torch import Tensor
 from photonfarm.trainer.networks.inputs import Inputs, Needs, given
 from photonfarm.trainer.predict.evaluation import DevicePredictor
 from photonfarm.trainer.predict.fill_in import fill_in
-from photonfarm.trainer.runs.settings import TrainSettings, UntrainedDenoiser
+from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 
 
 @dataclass(frozen=True, slots=True)
-class UntrainedPredictor:
+class ReadyPredictor:
     """A denoiser that is given one of `kept` pixels of half A."""
 
-    denoiser: UntrainedDenoiser
+    denoiser: ReadyDenoiser
     kept: int
     settings: TrainSettings  # for reading samples
 

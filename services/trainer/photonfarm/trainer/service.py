@@ -40,14 +40,16 @@ def run(
     changes: dict[str, Any],
     redis_url: str | None = None,
     *,
-    log: Callable[[str], None],
-    on_record: Callable[[dict[str, Any]], None],
+    scene_id: str | None = None,
+    log: Callable[[str], object],
+    on_record: Callable[[dict[str, Any]], object] | None = None,
 ) -> None:
-    """Train on one scene of a store, until the settings' end or SIGTERM; both leave a checkpoint.
+    """Train on one scene of a store, until the settings' end, SIGTERM or SIGINT; all leave a checkpoint.
 
-    The time spent waiting for a scene, its base and its samples counts. With a Redis, the used samples are reported to
-    workers. Under torchrun, rank 0 does all this, and the other ranks train with it until it ends; all need the same
-    folder. `log` takes sentences about the service, `on_record` each record of the run's log.
+    The scene is that of the spec or the id; without both, the store's only one. The time spent waiting for a scene, its
+    base and its samples counts. With a Redis, the used samples are reported to workers. Under torchrun, rank 0 does all
+    this, and the other ranks train with it until it ends; all need the same folder. `log` takes sentences about the
+    service, `on_record` each record of the run's log.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
@@ -64,7 +66,7 @@ def run(
             return
         with leading(group):
             log(f"training on {described(device, settings.network.precision)}")
-            scene_id = load_spec(spec).scene_id if spec else None
+            scene_id = load_spec(spec).scene_id if spec else scene_id
             _lead(scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
 
 
@@ -76,8 +78,8 @@ def _lead(
     redis_url: str | None,
     stop: Stop,
     group: TrainingGroup,
-    log: Callable[[str], None],
-    on_record: Callable[[dict[str, Any]], None],
+    log: Callable[[str], object],
+    on_record: Callable[[dict[str, Any]], object] | None,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.trainer.data.store_source import StoreSource
@@ -104,7 +106,7 @@ def _lead(
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             log(f"waiting for scene {scene_id}, {lacks}")
         with _reported(redis_url, store, scene_id, log) as on_draws:
-            followers = [on_record, *([board.record] if board else [])]
+            followers = [follow for follow in (on_record, board and board.record) if follow]
             outcome = train(
                 source,
                 settings,
@@ -256,7 +258,7 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _reported(
-    redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], None]
+    redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], object]
 ) -> Iterator[Callable[[int, int], None]]:
     """A callback for draws and samples of training; a thread reports the used ones to Redis regularly, and at the end.
 
@@ -283,7 +285,7 @@ def _reported(
 class _ConsumptionReporter:
     """Reports a scene's used samples to Redis."""
 
-    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], None]) -> None:
+    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], object]) -> None:
         self._url, self._root, self._scene_id, self._log = redis_url, store, scene_id, log
         self._store: Store | None = None  # opened with the first numbers: there may be no store before training begins
         self._used: int | None = None  # a resumed run knows it only once it has begun

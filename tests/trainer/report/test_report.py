@@ -38,6 +38,7 @@ from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
 from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
+from photonfarm.trainer.report.tables import Table
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
@@ -414,3 +415,11 @@ def assert_balanced(markup: str) -> None:
     parser = _Balance()
     parser.feed(markup)
     assert parser.open == []
+
+
+def test_columns_that_say_nothing_are_left_out() -> None:
+    table = Table("title", ("network", "ms", "paper", "more than cnn"), (("cnn", "1.0", "", "–"), ("own", "", "", "–")))
+    assert table.without_empty_columns.head == ("network", "ms")
+    assert table.without_empty_columns.rows == (("cnn", "1.0"), ("own", ""))
+    nothing = Table("title", ("network", "ms"), ())
+    assert nothing.without_empty_columns == nothing

@@ -106,17 +106,18 @@ def gathered(
     costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
+    entries = tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {}))
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
         baselines=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
         evaluation=evaluation,
-        entries=tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {})),
+        entries=entries,
         costs=costs,
         untimed=close_look.untimed,
         machine=close_look.machine,
         worst=tuple(close_look.worst),
-        published=found[0] if found else None,
+        published=found[0] if found and any(entry.published for entry in entries) else None,
     )
 
 

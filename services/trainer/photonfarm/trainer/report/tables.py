@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.frame_costs import Seconds
@@ -23,10 +23,20 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...] = ()
 
+    @property
+    def without_empty_columns(self) -> Table:
+        """The table without the columns that say nothing in any row."""
+        if not self.rows:
+            return self
+        kept = [place for place in range(len(self.head)) if any(row[place] not in {"", "–"} for row in self.rows)]
+        rows = tuple(tuple(row[place] for place in kept) for row in self.rows)
+        return replace(self, head=tuple(self.head[place] for place in kept), rows=rows)
+
 
 def tables(contents: ReportContents) -> list[Table]:
     """All tables, in the order of the report."""
-    return [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
+    found = [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
+    return [table.without_empty_columns for table in found]
 
 
 def facts(contents: ReportContents) -> list[tuple[str, str]]:
@@ -162,7 +172,7 @@ def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) ->
     headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[HEADLINE_BLOCK].estimate
     cells = [
         (f"{1e3 * entry.time.total:.1f}" if entry.time else NOT_AVAILABLE, None),
-        (_ratio(entry, unit), _published_ratio(entry, unit)),
+        (_ratio(entry, unit, alone=len(contents.entries) == 1), _published_ratio(entry, unit)),
         (with_interval(None if metrics is None else metrics.mse.estimate, 5), f"{paper.mse:.4f}" if paper else ""),
         (with_interval(None if metrics is None else metrics.mssim.estimate, 3), f"{paper.mssim:.3f}" if paper else ""),
         (f"{metrics.fid.value:.1f}" if metrics and metrics.fid else NOT_AVAILABLE, f"{paper.fid:.1f}" if paper else ""),
@@ -176,7 +186,9 @@ def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) ->
     return tuple(row)
 
 
-def _ratio(entry: ReportEntry, unit: ReportEntry) -> str:
+def _ratio(entry: ReportEntry, unit: ReportEntry, *, alone: bool) -> str:
+    if alone:
+        return ""
     return NOT_AVAILABLE if entry.time is None or unit.time is None else f"{entry.time.total / unit.time.total:.2f}"
 
 

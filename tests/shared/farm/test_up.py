@@ -35,3 +35,15 @@ def test_a_spec_that_is_not_there_is_refused_before_anything_is_made(tmp_path: P
         up.run_farm(str(tmp_path / "none.toml"), tmp_path / "store", Request(modifications=3), talk, workers=1,
                     train_steps=train_steps, hold_out=0.5, **made)  # fmt: skip
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", [{"reference_spp": 1 << 31}, {"reference_views": 1_000_000_000}])
+def test_references_that_cannot_be_planned_are_refused_before_anything_is_made(
+    tmp_path: Path, wrong: dict[str, int]
+) -> None:
+    talk: Any = None  # nothing is said
+    made = {"run": tmp_path / "run", "out": tmp_path / "out"}
+    with pytest.raises(SpecError):
+        up.run_farm("cornell", tmp_path / "store", Request(modifications=30), talk, workers=1, train_steps=10,
+                    hold_out=1 / 3, **{"reference_views": 1, **wrong}, **made)  # fmt: skip
+    assert list(tmp_path.iterdir()) == []

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -15,10 +18,12 @@ from photonfarm.shared.cli.settings import file_defaults
 from photonfarm.shared.cli.verbs import Umbrella, options_by_command
 from photonfarm.shared.core.errors import PhotonfarmError, StoreError
 
+CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
+
 
 @click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="photonfarm-shared", prog_name="photonfarm")
-@click.option("--config", type=click.Path(path_type=Path), envvar="PHOTONFARM_CONFIG", default="photonfarm.toml",
+@click.option("--config", type=click.Path(path_type=Path), envvar=CONFIG_VARIABLE, default="photonfarm.toml",
               show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
 @click.pass_context
 def umbrella(ctx: click.Context, config: Path) -> None:
@@ -31,6 +36,21 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():
         ctx.default_map = file_defaults(config, options_by_command(umbrella))
+    if ctx.get_parameter_source("config") is ParameterSource.COMMANDLINE:
+        ctx.with_resource(_told_to_child_processes(config))
+
+
+@contextmanager
+def _told_to_child_processes(config: Path) -> Iterator[None]:
+    """Name the configuration file in our environment, so that verbs that this verb starts read the same one."""
+    before = os.environ.get(CONFIG_VARIABLE)
+    os.environ[CONFIG_VARIABLE] = str(config.absolute())
+    try:
+        yield
+    finally:
+        del os.environ[CONFIG_VARIABLE]
+        if before is not None:
+            os.environ[CONFIG_VARIABLE] = before
 
 
 def main(args: list[str] | None = None) -> None:

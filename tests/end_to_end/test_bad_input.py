@@ -131,6 +131,17 @@ def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anyt
     assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
 
 
+@pytest.mark.parametrize("options", [(), ("--train-steps", "0")])
+def test_up_refuses_settings_that_its_workers_would_refuse_before_it_writes_anything(
+    here, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    (tmp_path / "photonfarm.toml").write_text('[work]\nreserve = "much"\n')
+    result = here("up", "room", *options)
+    assert result.returncode == 2
+    assert "'--reserve'" in result.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
+
+
 def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(here, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
@@ -178,11 +189,18 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
     assert len(found) == 3, "each way of splitting was met"
 
 
-def test_up_without_a_trainer_says_so_before_it_writes_anything(tmp_path: Path) -> None:
-    code = "from photonfarm.shared.cli import main, verbs; verbs._installed().pop('train'); main.main(['up', 'room'])"
+@pytest.mark.parametrize(
+    ("verb", "distribution"),
+    [("train", "photonfarm-trainer); --train-steps 0 renders only"), ("work", "photonfarm-renderer)")],
+)
+def test_up_without_a_trainer_or_a_worker_says_so_before_it_writes_anything(
+    tmp_path: Path, verb: str, distribution: str
+) -> None:
+    code = f"from photonfarm.shared.cli import main, verbs; verbs._installed().pop('{verb}'); main.main(['up', 'room'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert "photonfarm train" in result.stderr
+    assert f"photonfarm {verb}" in result.stderr
+    assert distribution in " ".join(result.stderr.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
 
 

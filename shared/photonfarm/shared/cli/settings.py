@@ -20,8 +20,9 @@ a table [store.check]."""
 def file_defaults(path: Path, options: Options) -> dict[str, Any]:
     """Defaults by verb from a TOML file: a table per verb; the table `all` holds for every verb that has its keys.
 
-    Keys above all tables do the same, and `all` overrules them. A subcommand's table is `[verb.subcommand]`; its defaults are stored under its name among those of its verb. Raises
-    SpecError for a file that cannot be read, and for a verb or an option that does not exist.
+    Keys above all tables do the same, and `all` overrules them. A subcommand's table is `[verb.subcommand]`; its
+    defaults are stored under its name among those of its verb. Raises SpecError for a file that cannot be read, and for
+    a verb or an option that does not exist.
     """
     try:
         tables = tomllib.loads(path.read_text())

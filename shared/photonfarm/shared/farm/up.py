@@ -123,8 +123,11 @@ def run_farm(
                     _call(["store", "merge", *merge], environment)
                     beside = ["--references", folder]
                 _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
-        except IncompleteError:
-            _call(preview, environment)  # the samples rendered so far can still be looked at
+        except IncompleteError as error:
+            try:
+                _call(preview, environment)  # the samples rendered so far can still be looked at
+            except IncompleteError as second:
+                raise IncompleteError(f"{error}. After that, {second}") from error
             raise
         _call(preview, environment)
 

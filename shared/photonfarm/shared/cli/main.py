@@ -16,7 +16,7 @@ from rich.console import Console
 
 from photonfarm.shared.cli.settings import file_defaults
 from photonfarm.shared.cli.verbs import Umbrella, options_by_command
-from photonfarm.shared.core.errors import PhotonfarmError, StoreError
+from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError
 
 CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
 
@@ -61,6 +61,16 @@ def main(args: list[str] | None = None) -> None:
         _fail(str(error), error.exit_code)
     except OSError as error:  # a file that a user named, and no code closer to it knew more
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
+    except Exception as error:
+        if not _is_of_redis(error):
+            raise
+        _fail(f"Redis failed: {error}", QueueError.exit_code)
+
+
+def _is_of_redis(error: Exception) -> bool:
+    """Whether an error is one of Redis; whoever met one has imported its package, which takes its time."""
+    redis = sys.modules.get("redis")
+    return redis is not None and isinstance(error, redis.RedisError)
 
 
 def _fail(sentence: str, exit_code: int) -> NoReturn:

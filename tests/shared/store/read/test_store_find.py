@@ -236,6 +236,8 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
     assert printed["samples"][0]["complete"]
+    assert printed["samples"][0]["pass"] == 0
+    assert not [name for name in printed["samples"][0] if name.endswith("_")]
     assert "SceneReader" in printed["samples"][0]["commands"]["look at it"]
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
     scene.guides.want(GuideSpec())

@@ -40,7 +40,7 @@ def scene_show(spec: str, as_json: bool) -> None:
 @store_option
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
               "more at that cost; write nothing.")  # fmt: skip
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
@@ -86,7 +86,7 @@ def submit(
 @store_option
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
 @json_option
 def top_up(

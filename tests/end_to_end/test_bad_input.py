@@ -101,6 +101,19 @@ def test_no_llvm_is_exit_code_6_and_says_what_to_install(photonfarm, tmp_path: P
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize("verb", [("evaluate",), ("report",), ("infer", "--row", "0")])
+def test_a_run_that_is_not_there_is_exit_code_4(here, verb: tuple[str, ...]) -> None:
+    result = here(*verb, "--run", "none")
+    assert result.returncode == 4
+    assert "none: there is no such folder" in result.stderr
+
+
+def test_training_that_waits_for_a_scene_in_vain_is_exit_code_7(here) -> None:
+    result = here("train", "--seconds", "0.3")
+    assert result.returncode == 7
+    assert "nothing was trained" in result.stderr
+
+
 def test_wrong_usage_is_exit_code_2(here) -> None:
     assert here("submit", "cornell", "--views", "0").returncode == 2
     assert here("fly").returncode == 2

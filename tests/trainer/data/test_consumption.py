@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.queue import connect, consumed_samples, serve
 from photonfarm.shared.store import Store
@@ -93,7 +94,8 @@ def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(tmp_path: 
     said: list[str] = []
     with EmbeddedRedis(tmp_path / "redis") as server:
         asked = ("cornell", tmp_path / "none", run, "small", {"max_seconds": 0.3}, server.url)
-        service.run(*asked, log=said.append, on_record=print)
+        with pytest.raises(IncompleteError, match="nothing was trained"):
+            service.run(*asked, log=said.append, on_record=print)
     assert any("waiting for a store" in line for line in said)
     assert any("step 0" in line for line in said)
     assert not (tmp_path / "none").exists()

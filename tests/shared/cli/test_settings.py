@@ -23,8 +23,7 @@ def test_the_table_of_all_verbs_stands_beside_tables_of_the_names_of_its_keys(tm
     options = {**OPTIONS, "store": {}, "store.check": {"store": "store", "scene": "scene"}}
     file = tmp_path / "photonfarm.toml"
     file.write_text(
-        'redis = "above"\n[store.check]\nscene = "room"\n[train]\nstore = "there"\n'
-        '[all]\nstore = "here"\nsteps = 5\n'
+        'redis = "above"\n[store.check]\nscene = "room"\n[train]\nstore = "there"\n[all]\nstore = "here"\nsteps = 5\n'
     )
     assert file_defaults(file, options) == {
         "work": {"store": "here", "redis_url": "above"},

@@ -118,7 +118,7 @@ def test_verbs_that_a_verb_starts_read_the_configuration_file_that_it_was_given(
     install: Install, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     install("report")
-    monkeypatch.setattr(EntryPoint, "load", lambda self: starting)
+    monkeypatch.setattr(EntryPoint, "load", lambda _: starting)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text("[report]\nout = 'room'\n[scene.show]\njson = true\n")
     monkeypatch.setattr("photonfarm.shared.cli.main.file_defaults", lambda *_: {"report": {"out": "room"}})

@@ -59,8 +59,8 @@ class Quiet:
         pass
 
     @contextmanager
-    def progress(self, steps: int) -> Iterator[Callable[[up.FarmProgress, bool], None]]:
-        yield lambda found, last: None
+    def progress(self, _: int) -> Iterator[Callable[[up.FarmProgress, bool], None]]:
+        yield lambda *_: None
 
 
 def test_what_failed_first_is_told_also_if_the_preview_fails_after_it(

@@ -179,7 +179,8 @@ def measure_frames(
     type=click.IntRange(1, 86400),
     default=60,
     show_default=True,
-    help="CPU time of the measurement, loading and compiling apart; a kept measurement is reused if it took at least as long.",
+    help="CPU time of the measurement, loading and compiling apart; a kept measurement is reused if it took at least "
+    "as long.",
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")

@@ -62,9 +62,10 @@ def rehearse(
     log: Callable[[str], None],
     shard_rows: int | None = None,
 ) -> DryRun:
-    """What `submission.submit` would plan and ask for; with `measure`, also its cost, and how the same cost would be spent best.
+    """What `submission.submit` would plan, and the guides that it would ask for.
 
-    `log` is called with the reason if the cost is unknown. Raises SpecError and StoreError as `submit` does.
+    With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
+    cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
     found = _counted(named.spec, request, store, shard_rows)
     costs = measured_costs(named.name) if measure and (found.planned or found.guide_views) else None

@@ -68,11 +68,12 @@ def reconcile(
     """Queue every job that is planned, not committed, not queued, not alive and not failed; returns how many.
 
     It works on one scene, or on all, and for one caller at a time: while another one is at it, this one waits for
-    `wait_s`, and then raises QueueError; a caller who does not wait at all gets 0. At most `limit` jobs are queued in all; the rest follows later. Scenes share these places equally, as a
-    scene whose jobs no worker takes would block the others: the jobs beyond a scene's share leave the queue when
-    another scene needs their places. `retry_failed` forgets failures first, and `retry_set_aside` also those of jobs
-    that failed too often. A scene that cannot be read is skipped with a warning. Raises QueueError also if Redis fails
-    or serves another store, StoreError if the store or the one scene cannot be read.
+    `wait_s`, and then raises QueueError; a caller who does not wait at all gets 0. At most `limit` jobs are queued in
+    all; the rest follows later. Scenes share these places equally, as a scene whose jobs no worker takes would block
+    the others: the jobs beyond a scene's share leave the queue when another scene needs their places. `retry_failed`
+    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. A scene that
+    cannot be read is skipped with a warning. Raises QueueError also if Redis fails or serves another store, StoreError
+    if the store or the one scene cannot be read.
     """
     serve(connection, store)
     try:

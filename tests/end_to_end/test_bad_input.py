@@ -101,6 +101,19 @@ def test_no_llvm_is_exit_code_6_and_says_what_to_install(photonfarm, tmp_path: P
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize("verb", [("evaluate",), ("report",), ("infer", "--row", "0")])
+def test_a_run_that_is_not_there_is_exit_code_4(here, verb: tuple[str, ...]) -> None:
+    result = here(*verb, "--run", "none")
+    assert result.returncode == 4
+    assert "none: there is no such folder" in result.stderr
+
+
+def test_training_that_waits_for_a_scene_in_vain_is_exit_code_7(here) -> None:
+    result = here("train", "--seconds", "0.3")
+    assert result.returncode == 7
+    assert "nothing was trained" in result.stderr
+
+
 def test_wrong_usage_is_exit_code_2(here) -> None:
     assert here("submit", "cornell", "--views", "0").returncode == 2
     assert here("fly").returncode == 2
@@ -128,6 +141,17 @@ def test_up_refuses_settings_that_the_trainer_would_refuse_before_it_writes_anyt
     result = here("up", "room")
     assert result.returncode == 2
     assert "'--threads'" in result.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
+
+
+@pytest.mark.parametrize("options", [(), ("--train-steps", "0")])
+def test_up_refuses_settings_that_its_workers_would_refuse_before_it_writes_anything(
+    here, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    (tmp_path / "photonfarm.toml").write_text('[work]\nreserve = "much"\n')
+    result = here("up", "room", *options)
+    assert result.returncode == 2
+    assert "'--reserve'" in result.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["photonfarm.toml"]
 
 
@@ -178,11 +202,18 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
     assert len(found) == 3, "each way of splitting was met"
 
 
-def test_up_without_a_trainer_says_so_before_it_writes_anything(tmp_path: Path) -> None:
-    code = "from photonfarm.shared.cli import main, verbs; verbs._installed().pop('train'); main.main(['up', 'room'])"
+@pytest.mark.parametrize(
+    ("verb", "distribution"),
+    [("train", "photonfarm-trainer); --train-steps 0 renders only"), ("work", "photonfarm-renderer)")],
+)
+def test_up_without_a_trainer_or_a_worker_says_so_before_it_writes_anything(
+    tmp_path: Path, verb: str, distribution: str
+) -> None:
+    code = f"from photonfarm.shared.cli import main, verbs; verbs._installed().pop('{verb}'); main.main(['up', 'room'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert "photonfarm train" in result.stderr
+    assert f"photonfarm {verb}" in result.stderr
+    assert distribution in " ".join(result.stderr.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
 
 

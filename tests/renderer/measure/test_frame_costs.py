@@ -1,5 +1,6 @@
 """`photonfarm measure-frames`: what kinds of surface a frame shows, and what its parts cost."""
 
+import shutil
 from collections.abc import Callable
 from itertools import islice, pairwise
 from pathlib import Path
@@ -17,7 +18,7 @@ from photonfarm.renderer.measure.partial_film import PartialFilm, part_of
 from photonfarm.renderer.measure.surfaces import surface_kinds
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Surface
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.modification import Modification, rest
@@ -265,7 +266,7 @@ def test_no_more_points_are_looked_for_than_are_asked_for(
 @pytest.mark.parametrize(
     ("scene", "rows", "named"),
     [
-        ("room", ["2", "4"], "row 4"),
+        ("room", ["2", "4"], "no row 4"),
         ("attic", ["0"], "'attic'"),
     ],
 )
@@ -278,6 +279,16 @@ def test_a_row_or_a_scene_that_is_not_there_is_named(
     assert result.exception.exit_code == 4
     assert named in str(result.exception)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_row_that_is_not_complete_is_incomplete_work(tmp_path: Path, store: Store) -> None:
+    shutil.copytree(store.root, tmp_path / "store")
+    grown = Store(tmp_path / "store")
+    grown.scenes()[0].plan(Request(modifications=4, views_per_modification=2))
+    result = CliRunner().invoke(measure_frames, verb(grown, tmp_path, "--row", "2", "--row", "5"))
+    assert isinstance(result.exception, IncompleteError)
+    assert result.exception.exit_code == 7
+    assert "row 5" in str(result.exception)
 
 
 def test_the_verb_needs_rows(tmp_path: Path, store: Store) -> None:

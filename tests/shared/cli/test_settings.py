@@ -2,7 +2,9 @@ from pathlib import Path
 
 import pytest
 
+from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.cli.settings import file_defaults
+from photonfarm.shared.cli.verbs import options_by_command
 from photonfarm.shared.core.errors import SpecError
 
 OPTIONS = {"work": {"store": "store", "redis": "redis_url"}, "train": {"store": "store", "steps": "max_steps"}}
@@ -17,9 +19,37 @@ def test_options_are_named_as_on_the_command_line(tmp_path: Path) -> None:
     }
 
 
+def test_the_table_of_all_verbs_stands_beside_tables_of_the_names_of_its_keys(tmp_path: Path) -> None:
+    options = {**OPTIONS, "store": {}, "store.check": {"store": "store", "scene": "scene"}}
+    file = tmp_path / "photonfarm.toml"
+    file.write_text(
+        'redis = "above"\n[store.check]\nscene = "room"\n[train]\nstore = "there"\n[all]\nstore = "here"\nsteps = 5\n'
+    )
+    assert file_defaults(file, options) == {
+        "work": {"store": "here", "redis_url": "above"},
+        "train": {"store": "there", "max_steps": 5},
+        "store": {"check": {"store": "here", "scene": "room"}},
+    }
+    file.write_text('store = "above"\n[all]\nstore = "all"\n')
+    assert file_defaults(file, OPTIONS) == {"work": {"store": "all"}, "train": {"store": "all"}}
+
+
+def test_the_example_of_the_documentation_is_read_also_with_a_table_for_a_verb_below_store(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs/configuration.md").read_text()
+    (tmp_path / "photonfarm.toml").write_text(
+        page.partition("```toml\n")[2].partition("```")[0] + "\n[store.check]\nrepair = true\n"
+    )
+    found = file_defaults(tmp_path / "photonfarm.toml", options_by_command(umbrella))
+    assert found["store"]["check"] == {"store": "/data/store", "repair": True}
+    assert found["train"]["store"] == "/data/store"
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [
+        ("all = 3", r"all = 3: .*\[all\]"),
+        ("[all]\ntypo = 1", r"all\.typo = 1: is no option"),
+        ("[all.train]\nsteps = 1", r"all\.train = "),
         ("typo = 1", "typo = 1"),
         ("[work]\nsteps = 1", r"work\.steps = 1: .* redis, store"),
         ("work = 3", "work = 3"),

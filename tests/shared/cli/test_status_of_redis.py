@@ -1,5 +1,6 @@
 """`photonfarm status` where Redis does not answer: the store's part comes at once, and why there is no other, soon."""
 
+import json
 import os
 import signal
 import subprocess
@@ -7,9 +8,53 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+import redis
+from click.testing import CliRunner
+
+from photonfarm.renderer.tools import doctor
+from photonfarm.shared import queue
+from photonfarm.shared.cli.main import main, umbrella
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.farm import status as farm_status
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.status import ANSWER_S
 from photonfarm.shared.store import Store
+
+
+def test_json_has_the_reason_that_the_text_has_where_nothing_is_known_of_the_queue(tmp_path: Path) -> None:
+    Store(tmp_path / "store", create=True)
+    words = ["status", "--store", str(tmp_path / "store"), "--redis", f"unix://{tmp_path}/none"]
+    text = CliRunner().invoke(umbrella, words)
+    found = json.loads(CliRunner().invoke(umbrella, [*words, "--json"]).stdout)
+    assert found["queue"] is None
+    assert found["no_queue"].startswith("no Redis at")
+    assert text.stdout.splitlines()[-1] == f"queue: {found['no_queue']}"
+
+
+def test_a_redis_that_fails_on_the_way_is_exit_code_5(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise redis.TimeoutError("Timeout reading from socket")
+
+    Store(tmp_path / "store", create=True)
+    monkeypatch.setattr(farm_status, "queue_of", fail)
+    with pytest.raises(SystemExit) as ended:
+        main(["status", "--store", str(tmp_path / "store")])
+    assert ended.value.code == QueueError.exit_code == 5
+    assert "Redis failed: Timeout reading from socket" in capsys.readouterr().err
+
+
+def test_the_doctor_tells_of_a_redis_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Failing:
+        def info(self, _: str) -> None:
+            raise redis.exceptions.NoPermissionError("no permissions to run the 'info' command")
+
+    monkeypatch.setattr(queue, "connect", lambda _: Failing())
+    found = doctor._tried("Redis", lambda: doctor._reaches("redis://h:1/0"))
+    assert (found.works, found.exit_code) == (False, QueueError.exit_code)
+    assert "no permissions" in found.detail
 
 
 def test_a_frozen_redis_does_not_hold_up_what_the_store_knows(tmp_path: Path) -> None:

@@ -1,3 +1,5 @@
+import os
+import subprocess
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -8,6 +10,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.shared.cli import verbs
 from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.commands import command
 
 
 @click.command()
@@ -101,6 +104,27 @@ def test_the_configuration_file_has_tables_for_subcommands(install: Install, tmp
     assert run("--config", str(file), "report").output == "report mine run\n"
     assert run("--config", str(file), "report", "stability").output == "stability all 9\n"
     assert run("--config", str(file), "scene", "plan").output == "stability all 5\n"
+
+
+@click.command()
+@click.option("--out", default="out")
+def starting(out: str) -> None:
+    """Start another verb."""
+    done = subprocess.run(command("scene", "show", out), capture_output=True, text=True, check=False)
+    click.echo(f"{done.returncode}: {done.stdout}{done.stderr}")
+
+
+def test_verbs_that_a_verb_starts_read_the_configuration_file_that_it_was_given(
+    install: Install, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    install("report")
+    monkeypatch.setattr(EntryPoint, "load", lambda _: starting)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text("[report]\nout = 'room'\n[scene.show]\njson = true\n")
+    monkeypatch.setattr("photonfarm.shared.cli.main.file_defaults", lambda *_: {"report": {"out": "room"}})
+    result = run("--config", "mine.toml", "report")
+    assert result.output.startswith('0: {\n  "scene_id"'), result.output
+    assert "PHOTONFARM_CONFIG" not in os.environ
 
 
 def test_the_installed_verbs_are_listed_with_their_subcommands() -> None:

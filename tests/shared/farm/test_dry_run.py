@@ -20,9 +20,9 @@ from photonfarm.shared.farm.dry_run import DryRun, costs_by_renderer, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import NamedSpec, load_spec
+from photonfarm.shared.scene.spec import GuideSpec, NamedSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.shared.store.format.schema import bytes_of_rows
+from photonfarm.shared.store.format.schema import bytes_of_rows, most_guide_bytes
 
 COSTS = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 1000.0 * KAPPA)  # so noisy that 8 spp are too few
 STATIC_NOISE = 50**2 * KAPPA * 0.0625 / 0.375  # for which 50 spp are best
@@ -112,6 +112,7 @@ def test_of_a_grown_request_only_what_is_new_counts(
     always = {**samples.small_spec().objects[0].model_dump(), "removal_probability": 0.0}  # no two are equal
     spec = spec_file(tmp_path, objects=[always])
     request = {"modifications": 6, "views_per_modification": 2}
+    store.add(load_spec(spec)).guides.ask(GuideSpec())
     store.plan(load_spec(spec), dry_run.Request(**request))
     found = rehearsed(tmp_path, Path(store.root), spec=spec, **grown)
     assert (found.planned, found.extent) == (samples_, extent)
@@ -120,6 +121,31 @@ def test_of_a_grown_request_only_what_is_new_counts(
         core_s = 0.5 * extent.configurations + 0.25 * extent.views + samples_ * (0.125 + 8 * 0.0625)
         assert found.core_s == pytest.approx(core_s)
     assert (found.suggestion, found.reduction) == (None, None)  # it would render again what is planned
+
+
+def test_guides_that_views_of_older_plans_would_get_are_counted_and_paid_for(tmp_path: Path, verb: Verb) -> None:
+    verb(replace(COSTS, guides_s=0.2).json())
+    store, spec = Store(tmp_path / "store", create=True), spec_file(tmp_path)
+    request = {"modifications": 6, "views_per_modification": 2}
+    scene = store.scene(store.plan(load_spec(spec), Request(**request), shard_rows=4).scene_id)
+    found = rehearsed(tmp_path, Path(store.root), spec=spec)
+    assert (found.planned, found.planned_before, found.guide_views) == (0, 12, 12)
+    assert found.size_bytes == most_guide_bytes(scene.spec, 12, 3, 4)
+    assert found.core_s == pytest.approx(12 * 0.2)
+    lines = run(spec, Path(store.root)).stdout.splitlines()
+    assert lines[1] == "guides of 12 views that are planned would be asked for too"
+    assert lines[2].endswith("2.4 core-seconds: 0.6 s on the 4 cores here")
+    assert len(lines) == 3
+    assert scene.guides.settings() is None
+    scene.guides.ask(scene.spec.guides)
+    assert rehearsed(tmp_path, Path(store.root), spec=spec).guide_views == 0
+
+
+def test_guides_with_other_settings_are_refused_as_submit_refuses_them(tmp_path: Path, verb: Verb) -> None:
+    store, spec = Store(tmp_path / "store", create=True), spec_file(tmp_path)
+    store.add(load_spec(spec)).guides.ask(GuideSpec(light_samples=9))
+    with pytest.raises(SpecError, match="light_samples"):
+        rehearsed(tmp_path, Path(store.root), spec=spec)
 
 
 def test_equal_configurations_are_counted_once(tmp_path: Path) -> None:
@@ -258,6 +284,7 @@ def test_of_a_static_scene_the_command_speaks_of_samples_alone(tmp_path: Path, v
 def test_where_samples_are_planned_the_command_says_why_it_suggests_nothing(tmp_path: Path, verb: Verb) -> None:
     verb()
     spec, store = spec_file(tmp_path), Store(tmp_path / "store", create=True)
+    store.add(load_spec(spec)).guides.ask(GuideSpec())
     store.plan(load_spec(spec), dry_run.Request(modifications=1, views_per_modification=2))
     lines = run(spec, Path(store.root)).stdout.splitlines()
     assert lines[2] == "no suggestion: another half_spp would render the 2 planned samples again"

@@ -1,5 +1,8 @@
 """What `photonfarm up` refuses before it begins, and what it says of how far it is."""
 
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +10,7 @@ import pytest
 import store_samples as samples
 
 from photonfarm.shared.cli.show_up import progress_line
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.farm import up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
@@ -35,3 +38,41 @@ def test_a_spec_that_is_not_there_is_refused_before_anything_is_made(tmp_path: P
         up.run_farm(str(tmp_path / "none.toml"), tmp_path / "store", Request(modifications=3), talk, workers=1,
                     train_steps=train_steps, hold_out=0.5, **made)  # fmt: skip
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrong", [{"reference_spp": 1 << 31}, {"reference_views": 1_000_000_000}])
+def test_references_that_cannot_be_planned_are_refused_before_anything_is_made(
+    tmp_path: Path, wrong: dict[str, int]
+) -> None:
+    talk: Any = None  # nothing is said
+    made = {"run": tmp_path / "run", "out": tmp_path / "out"}
+    with pytest.raises(SpecError):
+        up.run_farm("cornell", tmp_path / "store", Request(modifications=30), talk, workers=1, train_steps=10,
+                    hold_out=1 / 3, **{"reference_views": 1, **wrong}, **made)  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
+
+
+class Quiet:
+    """Says nothing."""
+
+    def say(self, line: str) -> None:
+        pass
+
+    @contextmanager
+    def progress(self, _: int) -> Iterator[Callable[[up.FarmProgress, bool], None]]:
+        yield lambda *_: None
+
+
+def test_what_failed_first_is_told_also_if_the_preview_fails_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def command(verb: str, *_: str) -> list[str]:
+        return [sys.executable, "-c", f"import sys; print('no {verb}'); sys.exit({6 if verb == 'work' else 4})"]
+
+    monkeypatch.setattr(up, "command", command)
+    with pytest.raises(IncompleteError) as caught:
+        up.run_farm("cornell", tmp_path / "store", Request(modifications=2), Quiet(), workers=1, train_steps=0,
+                    hold_out=0.5, run=tmp_path / "run", out=tmp_path / "out")  # fmt: skip
+    said = str(caught.value)
+    assert said.startswith("worker-1 ended with exit code 6; ")
+    assert "says: no work. After that, photonfarm preview ended with exit code 4" in said

@@ -219,7 +219,13 @@ def test_held_out_selects_what_training_keeps(tmp_path: Path, objects: list | No
         assert topped_up(scene, condition) == expected
 
 
-CONDITIONS = ["views=10", "views=first:0", "rows=a", "plan=-1", "held-out=1.5", "all", ""]
+@pytest.mark.parametrize("share", [1 / 3, 1e-5, 5e-324, 0.00012345678901234567, 1 - 2**-53])
+def test_every_share_that_python_writes_is_one(share: float) -> None:
+    assert TopUp.of("+8", [f"held-out={share}"]).where == (f"held-out={share}",)
+
+
+CONDITIONS = ["views=10", "views=first:0", "rows=a", "plan=-1", "all", ""]
+CONDITIONS += [f"held-out={share}" for share in ("1.5", "1.0", "0", "1e5", "nan", "-.5", ".", "")]
 KEYS = ["modification=XYZ", "view=zz", "view=", f"view={'a' * 33}"]
 
 

@@ -143,7 +143,8 @@ def test_a_job_that_was_taken_by_a_worker_that_died_is_queued_again(
 def test_only_one_caller_reconciles_at_a_time(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
     with connection.lock("rq:photonfarm:reconcile", timeout=10):
         assert reconcile(store, connection, wait_s=0) == 0
-        assert reconcile(store, connection, wait_s=0.2) == 0
+        with pytest.raises(QueueError, match="another process"):
+            reconcile(store, connection, wait_s=0.2, retry_set_aside=True)
     assert reconcile(store, connection, wait_s=0) == 10
 
 
@@ -161,7 +162,8 @@ def test_one_that_takes_long_keeps_others_out_until_it_is_done(
         slow.setattr(reconciliation, "_reconcile", fill)
         filling = other.submit(reconcile, store, connection)
         began.wait(10)
-        assert reconcile(store, connection, wait_s=3) == 0
+        with pytest.raises(QueueError, match="another process"):
+            reconcile(store, connection, wait_s=3)
         done.set()
         assert filling.result(10) == 1
     assert reconcile(store, connection, wait_s=0) == 10

@@ -65,6 +65,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(scene={"builtin": "castle"}), r"scene\.builtin = 'castle': .*'cornell' or 'room'"),
         (changed(exposure=0), "exposure = 0"),
         (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
+        (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0;"),
         (changed(flm={}), "flm: .*nearest: film"),
         (changed(objects=tomllib.loads(SPEC)["objects"] * 2), "'ball'"),
         ({k: v for k, v in changed().items() if k != "view"}, "view: "),
@@ -96,6 +97,29 @@ def test_invalid_toml_and_an_unknown_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SpecError):
         load_spec(tmp_path / "spec.toml")
     with pytest.raises(SpecError, match="cornell"):
+        load_spec("castle")
+
+
+def test_plain_path_tracing_and_light_paths_without_connections_are_allowed(scenes: Path) -> None:
+    for transport in ({"light_ratio": 0, "connections": 0}, {"connections": 0}, {"light_ratio": 0.25}):
+        spec = parse_spec(changed(transport=transport), where="spec")
+        assert SceneSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+def test_a_folder_does_not_hide_the_spec_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room").mkdir()
+    assert load_spec("room").scene.builtin == "room"
+    (tmp_path / "hall").mkdir()
+    with pytest.raises(SpecError, match="hall: no such spec"):
+        load_spec("hall")
+
+
+def test_an_unknown_name_is_answered_with_all_that_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes/attic.toml").write_text("")
+    with pytest.raises(SpecError, match=r"castle: no such spec; give a \.toml file or one of attic, cornell, room$"):
         load_spec("castle")
 
 

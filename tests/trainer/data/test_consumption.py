@@ -99,7 +99,8 @@ def test_a_store_that_is_not_there_yet_is_waited_for_also_with_a_spec(tmp_path: 
     said: list[str] = []
     with EmbeddedRedis(tmp_path / "redis") as server:
         asked = ("cornell", tmp_path / "none", run, "small", {"max_seconds": 0.3}, server.url)
-        service.run(*asked, log=said.append, on_record=print)
+        with pytest.raises(IncompleteError, match="nothing was trained"):
+            service.run(*asked, log=said.append, on_record=print)
     assert any("waiting for a store" in line for line in said)
     assert any("step 0" in line for line in said)
     assert not (tmp_path / "none").exists()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.errors import StoreError
 from photonfarm.trainer.metrics import FIDInceptionV3, InceptionWeights, find_weights, inception_weights, load_inception
 from photonfarm.trainer.metrics.inception import network_input
 
@@ -175,7 +175,7 @@ def test_a_given_file_comes_first_and_is_told_from_the_published_one(random_file
 
 
 def test_a_given_file_that_is_not_there_is_refused() -> None:
-    with pytest.raises(SpecError):
+    with pytest.raises(StoreError):
         find_weights(Path("gone.pt"))
 
 
@@ -186,7 +186,7 @@ def test_without_weights_there_is_no_network(nothing_installed: Path) -> None:
 
 def test_a_file_in_torch_hubs_cache_with_another_hash_is_refused(nothing_installed: Path) -> None:
     _saved({}, nothing_installed / "pt_inception-2015-12-05-6726825d.pth")
-    with pytest.raises(SpecError, match="6726825d"):
+    with pytest.raises(StoreError, match="6726825d"):
         find_weights()
 
 
@@ -220,12 +220,12 @@ def test_a_file_of_another_network_is_refused(tmp_path: Path) -> None:
         (state, r"mixed_3\.tower\.conv_1\.beta"),
         ({"weight": torch.zeros(1)}, r"Conv2d_1a_3x3\.conv\.weight"),
     ):
-        with pytest.raises(SpecError, match=named):
+        with pytest.raises(StoreError, match=named):
             load_inception(_saved(saved, tmp_path / "other.pt"))
 
 
 def test_a_file_without_tensors_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "text.pt"
     path.write_text("not tensors")
-    with pytest.raises(SpecError):
+    with pytest.raises(StoreError):
         load_inception(path)

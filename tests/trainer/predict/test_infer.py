@@ -125,9 +125,14 @@ def test_a_row_that_is_not_there_is_told_from_one_that_is_not_complete(
 ) -> None:
     run = trained()
     scene.plan(Request(modifications=8, views_per_modification=3))
-    for row, said in ((99, "24 rows"), (17, "wait for the workers"), (24, "24 rows")):
-        with pytest.raises(StoreError, match=said):
+    for row, said, code in ((99, "24 rows", 4), (17, "wait for the workers", 7), (24, "24 rows", 4)):
+        with pytest.raises(PhotonfarmError, match=said) as caught:
             infer.show_sample(store, run, row, tmp_path / "out")
+        assert caught.value.exit_code == code
+    incomplete = Store(store).scene(scene.scene_id).job_rows(1).views
+    with pytest.raises(PhotonfarmError, match="wait for the workers") as caught:
+        infer.find_row(store, run, None, " ".join(map(str, incomplete[max(incomplete)].vector)))
+    assert caught.value.exit_code == 7
     assert not (tmp_path / "out").exists()
 
 

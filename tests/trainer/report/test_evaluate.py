@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.pictures import display
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
@@ -111,7 +111,7 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
     named = ["--store", store, "--references", references, "--run", runs[0].folder, "--run", runs[1].folder]
     arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 3]
     result = CliRunner().invoke(umbrella, [str(a) for a in (*arguments, "--inception", tmp_path / "none")])
-    assert isinstance(result.exception, SpecError), "weights that are named must be there"
+    assert isinstance(result.exception, StoreError), "weights that are named must be there"
     result = CliRunner().invoke(umbrella, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0
     lines = [line for line in result.stdout.splitlines() if line.startswith("|")]
@@ -299,13 +299,14 @@ def test_what_cannot_be_compared_is_refused(
         (static.scene_id, {"runs": [run, static]}),
         ("300", {"denoisers": [("none", 300)]}),
         ("device = 'cuda:99'", {"device": "cuda:99"}),
-        ("missing: ", {"references": tmp_path / "missing"}),
-        ("empty: ", {"references": tmp_path / "empty"}),
         (r"\(8, 8, 3\)", {"references": references}),
     ]
     for named, asked in refused:
         with pytest.raises(SpecError, match=named):
             compare(store, **{"runs": [run], **asked})
+    for folder in ("missing", "empty"):
+        with pytest.raises(StoreError, match=f"{folder}: "):
+            compare(store, [run], references=tmp_path / folder)
 
 
 def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_source, tiny, tmp_path: Path) -> None:

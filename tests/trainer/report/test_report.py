@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
@@ -122,8 +122,8 @@ def test_a_store_without_the_scene_is_not_ready(tmp_path) -> None:
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path) -> None:
-    with pytest.raises(SpecError):
-        write_report(tmp_path / "store", tmp_path / "run", tmp_path / "out")
+    with pytest.raises(StoreError):
+        write_report(tmp_path / "store", [tmp_path / "run"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer import service
+from photonfarm.trainer.cli.train_verb import train
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, settings_of, small
 from photonfarm.trainer.training.losses import paired_loss
 
@@ -167,6 +168,18 @@ def test_an_architecture_that_does_not_exist_is_refused_with_those_that_do() -> 
     found = CliRunner().invoke(umbrella, ["train", "--architecture", "gan"])
     assert found.exit_code == 2
     assert "light_transport_photons" in found.output
+
+
+def test_a_default_that_the_help_states_as_a_number_is_that_of_every_preset() -> None:
+    stated = 0
+    for option in train.params:
+        if found := re.search(r"\[default: ([\d.]+)\]", getattr(option, "help", None) or ""):
+            for settings in map(preset, PRESETS):
+                value = getattr(settings, str(option.name), None)
+                assert value == float(found[1]), option.name
+                assert option.name != "decay" or settings.schedule == "epochs"
+            stated += 1
+    assert stated
 
 
 def test_the_summary_is_printed_and_nothing_else_is_done(tmp_path: Path) -> None:

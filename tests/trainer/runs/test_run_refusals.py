@@ -73,14 +73,14 @@ def test_a_trainer_that_is_refused_leaves_the_sign_of_life_of_the_one_at_work(ru
 
 
 def test_a_folder_is_no_run_without_settings_that_are_those_of_one(run) -> None:
-    with pytest.raises(SpecError):
+    with pytest.raises(StoreError):
         read_settings(run)
     run.mkdir()
-    with pytest.raises(SpecError):
+    with pytest.raises(StoreError):
         read_settings(run)
     for text, named in (("{", r"settings\.json"), ('{"network": {"widht": 8}, "batch": 0}', "width.*; batch = 0")):
         (run / "settings.json").write_text(text)
-        with pytest.raises(SpecError, match=named):
+        with pytest.raises(StoreError, match=named):
             read_settings(run)
 
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
+from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.scene.spec import load_spec
 from photonfarm.trainer import service
@@ -240,16 +241,29 @@ def test_who_reads_the_log_while_it_is_cut_has_it_whole(tmp_path) -> None:
 
 def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path) -> None:
     told, began = [], time.monotonic()
-    service.run(None, tmp_path / "store", run, "small", {"max_seconds": 0.3}, log=told.append, on_record=told.append)
+    asked = (None, tmp_path / "store", run, "small", {"max_seconds": 0.3})
+    with pytest.raises(IncompleteError, match=r"no scene .* in 0\.3 s; nothing was trained"):
+        service.run(*asked, log=told.append, on_record=told.append)
     assert time.monotonic() - began < 5
-    first, *said = told
-    assert first == f"training on {described(usable_device('auto'))}"
-    assert any("no scene" in line for line in said)
+    assert told[0] == f"training on {described(usable_device('auto'))}"
+
+
+def test_a_service_that_is_stopped_while_it_waits_for_a_scene_has_done_what_it_was_asked_for(
+    run, tmp_path, monkeypatch
+) -> None:
+    def signalled(*_: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    told = []
+    monkeypatch.setattr(service, "_only_scene", signalled)
+    service.run(None, tmp_path / "store", run, "small", {}, log=told.append, on_record=told.append)
+    assert any("no scene" in line for line in told)
 
 
 def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:
     store, said = scene.folder.parent.parent, []
-    service.run("cornell", store, run, "small", {"max_seconds": 0.3}, log=said.append, on_record=said.append)
+    with pytest.raises(IncompleteError, match="nothing was trained"):
+        service.run("cornell", store, run, "small", {"max_seconds": 0.3}, log=said.append, on_record=said.append)
     assert any(f"waiting for scene {load_spec('cornell').scene_id}" in str(line) for line in said)
 
 

@@ -54,11 +54,11 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
     "--ahead", type=click.FloatRange(1), metavar="RATIO",
     help="Take no job of a scene while more of its samples are committed than RATIO × those that its trainer has used. "
     "About the first 256 of a scene may always be (jobs are taken and finished whole, by each worker); without a "
-    "trainer it stops there. Below 1 it would stop for good.",
+    "trainer it stops there. Values below 1 would stop rendering for ever.",
 )  # fmt: skip
 @click.option(
     "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
-    metavar="SECONDS", help="End a job that takes longer, as it hangs; it is started five times. A worker that was "
+    metavar="SECONDS", help="End a job that takes longer; it is started up to five times. A worker that was "
     "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
 )  # fmt: skip
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
@@ -158,7 +158,8 @@ def measure_frames(
 ) -> None:
     """Measure what the parts of a frame cost here, on one core, and what kind of surface each pixel shows.
 
-    Nothing is written to the store. Rows of at least two configurations make edits what they are between samples.
+    Nothing is written to the store. Give rows of at least two configurations, so that edits are measured as between
+    samples.
     """
     from photonfarm.renderer.scene import backend
 
@@ -178,7 +179,8 @@ def measure_frames(
     type=click.IntRange(1, 86400),
     default=60,
     show_default=True,
-    help="CPU time of the measurement, loading and compiling apart; one that is kept counts if it had no less.",
+    help="CPU time of the measurement, loading and compiling apart; a kept measurement is reused if it took at least "
+    "as long.",
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")

@@ -50,6 +50,8 @@ def run(
     base and its samples counts. With a Redis, the used samples are reported to workers. Under torchrun, rank 0 does all
     this, and the other ranks train with it until it ends; all need the same folder. `log` takes sentences about the
     service, `on_record` each record of the run's log.
+
+    Raises IncompleteError if the time is over before there is anything to train on.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
@@ -97,6 +99,10 @@ def _lead(
         if is_vacant(store):
             log(f"waiting for a store and a scene in {store}")
         scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
+        if scene_id is None and not stop.is_set():
+            raise IncompleteError(
+                f"{store}: no scene to train on has come in {settings.max_seconds:g} s; nothing was trained"
+            )
         if scene_id is None:
             log(f"{store}: no scene to train on has come; nothing was trained")
             return
@@ -121,6 +127,10 @@ def _lead(
                 ),
             )
     log(f"ended at step {outcome.step}: {outcome.reason}")
+    if outcome.reason == "seconds" and not source.ready():
+        raise IncompleteError(
+            f"{store}: nothing of scene {scene_id} has been rendered in {settings.max_seconds:g} s; nothing was trained"
+        )
 
 
 def check(folder: Path) -> None:
@@ -181,7 +191,7 @@ def search(
         raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
     settings = settings_of(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
     scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
-    if scene_id is None or not StoreSource(store, scene_id).ready():
+    if scene_id is None or is_vacant(store) or not Store(store).has_scene(scene_id):
         wanted = f" {spec}" if spec else ""
         raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):

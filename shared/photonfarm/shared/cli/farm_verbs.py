@@ -41,7 +41,7 @@ def scene_show(spec: str, as_json: bool) -> None:
 @store_option
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
               "more at that cost; write nothing.")  # fmt: skip
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
@@ -87,7 +87,7 @@ def submit(
 @store_option
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue the jobs that were set aside, as they had failed repeatedly.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
 @json_option
 def top_up(
@@ -173,21 +173,22 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     from photonfarm.shared.farm.up import run_farm, trainer_arguments
 
     try:
+        _check_arguments(["work", "--until-complete"], "photonfarm-renderer")
         if options["train_steps"]:
             trainer = {name: options[name] for name in ("run", "train_steps", "hold_out")}
-            _check_arguments(trainer_arguments(spec, **trainer))
+            _check_arguments(trainer_arguments(spec, **trainer), "photonfarm-trainer", "--train-steps 0 renders only")
         run_farm(spec, store, request, FarmTalk(), **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
 
 
-def _check_arguments(arguments: list[str]) -> None:
+def _check_arguments(arguments: list[str], distribution: str, *remedies: str) -> None:
     """Raise UsageError if a verb is not installed, or would refuse its arguments or its table of the configuration."""
     root = click.get_current_context().find_root()
     verb = cast(click.Group, root.command).get_command(root, arguments[0])
     if verb is None:
-        raise click.UsageError(
-            f"`photonfarm {arguments[0]}` is not installed here (photonfarm-trainer); --train-steps 0 renders only"
-        )
-    verb.make_context(arguments[0], arguments[1:], parent=root).close()
+        missing = f"`photonfarm {arguments[0]}` is not installed here ({distribution})"
+        raise click.UsageError("; ".join([missing, *remedies]))
+    embedded = ["--redis", "unix:///"]  # like that of the embedded Redis, which wants no password
+    verb.make_context(arguments[0], [*arguments[1:], *embedded], parent=root).close()

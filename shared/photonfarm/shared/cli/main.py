@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,12 +16,14 @@ from rich.console import Console
 
 from photonfarm.shared.cli.settings import file_defaults
 from photonfarm.shared.cli.verbs import Umbrella, options_by_command
-from photonfarm.shared.core.errors import PhotonfarmError, StoreError
+from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError
+
+CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
 
 
 @click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="photonfarm-shared", prog_name="photonfarm")
-@click.option("--config", type=click.Path(path_type=Path), envvar="PHOTONFARM_CONFIG", default="photonfarm.toml",
+@click.option("--config", type=click.Path(path_type=Path), envvar=CONFIG_VARIABLE, default="photonfarm.toml",
               show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
 @click.pass_context
 def umbrella(ctx: click.Context, config: Path) -> None:
@@ -31,6 +36,21 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():
         ctx.default_map = file_defaults(config, options_by_command(umbrella))
+    if ctx.get_parameter_source("config") is ParameterSource.COMMANDLINE:
+        ctx.with_resource(_told_to_child_processes(config))
+
+
+@contextmanager
+def _told_to_child_processes(config: Path) -> Iterator[None]:
+    """Name the configuration file in our environment, so that verbs that this verb starts read the same one."""
+    before = os.environ.get(CONFIG_VARIABLE)
+    os.environ[CONFIG_VARIABLE] = str(config.absolute())
+    try:
+        yield
+    finally:
+        del os.environ[CONFIG_VARIABLE]
+        if before is not None:
+            os.environ[CONFIG_VARIABLE] = before
 
 
 def main(args: list[str] | None = None) -> None:
@@ -41,6 +61,16 @@ def main(args: list[str] | None = None) -> None:
         _fail(str(error), error.exit_code)
     except OSError as error:  # a file that a user named, and no code closer to it knew more
         _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
+    except Exception as error:
+        if not _is_of_redis(error):
+            raise
+        _fail(f"Redis failed: {error}", QueueError.exit_code)
+
+
+def _is_of_redis(error: Exception) -> bool:
+    """Whether an error is one of Redis; whoever met one has imported its package, which takes its time."""
+    redis = sys.modules.get("redis")
+    return redis is not None and isinstance(error, redis.RedisError)
 
 
 def _fail(sentence: str, exit_code: int) -> NoReturn:

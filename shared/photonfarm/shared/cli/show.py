@@ -117,7 +117,9 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(
             f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
         )
-        if isinstance(result, DryRun) and result.planned:
+        if isinstance(result, DryRun) and result.guide_views:
+            click.echo(f"guides of {result.guide_views} views that are planned would be asked for too")
+        if isinstance(result, DryRun) and (result.planned or result.guide_views):
             _cost(result)
         return
     queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
@@ -138,7 +140,8 @@ def _cost(result: DryRun) -> None:
         return
     cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
     click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {_duration(result.wall_s)} on the {cores} here")
-    click.echo(_suggestion(result))
+    if result.planned:
+        click.echo(_suggestion(result))
 
 
 def _suggestion(result: DryRun) -> str:

@@ -19,9 +19,10 @@ IDLE_SHOWN = 10
 
 
 def document(scenes: Sequence[SceneStatus], found: StoreQueue | NoQueue, store: str | Path) -> None:
-    """Print a store's scenes and its queue as JSON."""
+    """Print a store's scenes and its queue as JSON, or why nothing is known of the queue."""
     document = None if isinstance(found, NoQueue) else _queue_document(found, store)
-    print_json({"scenes": [asdict(scene) for scene in scenes], "queue": document})
+    reason = found.reason if isinstance(found, NoQueue) else None
+    print_json({"scenes": [asdict(scene) for scene in scenes], "queue": document, "no_queue": reason})
 
 
 def scenes(found: Sequence[SceneStatus]) -> None:

@@ -128,7 +128,7 @@ def _group(group: FindingGroup) -> dict[str, Any]:
 def found(matches: Matches, store: str | Path, as_json: bool) -> None:
     """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
-        samples = [{**asdict(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
+        samples = [{**_fields(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
         print_json({"count": matches.count, "nearest": matches.nearest, "samples": samples})
         return
     for sample in matches.samples:
@@ -138,6 +138,11 @@ def found(matches: Matches, store: str | Path, as_json: bool) -> None:
     if not matches.count:
         near = "" if matches.nearest is None else f"; the nearest is {matches.nearest:g} scene units away"
         click.echo(f"no sample fits{near}", err=True)
+
+
+def _fields(sample: FoundSample) -> dict[str, Any]:
+    """The fields of a sample by their names; `pass` is a word of Python's."""
+    return {name.removesuffix("_"): value for name, value in asdict(sample).items()}
 
 
 def merged(view: WrittenView) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from photonfarm.shared.cli.options import json_option, redis_option, store_option
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 
 
 def scene_option(command: click.decorators.FC) -> click.decorators.FC:
@@ -118,10 +118,12 @@ def merge(
     Each is a NumPy archive of `mean`, `m2`, `half_a`, `half_b` and `standard_error`, (H, W, 3) float64 linear radiance,
     and the number of `passes`, of two independent halves each. Exact, and the same in any order; merge again when more
     passes have arrived. Without conditions all views are merged.
+
+    Exit codes: 0 some view was merged, 7 none yet, as samples or passes are missing, 4 no sample that is planned fits.
     """
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.store import Store
-    from photonfarm.shared.store.read.find import Query, scene_named
+    from photonfarm.shared.store.read.find import Query, find_samples, scene_named
     from photonfarm.shared.store.read.merge import merge_views, write_views
 
     opened = Store(store)
@@ -136,8 +138,10 @@ def merge(
     if as_json:
         show_store.merged_document(written)
     if not written:
+        if not find_samples(opened, ids, query, limit=1).count:
+            raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
         what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
-        raise StoreError(f"{what}; `photonfarm store find` shows what there is")
+        raise IncompleteError(f"{what}; `photonfarm store find` shows what there is")
 
 
 @click.command()

@@ -2,11 +2,11 @@
 
     PhotonfarmError                exit 1   (never raised itself)
     ├── SpecError (ValueError)     exit 3   a scene spec or a request that cannot be used
-    ├── StoreError (OSError)       exit 4   a store that cannot be read or written
+    ├── StoreError (OSError)       exit 4   a store, or other data, that cannot be read or written
     │   └── CorruptError           exit 4   stored bytes that are not what was committed
     ├── QueueError (OSError)       exit 5   no Redis, or one that refuses us
     ├── BackendError (RuntimeError) exit 6  this machine cannot render: Mitsuba, LLVM or scene files
-    └── IncompleteError            exit 7   work that ended before it was done
+    └── IncompleteError            exit 7   work that ended before it was done, samples that are not complete
         └── DivergedError          exit 8   training whose loss is no longer finite (in the trainer's `learner`)
 
 Exit 0 is success, 2 is wrong usage of a command (given by click), 130 is Ctrl-C in `photonfarm up`.

@@ -47,10 +47,14 @@ def submit(
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
-    QueueError; in the last case the plan is kept, and idle workers queue it later.
+    QueueError; in the last case the plan is kept, and idle workers queue it later. Guides are asked for before the
+    plan, so that no worker renders it without them.
     """
     opened = Store(store, create=True)
-    opened.add(named.spec).guides.want(named.spec.guides)
+    scene = opened.add(named.spec)
+    scene.guides.check(named.spec.guides)
+    scene.plan(Request(), shard_rows=shard_rows, dry_run=True)  # what is refused leaves no wish for guides behind
+    scene.guides.want(named.spec.guides)
     planned = opened.plan(named.spec, request, shard_rows=shard_rows)
     queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)

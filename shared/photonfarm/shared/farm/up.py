@@ -22,7 +22,7 @@ from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import spp_per_pass
+from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -81,12 +81,17 @@ def run_farm(
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
     with them.
 
-    A wrong spec, and a hold-out that leaves one side empty, are refused before anything is written, by a SpecError.
+    A wrong spec, a hold-out that leaves one side empty, and references of no valid number are refused before anything
+    is written, by a SpecError.
     After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
     named = NamedSpec.load(spec)
+    references = train_steps > 0 and reference_views > 0
+    which = (f"held-out={hold_out}", f"views=first:{reference_views}")  # of the planned views get references
     if train_steps:
         check_hold_out(named.spec, store, hold_out, request)
+    if references:
+        TopUp.of(str(reference_spp), which)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -94,9 +99,8 @@ def run_farm(
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows)
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
-        if references := train_steps > 0 and reference_views > 0:
-            where = (f"held-out={hold_out}", f"views=first:{reference_views}")
-            added = top_up(named, store, redis.url, str(reference_spp), where=where, retry=True)
+        if references:
+            added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
             talk.say(f"{added.planned} passes more for references, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
@@ -119,8 +123,11 @@ def run_farm(
                     _call(["store", "merge", *merge], environment)
                     beside = ["--references", folder]
                 _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
-        except IncompleteError:
-            _call(preview, environment)  # the samples rendered so far can still be looked at
+        except IncompleteError as error:
+            try:
+                _call(preview, environment)  # the samples rendered so far can still be looked at
+            except IncompleteError as second:
+                raise IncompleteError(f"{error}. After that, {second}") from error
             raise
         _call(preview, environment)
 

@@ -33,6 +33,9 @@ from photonfarm.shared.plan.request import (
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
 from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
 
+_A_SHARE = re.compile(r"(?:\d|\d?\.\d{1,25})(?:e-\d{1,3})?")
+"""A number as Python writes one between 0 and 1, such as 0.3333333333333333 or 1e-05."""
+
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
@@ -219,7 +222,7 @@ def _parsed(condition: str) -> Condition:
             )
         case ["held-out"]:
             return _held_out, HOLD_OUT
-        case ["held-out", value] if re.fullmatch(r"0?\.\d{1,9}", value):
+        case ["held-out", value] if _A_SHARE.fullmatch(value) and 0 < float(value) < 1:
             return _held_out, float(value)
     raise SpecError(
         f"where {condition!r}: is no condition; allowed are views=first:N, view=KEY, modification=KEY, rows=A-B, "

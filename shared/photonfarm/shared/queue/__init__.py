@@ -12,6 +12,7 @@ rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host
 job it renders, or -, and the process of its supervisor
 rq:photonfarm:paused:<worker name>  why a worker takes no jobs
 rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
+rq:photonfarm:reconcile             lock of the process that fills the queue
 rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
 rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """

@@ -1,6 +1,6 @@
 """The trainer's reports to the workers of how many samples of a scene it has used, so that they need not run far ahead.
 
-The number is counts again and again: a Redis that loses it has it back within seconds.
+The number is reported repeatedly, so a Redis that lost it has it again within seconds.
 """
 
 from __future__ import annotations

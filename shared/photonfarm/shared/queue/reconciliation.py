@@ -67,16 +67,22 @@ def reconcile(
 ) -> int:
     """Queue every job that is planned, not committed, not queued, not alive and not failed; returns how many.
 
-    It works on one scene, or on all, and for one caller at a time: it returns 0 if another one is still at it after
-    `wait_s`. At most `limit` jobs are queued in all; the rest follows later. Scenes share these places equally, as a
-    scene whose jobs no worker takes would block the others: the jobs beyond a scene's share leave the queue when
-    another scene needs their places. `retry_failed` forgets failures first, and `retry_set_aside` also those of jobs
-    that failed too often. A scene that cannot be read is skipped with a warning. Raises QueueError if Redis fails or
-    serves another store, StoreError if the store or the one scene cannot be read.
+    It works on one scene, or on all, and for one caller at a time: while another one is at it, this one waits for
+    `wait_s`, and then raises QueueError; a caller who does not wait at all gets 0. At most `limit` jobs are queued in
+    all; the rest follows later. Scenes share these places equally, as a scene whose jobs no worker takes would block
+    the others: the jobs beyond a scene's share leave the queue when another scene needs their places. `retry_failed`
+    forgets failures first, and `retry_set_aside` also those of jobs that failed too often. A scene that
+    cannot be read is skipped with a warning. Raises QueueError also if Redis fails or serves another store, StoreError
+    if the store or the one scene cannot be read.
     """
     serve(connection, store)
     try:
         with _alone(connection, wait_s) as alone:
+            if not alone and wait_s > 0:
+                raise QueueError(
+                    f"another process has been filling the queue for {wait_s:g} s, so this one has queued and retried "
+                    "nothing; try again"
+                )
             if not alone:
                 return 0
             if retry_failed or retry_set_aside:

@@ -161,6 +161,15 @@ class Transport(Frozen):
     light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
 
+    @model_validator(mode="after")
+    def _has_light_paths_to_connect_to(self) -> Self:
+        if self.connections and not self.light_ratio:
+            raise ValueError(
+                f"has connections = {self.connections} and light_ratio = 0; light_ratio = 0 has no light paths to "
+                "connect to, so connections = 0 or a light_ratio above 0 is required"
+            )
+        return self
+
 
 class PhotonSpec(Frozen):
     """Light sub-paths stored per modification: `paths` × `depth` slots; 0 paths: none."""
@@ -402,12 +411,14 @@ def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
 def find_spec(name: str) -> Path:
     """The file of a spec: a path, or a bare name among `scenes/` here and the built-in ones; else SpecError."""
     path = Path(name)
-    if path.suffix == ".toml" or path.exists():
+    if path.suffix == ".toml" or path.is_file():
         return path
-    for folder in (Path("scenes"), Path(__file__).parent / "specs"):
+    folders = (Path("scenes"), Path(__file__).parent / "specs")
+    for folder in folders:
         if (folder / f"{name}.toml").is_file():
             return folder / f"{name}.toml"
-    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(BUILTIN_ROOMS)}")
+    known = sorted({file.stem for folder in folders for file in folder.glob("*.toml")})
+    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(known)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.estimate import clean_error
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
@@ -207,9 +207,13 @@ def test_the_command_writes_each_view_of_what_is_complete_and_again_when_more_is
     store, out = scene.storage.where, tmp_path / "references"
     arguments = ["store", "merge", "--store", store, "--out", str(out)]
     nothing = CliRunner().invoke(umbrella, arguments)
-    assert isinstance(nothing.exception, StoreError)
+    assert isinstance(nothing.exception, IncompleteError)
+    unplanned = CliRunner().invoke(umbrella, [*arguments, "--row", "9999"])
+    assert isinstance(unplanned.exception, StoreError)
     few = CliRunner().invoke(umbrella, [*arguments, "--least", "512"])
-    assert isinstance(few.exception, StoreError)
+    assert isinstance(few.exception, IncompleteError)
+    codes = [result.exception.exit_code for result in (nothing, unplanned, few)]
+    assert codes == [7, 4, 7]
     assert "--least" in str(few.exception)
     assert not out.exists()
 

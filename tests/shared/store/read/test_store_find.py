@@ -240,6 +240,8 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
     assert printed["samples"][0]["complete"]
+    assert printed["samples"][0]["pass"] == 0
+    assert not [name for name in printed["samples"][0] if name.endswith("_")]
     scene.write_base(*samples.base())
     words = shlex.split(printed["samples"][0]["commands"]["look at it"])[1:]
     looked = subprocess.run([sys.executable, *words], capture_output=True, text=True)

@@ -176,6 +176,22 @@ def test_settings_are_fixed_by_whoever_asks_first(scene: SceneStore) -> None:
         again.want(GuideSpec(light_samples=5))
 
 
+def test_a_refused_submission_changes_nothing(store: Store, scene: SceneStore) -> None:
+    def everything() -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in Path(store.root).rglob("*") if path.is_file()}
+
+    before = everything()
+    named, more = NamedSpec("small", scene.spec, None), Request(modifications=6)
+    with pytest.raises(SpecError, match="shard_rows = 8"):
+        submit(named, store.root, None, more, shard_rows=8)
+    assert everything() == before
+    scene.guides.ask(GuideSpec(light_samples=2))
+    before = everything()
+    with pytest.raises(SpecError, match="light_samples"):
+        submit(named, store.root, None, more)
+    assert everything() == before
+
+
 def test_settings_of_a_later_program_are_read(scene: SceneStore) -> None:
     scene.guides.want(GuideSpec())
     file = scene.folder / "guides/settings.json"

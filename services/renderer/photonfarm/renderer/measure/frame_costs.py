@@ -21,7 +21,7 @@ from photonfarm.renderer.jobs.render import lit_points, located, photons_of
 from photonfarm.renderer.measure.partial_film import PartialFilm
 from photonfarm.renderer.measure.surfaces import surface_kinds
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
@@ -53,8 +53,8 @@ def write_frame_costs(
     """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
 
     The backend must have been loaded, with one thread.
-    Raises StoreError for a scene or a row that the store does not hold, SceneNotHereError if the scene's files are
-    not on this machine.
+    Raises StoreError for a scene or a row that the store does not hold, IncompleteError for a row that is not complete,
+    SceneNotHereError if the scene's files are not on this machine.
     """
     opened = Store(store)
     reader = SceneReader(store, scene_id := scene_named(opened, scene))
@@ -70,8 +70,13 @@ def write_frame_costs(
 
 
 def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
-    if missing := sorted(set(rows) - set(reader.rows.tolist())):
+    planned = max((plan["first_row"] + plan["samples"] for plan in reader.plan_requests), default=0)
+    if max(rows) >= planned:
         raise StoreError(
+            f"there is no row {max(rows)}; scene {reader.spec.scene_id} has {planned} rows, and the first is 0"
+        )
+    if missing := sorted(set(rows) - set(reader.rows.tolist())):
+        raise IncompleteError(
             f"row {missing[0]} of scene {reader.spec.scene_id} is not complete; {len(reader.rows)} of "
             f"{reader.planned} planned rows are, which `photonfarm store find` shows"
         )

@@ -97,21 +97,22 @@ def _writes_to_bucket(url: str) -> str:
 
 def _starts_redis() -> str:
     from photonfarm.shared.farm.redis_server import EmbeddedRedis
-    from photonfarm.shared.queue import connect
 
     with tempfile.TemporaryDirectory() as folder, EmbeddedRedis(Path(folder)) as server:
-        return f"version {connect(server.url).info('server')['redis_version']}"
+        return _reaches(server.url)
 
 
 def _reaches(url: str) -> str:
+    from redis import RedisError
+
     from photonfarm.shared.queue import connect
 
     try:
         return f"version {connect(url).info('server')['redis_version']}"
     except QueueError:
         raise
-    except OSError as error:
-        raise QueueError(str(error)) from error
+    except (RedisError, OSError) as error:
+        raise QueueError(f"Redis failed while it was asked for its version: {error}") from error
 
 
 def _scenes() -> MachineCheck:

@@ -93,8 +93,10 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     "your own, refused if it biases.  [default: the preset's]",
 )
 @click.option("--optimiser", metavar=f"[{'|'.join(get_args(Optimiser))}]", help="[default: adam]")
-@click.option("--learning-rate", type=click.FloatRange(0, min_open=True), help="At the beginning.  [default: 0.0005]")
-@click.option("--decay", type=click.FloatRange(0, 1, min_open=True), help="Of the rate, per epoch.  [default: 0.99]")
+@click.option("--learning-rate", type=click.FloatRange(0, min_open=True),
+              help="At the beginning.  [default: the preset's]")  # fmt: skip
+@click.option("--decay", type=click.FloatRange(0, 1, min_open=True),
+              help="Of the rate, per epoch.  [default: the preset's]")  # fmt: skip
 @click.option("--beta2", type=float, help="Of Adam; 0.9999 or more where fireflies are rare.  [default: 0.999]")
 @click.option(
     "--demodulation",

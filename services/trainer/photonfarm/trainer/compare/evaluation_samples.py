@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
@@ -110,9 +110,9 @@ class HeldOutSamples:
 
 
 def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Reference]:
-    """The references by the row of their view; raises SpecError if none can be used."""
+    """The references by the row of their view; raises StoreError if there is none, SpecError for another film."""
     if not folder.is_dir():
-        raise SpecError(f"{folder}: there is no such folder")
+        raise StoreError(f"{folder}: there is no such folder")
     spec = samples.source.spec
     film = spec.film
     found: dict[int, Reference] = {}
@@ -122,7 +122,7 @@ def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Referenc
             if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
     if not found:
-        raise SpecError(
+        raise StoreError(
             f"{folder}: holds no reference of the {len(samples.rows)} held-out views; "
             "`photonfarm store merge --out` writes them, named by their views' keys"
         )

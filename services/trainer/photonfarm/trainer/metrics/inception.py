@@ -175,7 +175,7 @@ def network_input(images: Tensor) -> Tensor:
 def load_inception(path: Path | None = None, device: str = "cpu") -> Inception | None:
     """The network with the weights that `find_weights` finds; None if there are none.
 
-    Raises SpecError as `find_weights` and `read_weights` do.
+    Raises StoreError as `find_weights` and `read_weights` do.
     """
     found = find_weights(path)
     if found is None:

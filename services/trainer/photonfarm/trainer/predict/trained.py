@@ -33,8 +33,8 @@ class TrainedRun:
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
         """The run with the weights of the checkpoint of this name, by default the last one.
 
-        Raises SpecError if the folder is not a run, or its settings are not those of the checkpoint; StoreError without
-        a readable checkpoint.
+        Raises StoreError if the folder is not a run with a readable checkpoint, SpecError if its settings are not those
+        of the checkpoint.
         """
         settings, state = read_settings(folder), checkpoint.load(folder / name)
         identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}

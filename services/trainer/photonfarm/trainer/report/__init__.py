@@ -39,9 +39,9 @@ def write_report(
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
 
-    Runs, and denoisers given one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if a folder
-    is not a run or the runs cannot be compared, StoreError without a readable checkpoint or store or if `out` cannot be
-    written, IncompleteError if nothing is held out.
+    Runs, and denoisers given one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if
+    the runs cannot be compared, StoreError if a folder is not a run with a readable checkpoint, for a store that cannot
+    be read or if `out` cannot be written, IncompleteError if nothing is held out.
     """
     loaded = [TrainedRun.load(run) for run in runs]
     with store_errors("write the report", out):

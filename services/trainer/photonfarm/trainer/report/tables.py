@@ -295,7 +295,7 @@ def _worst(contents: ReportContents) -> list[Table]:
     note = (
         f"of all views with references, those in which pixels of one kind cost {contents.entries[0].name} most: the "
         "sum of their squared error in the metric space, the references' noise taken out; one view may be the worst of "
-        "several kinds. Close: nearer than 5 % of what is seen. Fine shadows: in both halves of the reference light "
-        "steps where surface, normal and colour do not"
+        "several kinds. Near surfaces: the nearest 5 % of what is seen. Fine shadows: in both halves of the reference "
+        "light steps where surface, normal and colour do not"
     )
     return [Table("Worst cases", ("kind of pixels", "row of the store", "of the image", "MSE there"), rows, (note,))]

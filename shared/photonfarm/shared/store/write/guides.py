@@ -65,13 +65,17 @@ class GuideStore:
         Raises SpecError if the scene has guides with other settings.
         """
         new = self.ask(wanted)
+        self.check(wanted)
+        return new
+
+    def check(self, wanted: GuideSpec) -> None:
+        """Raise SpecError if the scene has guides with other settings."""
         found = self.settings()
-        if found != wanted:
+        if found is not None and found != wanted:
             raise SpecError(
                 f"guides: {wanted.model_dump()} is asked for, and scene {self.scene_id} has guides with "
-                f"{found.model_dump() if found else None}, fixed when they were first asked for; ask for these"
+                f"{found.model_dump()}, fixed when they were first asked for; ask for these"
             )
-        return new
 
     def ask(self, wanted: GuideSpec) -> bool:
         """Request guides for all views as `want` does; False if that was done before, with whatever settings."""

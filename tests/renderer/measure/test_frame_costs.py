@@ -229,7 +229,7 @@ def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, st
     options = ["--row", "3", "--row", "0", "--kept", "1", "--kept", "4", "--timed", "3"]
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options), catch_exceptions=False)
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'costs.npz'}: 2 rows, 3 timed frames\n")
-    assert "render_s 1/4 0." in result.stderr
+    assert "render_s 1/4 0." in result.stdout
     costs = FrameCosts.read(tmp_path / "costs.npz")
     assert costs.scene_id == room.spec.scene_id
     assert (costs.rows.tolist(), costs.kept.tolist()) == ([3, 0], [1, 4])

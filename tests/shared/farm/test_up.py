@@ -1,5 +1,6 @@
 """What `photonfarm up` refuses before it begins, and what it says of how far it is."""
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,6 +29,19 @@ def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path
     samples.commit(scene, 2, samples.outputs(scene, 2))
     assert (farm.look().samples, farm.look().passes) == ((4, 6), (4, 6))
     assert progress_line(farm.look()) == "samples 4/6  further passes 4/6  steps 0/10"
+
+
+def test_the_log_of_another_run_is_not_counted_where_nothing_is_trained(store: Store, tmp_path: Path) -> None:
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=3), shard_rows=4).scene_id)
+    record = {"kind": "validation", "step": 7, "error": 0.5, "standard_error": 0.1, "held_out": 3}
+    (tmp_path / "metrics.jsonl").write_text(json.dumps(record) + "\n")
+    assert up._Farm(scene, tmp_path, 0).look() == up.FarmProgress((0, 3), (0, 0), 0, 0, "")
+    trained = up._Farm(scene, tmp_path, 10).look()
+    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 3 views")
+
+
+def test_a_process_that_was_killed_is_told_apart_from_one_that_failed() -> None:
+    assert (up._end(-9), up._end(7)) == ("was ended by SIGKILL", "ended with exit code 7")
 
 
 @pytest.mark.parametrize("train_steps", [0, 10])
@@ -75,4 +89,5 @@ def test_what_failed_first_is_told_also_if_the_preview_fails_after_it(
                     hold_out=0.5, run=tmp_path / "run", out=tmp_path / "out")  # fmt: skip
     said = str(caught.value)
     assert said.startswith("worker-1 ended with exit code 6; ")
-    assert "says: no work. After that, photonfarm preview ended with exit code 4" in said
+    assert "says: no work. What is rendered" in said
+    assert "goes on from there. After that, photonfarm preview ended with exit code 4" in said

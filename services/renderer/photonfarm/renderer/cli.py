@@ -168,7 +168,7 @@ def measure_frames(
 
     costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
     parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
-    click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()), err=True)
+    click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()))
     click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
 
 

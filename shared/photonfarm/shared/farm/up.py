@@ -101,7 +101,7 @@ def run_farm(
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
-            talk.say(f"{added.planned} passes more for references, {added.planned_before} planned before")
+            talk.say(f"references: {added.planned} further passes planned, {added.planned_before} planned before")
         scene = Store(store).scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
         talk.say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
@@ -214,10 +214,11 @@ class _Farm:
 
     def look(self) -> FarmProgress:
         """Count the samples and the further passes of their views, and read the trainer's log."""
-        for record in self._records():
+        for record in self._records() if self.steps else []:  # else they are of another run
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
-                self.note = f", held-out error {stated(record['error'], record['standard_error'])}"
+                error = stated(record["error"], record["standard_error"])
+                self.note = f", held-out error {error} on {record['held_out']} views"
         found = self.scene.progress()
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
@@ -240,10 +241,17 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, ta
             for name, process in running.items():
                 if process.poll():
                     log = farm.run / f"{name}.log"
-                    raise IncompleteError(f"{name} ended with exit code {process.returncode}; {log} says: {_tail(log)}")
+                    raise IncompleteError(
+                        f"{name} {_end(process.returncode)}; {log} says: {_tail(log)}. What is rendered and trained is "
+                        "kept, and the same command goes on from there"
+                    )
             if not alive:
                 return
             time.sleep(POLL_S)
+
+
+def _end(code: int) -> str:
+    return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
 
 def _tail(log: Path) -> str:

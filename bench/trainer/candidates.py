@@ -51,25 +51,30 @@ class _OfPoints(Guided):
 # ---------------------------------------------------------------------------------------------------------------- light
 
 
-class _NoBounce(LitPoints):
-    def leaving(self, source: Tensor, reflects: Tensor, sent: Tensor) -> Tensor:  # noqa: ARG002 - what bounces see
-        return sent
+class _OneBounce(LitPoints):
+    bounces = 1
+
+    def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
+        senders = self.visibility.surfaces(source, self.normal)
+        between = self.form_factors(source, self.normal, source) * self.visibility(senders, senders)
+        leaving = sent
+        for _ in range(self.bounces):
+            leaving = sent + self.albedo * (between @ leaving)
+        return super().arriving(at, facing, source, leaving)
 
 
-class NoBounce(_OfPoints):
-    """Points do not light each other: B₀ alone reaches the pixels."""
+class OneBounce(_OfPoints):
+    """Points light each other once: what they reflect of that light reaches the pixels, too."""
 
-    kind = _NoBounce
+    kind = _OneBounce
 
 
-class _TwoBounces(LitPoints):
-    def leaving(self, source: Tensor, reflects: Tensor, sent: Tensor) -> Tensor:
-        between = self.between(source)
-        return sent + reflects * (between @ (sent + reflects * (between @ sent)))
+class _TwoBounces(_OneBounce):
+    bounces = 2
 
 
 class TwoBounces(_OfPoints):
-    """Points light each other twice: B₀ + B₁ + B₂ reaches the pixels."""
+    """Points light each other twice."""
 
     kind = _TwoBounces
 
@@ -125,11 +130,9 @@ class _LatentTokens(_Unhidden):
         self.point, self.pixel, self.light = _layers(SURFACE + 6, WIDTH), _layers(SURFACE, WIDTH), _layers(WIDTH, 6)
         self.read, self.shown = (nn.MultiheadAttention(WIDTH, HEADS) for _ in range(2))
 
-    def arriving(
-        self, at: Tensor, facing: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
         surfaces = self.visibility.surfaces
-        points = self.point(torch.cat([surfaces(source, self.normal), reflects, torch.log1p(sent)], dim=-1))
+        points = self.point(torch.cat([surfaces(source, self.normal), self.albedo, torch.log1p(sent)], dim=-1))
         tokens = self.tokens + self.read(self.tokens, points, points, need_weights=False)[0]
         pixels = self.pixel(surfaces(at, facing))
         light = self.light(pixels + self.shown(pixels, tokens, tokens, need_weights=False)[0])

@@ -30,7 +30,7 @@ WITHOUT = {
 """What each is compared with: itself without a part."""
 
 TRIED = {
-    candidates.NoBounce: "guided_transport",
+    candidates.OneBounce: "guided_transport",
     candidates.TwoBounces: "guided_transport",
     candidates.Unhidden: "guided_transport",
     candidates.Attention: "guided_transport",

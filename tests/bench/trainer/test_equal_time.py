@@ -41,7 +41,7 @@ def test_a_page_of_networks_has_those_that_were_kept_and_those_that_were_not() -
     for name, instead in guided_networks.INSTEAD.items():
         _, row = [line for line in lines if line.startswith(f"| {name} |")]
         assert f"| {instead} " in row
-    few = guided_networks.page({"room": [result("NoBounce", 1.0)]}, TOLD)
+    few = guided_networks.page({"room": [result("OneBounce", 1.0)]}, TOLD)
     assert few.splitlines()[-1].endswith("| – |"), "nothing to compare it with"
 
 

@@ -109,7 +109,8 @@ def test_what_reflects_nothing_shows_what_it_emits_and_nothing_else(make_source,
 
 
 def test_a_scene_far_from_the_origin_gives_the_same_image(make_source) -> None:
-    source, chosen, kind, offset = make_source(1), NetworkSettings(width=4), "guided_transport", np.float32(1024)
+    source, kind, offset = make_source(1), "guided_transport", np.float32(1024)
+    chosen = NetworkSettings(width=4, architecture=kind)
     inputs, frame = batch_of(source, (0,), kind).inputs, SceneFrame.of(source.spec, *source.base(), chosen)
     inputs.guides.specular[:, :8], inputs.guides.roughness[:, :8] = 0.9, 0.3  # a metal: its lobe sums over points too
     near = image(build(chosen, frame, 0), inputs)
@@ -117,6 +118,15 @@ def test_a_scene_far_from_the_origin_gives_the_same_image(make_source) -> None:
     inputs.points.position[:] += offset
     inputs.world_to_camera[:, :, 3] -= inputs.world_to_camera[:, :, :3].sum(-1) * offset
     torch.testing.assert_close(image(build(chosen, away, 0), inputs), near, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize(("max_depth", "lit"), [(2, False), (3, True), (-1, True)])
+def test_lit_points_send_nothing_by_paths_longer_than_the_images_have(make_source, max_depth: int, lit: bool) -> None:
+    source, kind = make_source(1), "guided_transport"
+    chosen = NetworkSettings(width=4, architecture=kind)
+    frame = replace(SceneFrame.of(source.spec, *source.base(), chosen), max_depth=max_depth)
+    light = build(chosen, frame, 0).lit_points(batch_of(source, (0,), kind).inputs)
+    assert [bool(each.any()) for each in light[:2]] == [lit, lit]
 
 
 def test_inputs_that_lack_what_a_network_needs_are_named(make_source) -> None:

@@ -1,10 +1,10 @@
-"""Indirect light by instant radiosity [Keller 1997] from the points of the scene's cloud, with learned visibility.
+"""Light that lit points of the scene's cloud send on, by instant radiosity [Keller 1997] with learned visibility.
 
-Each of the first points of the cloud stands for its share A of the scene's surface. It receives direct light, rendered
-with its shadows. Its reflected light goes to every other point, and from all of these to every pixel, by the form
-factor F = cos θ cos θ′ A / (π r²):
+Each of the first points of the cloud stands for its share A of the scene's surface. It receives direct light E,
+rendered with its shadows. What it reflects, ρ E / π, goes to every pixel by the form factor
+F = cos θ cos θ′ A / (π r²):
 
-B₀ = ρ E / π        B₁ = ρ (F ∘ V) B₀        light of a pixel = (F ∘ V) (B₀ + B₁)
+light of a pixel = Σ F V ρ E / π
 
 This is attention over points. Its kernel is the form factor, so that the light of a pixel depends on its position,
 which a maximum over points cannot express. The visibility V between two surfaces is learned, as a function of their
@@ -12,7 +12,8 @@ places and normals:
 
 V = sigmoid(r(receiver) · s(sender) + b)
 
-For metals B₀ is summed over the directions that their lobe reflects; nothing is learned there.
+For metals the light is summed over the directions that their lobe reflects; nothing is learned there. Light that points
+send to each other was tried, and brings nothing at equal time (`bench/trainer/candidates.py`).
 
 Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
 """
@@ -48,6 +49,9 @@ LEAST_LOGARITHM = -60.0
 
 CHANNELS = 9
 """The channels of the three results of `LitPoints` together."""
+
+PATH_EDGES = 3
+"""The edges of the paths that lit points stand for: from a lamp to a point, to a surface, to the eye."""
 
 DIFFUSE = 1
 """The index of all diffuse light among the results of `LitPoints`."""
@@ -97,7 +101,7 @@ class LitPoints(nn.Module):
     """The radiance of white diffuse surfaces, and of lobes over their albedo, by the light of lit points.
 
     All positions within are about the scene's centre, as squares of large coordinates leave float32 no distances. Other
-    kinds override `form_factors`, `leaving` or `arriving`.
+    kinds override `form_factors` or `arriving`.
     """
 
     centre: Tensor
@@ -116,7 +120,7 @@ class LitPoints(nn.Module):
         self.register_buffer("albedo", torch.from_numpy(frame.appearance[: self._count, 3:6].copy()), persistent=False)
 
     def forward(self, inputs: Inputs) -> list[Tensor]:
-        """Diffuse light B₀ without occlusion, all diffuse light, and light by other lobes, (B, H, W, 3) each.
+        """Diffuse light if nothing hid a point, diffuse light, and light by other lobes, (B, H, W, 3) each.
 
         The last is 0 where other lobes reflect less than `GLOSSY`.
         """
@@ -126,10 +130,11 @@ class LitPoints(nn.Module):
     def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = given(inputs.points), given(inputs.guides)
         source, there = points.position[place, : self._count] - self.centre, points.present[place, : self._count, None]
-        reflects = self.albedo * there
-        sent = reflects * guides.point_light[place, : self._count] / math.pi * self.reaches(edges=3)
+        sent = self.albedo * there * guides.point_light[place, : self._count] / math.pi
+        if 0 <= self._max_depth < PATH_EDGES:
+            sent = torch.zeros_like(sent)
         rays, surface, normal = self._surfaces(inputs, place)
-        unhidden, light = self._diffuse(surface, normal, source, reflects, sent)
+        unhidden, light = self._diffuse(surface, normal, source, sent)
         glossy = (guides.specular[place] - guides.throughput[place]).mean(-1) > GLOSSY
         gloss = torch.zeros_like(surface)
         if glossy.any():
@@ -145,41 +150,23 @@ class LitPoints(nn.Module):
         distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
         return rays, eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
 
-    def _diffuse(
-        self, surface: Tensor, normal: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The points' B₀ without occlusion, and their B₀ + B₁ with occlusion, (H, W, 3) each."""
+    def _diffuse(self, surface: Tensor, normal: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
+        """The points' light without and with learned visibility, (H, W, 3) each."""
         at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
-        found = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, reflects, sent), dim=-1)
+        found = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
         height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
         coarse = found.reshape(1, height, width, 6).permute(0, 3, 1, 2)
         fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear")[0].permute(1, 2, 0)
         return fine[..., :3], fine[..., 3:]
 
-    def arriving(
-        self, at: Tensor, facing: Tensor, source: Tensor, reflects: Tensor, sent: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """B₀ without occlusion and B₀ + B₁ with it, at surfaces (N, 3) with normals `facing` (N, 3): (N, 3) each.
+    def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
+        """Light without and with learned visibility at surfaces (N, 3) with normals `facing` (N, 3): (N, 3) each.
 
-        The points are at `source` and reflect and send so much, (L, 3) each.
+        The points are at `source` and send so much, (L, 3) each.
         """
-        factors, leaving = self.form_factors(at, facing, source), self.leaving(source, reflects, sent)
-        surfaces = self.visibility.surfaces
+        factors, surfaces = self.form_factors(at, facing, source), self.visibility.surfaces
         seen = factors * self.visibility(surfaces(at, facing), surfaces(source, self.normal))
-        return factors @ sent, seen @ leaving
-
-    def leaving(self, source: Tensor, reflects: Tensor, sent: Tensor) -> Tensor:
-        """B₀ + B₁ of each point, (L, 3)."""
-        return sent + reflects * (self.between(source) @ sent) * self.reaches(edges=4)
-
-    def reaches(self, edges: int) -> bool:
-        """Whether paths of so many edges are in the images."""
-        return self._max_depth < 0 or edges <= self._max_depth
-
-    def between(self, source: Tensor) -> Tensor:
-        """F ∘ V between the points, (L, L)."""
-        senders = self.visibility.surfaces(source, self.normal)
-        return self.form_factors(source, self.normal, source) * self.visibility(senders, senders)
+        return factors @ sent, seen @ sent
 
     def form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
         """cos θ cos θ′ A / (π r²) between surfaces (N, 3) with normals `facing` (N, 3) and each point, (N, L)."""

@@ -40,8 +40,9 @@ def train(
     those of `photonfarm work --ahead` wait for a trainer once they are so many samples ahead. An interrupt (Ctrl-C, or
     a notebook's stop button) ends training with a checkpoint, and the same call goes on.
 
-    Raises SpecError for settings that cannot be and a new run that ended before anything was rendered, StoreError for a
-    store that cannot be read and a folder that cannot be written, and DivergedError if training diverges.
+    Raises SpecError for settings that cannot be, StoreError for a store that cannot be read and a folder that cannot be
+    written, IncompleteError if `max_seconds` were over before anything was rendered, and DivergedError if training
+    diverges.
     """
     from photonfarm.shared.store import Store  # torch is slow to load, and settings are read without it
     from photonfarm.shared.store.read.find import scene_named

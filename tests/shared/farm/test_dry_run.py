@@ -265,7 +265,7 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
     assert first.endswith(": 12 samples would be planned, 0 are already")
     assert second == "at most 0.1 MB before compression; 14 core-seconds: 3.4 s on the 4 cores here"
     assert third.startswith("suggested at this cost: half_spp = ")
-    assert third.endswith("% less excess error predicted")
+    assert "% less excess error predicted for light_transport" in third
     assert not (tmp_path / "none").exists()
 
 

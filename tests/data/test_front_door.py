@@ -191,7 +191,7 @@ def test_guides_come_with_the_samples_of_a_scene_that_has_them(tmp_path: Path) -
 
 
 def test_wrong_names_raise_with_those_that_exist(scene: Scene, tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=scene.id):
+    with pytest.raises(StoreError, match=rf"{scene.id} \(small\)"):
         open_scene(tmp_path / "store", "large")
     with pytest.raises(StoreError):
         open_scene(tmp_path / "nowhere", "small")

@@ -26,19 +26,21 @@ def scene_named(store: Store, text: str) -> str:
     """The id of a scene, given its id, the beginning of its id, or its name; StoreError unless exactly one fits."""
     ids = store.scene_ids()
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
-    found = found or [each for each in ids if _has_name(store, each, text)]
+    found = found or [each for each in ids if _name(store, each) == text]
     if len(found) != 1:
         held = f"{len(found)} scenes have" if found else "no scene has"
-        known = f"give one of the ids {', '.join(found or ids)}" if ids else "the store has no scenes yet"
+        each_named = ", ".join(f"{each} ({_name(store, each) or 'unreadable'})" for each in found or ids)
+        known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return found[0]
 
 
-def _has_name(store: Store, scene_id: str, name: str) -> bool:
+def _name(store: Store, scene_id: str) -> str | None:
+    """The name of a scene; None if its spec is unreadable: then it has to be named by its id."""
     try:
-        return store.scene(scene_id).spec.name == name
-    except StoreError:  # unreadable: it has to be named by its id
-        return False
+        return store.scene(scene_id).spec.name
+    except StoreError:
+        return None
 
 
 def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:

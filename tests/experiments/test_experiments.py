@@ -216,13 +216,23 @@ def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment,
         stages.train()
 
 
-def test_training_that_ends_early_without_an_error_is_not_taken_for_done(tiny: Experiment, tmp_path: Path) -> None:
-    """Nothing is rendered, and the trainer waits for samples until its time is over; then it exits with 0."""
+def test_training_without_a_sample_in_its_time_ends_a_stage(tiny: Experiment, tmp_path: Path) -> None:
     brief = with_size(
         tiny, train={**tiny.size.train, "max_seconds": 0.1}, architectures=("light_transport",), seeds=(0,)
     )
     stages = Stages(brief, tmp_path / "work", workers=1)
     stages.write_spec()
+    with pytest.raises(StageError, match="exit code 7"):
+        stages.train()
+
+
+def test_training_that_ends_early_without_an_error_is_not_taken_for_done(
+    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one that SIGTERM stopped, whose exit code is 0."""
+    stages = Stages(with_size(tiny, architectures=("light_transport",), seeds=(0,)), tmp_path / "work", workers=1)
+    stages.write_spec()
+    monkeypatch.setattr(Stages, "_verb", lambda *_, **__: None)
     with pytest.raises(StageError, match="stopped early"):
         stages.train()
 

@@ -59,9 +59,9 @@ OPEN_SHARDS = 400
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
-    def __init__(self, root: str | Path, scene_id: str) -> None:
-        """Take the scene to follow; store, scene and plans may appear later."""
-        self._with_guides = False
+    def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
+        """Take the scene to follow; store, scene and plans may appear later. With `guides`, samples come with them."""
+        self._with_guides = guides
         self._guides: GuideStore | None = None
         self._guided: set[int] = set()  # jobs whose guides are there
         self._storage = open_storage(root)

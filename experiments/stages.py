@@ -187,7 +187,8 @@ class Stages:
         """
         size, out = self.experiment.size, self.folder / "report"
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
-        denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
+        if size.untrained:  # `--kept` is for these
+            denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
         self._tell_commits(out / "report.json")
         if again := self.experiment.again():

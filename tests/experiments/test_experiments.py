@@ -216,6 +216,19 @@ def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment,
         stages.train()
 
 
+@pytest.mark.parametrize(("untrained", "kept"), [(("oidn",), True), ((), False)])
+def test_kept_pixels_are_asked_for_with_denoisers_that_come_ready_alone(
+    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, untrained: tuple[str, ...], kept: bool
+) -> None:
+    """`photonfarm report` refuses --kept without --denoiser."""
+    asked: list[str] = []
+    monkeypatch.setattr(Stages, "_verb", lambda _, __, arguments, **___: asked.extend(map(str, arguments)))
+    monkeypatch.setattr(Stages, "_tell_commits", lambda *_: None)
+    Stages(with_size(tiny, untrained=untrained), tmp_path / "work", workers=1).report()
+    assert asked[0] == "report"
+    assert ("--kept" in asked) is ("--denoiser" in asked) is kept
+
+
 def test_training_without_a_sample_in_its_time_ends_a_stage(tiny: Experiment, tmp_path: Path) -> None:
     brief = with_size(
         tiny, train={**tiny.size.train, "max_seconds": 0.1}, architectures=("light_transport",), seeds=(0,)

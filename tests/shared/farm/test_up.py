@@ -37,7 +37,7 @@ def test_the_log_of_another_run_is_not_counted_where_nothing_is_trained(store: S
     (tmp_path / "metrics.jsonl").write_text(json.dumps(record) + "\n")
     assert up._Farm(scene, tmp_path, 0).look() == up.FarmProgress((0, 3), (0, 0), 0, 0, "")
     trained = up._Farm(scene, tmp_path, 10).look()
-    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 3 views")
+    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 3 samples")
 
 
 def test_a_process_that_was_killed_is_told_apart_from_one_that_failed() -> None:

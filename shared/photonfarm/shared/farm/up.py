@@ -218,7 +218,7 @@ class _Farm:
             self.step = record.get("step", self.step)
             if record.get("kind") == "validation":
                 error = stated(record["error"], record["standard_error"])
-                self.note = f", held-out error {error} on {record['held_out']} views"
+                self.note = f", held-out error {error} on {record['held_out']} samples"
         found = self.scene.progress()
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]

@@ -103,16 +103,11 @@ def run(pending: list[str], settings: MeasureSettings, folder: Path, key: dict[s
                 continue
             result = measure(name, PLANS[name], settings, scene)
             result |= {"settings": key, "machine": machine(), "commit": commit, "took_s": time.perf_counter() - start}
-            store(folder / f"{name}.json", result)
+            write_whole(folder / f"{name}.json", json.dumps(result, indent=1) + "\n")
             say(f"  took {result['took_s']:.0f} s")
             del scene
             gc.collect()
     return left_out
-
-
-def store(path: Path, result: dict[str, Any]) -> None:
-    """Write the result as a whole or not at all."""
-    write_whole(path, json.dumps(result, indent=1) + "\n")
 
 
 def kept(folder: Path, name: str, key: dict[str, Any]) -> dict[str, Any] | None:

@@ -18,6 +18,7 @@ from bench.renderer.peers.measure import MeasuredMethod
 from bench.renderer.peers.methods import Shot, calibrate
 from bench.renderer.peers.plans import BUDGETS, METHODS, PLAN_SECONDS, PLANS, estimated_seconds
 from photonfarm.renderer.cli import scene_plan
+from photonfarm.shared.core.files import write_whole
 
 TRUTH = np.ones((16, 16, 3))
 
@@ -167,7 +168,7 @@ def test_a_plot_is_written_for_a_scene(tmp_path: Path) -> None:
 def test_a_result_counts_only_for_equal_settings(tmp_path: Path) -> None:
     key = {"seconds": 1.0, "methods": ["path"]}
     assert render.kept(tmp_path, "cove", key) is None
-    render.store(tmp_path / "cove.json", {"settings": key, "rows": {}})
+    write_whole(tmp_path / "cove.json", json.dumps({"settings": key, "rows": {}}))
     assert render.kept(tmp_path, "cove", json.loads(json.dumps(key))) is not None
     assert render.kept(tmp_path, "cove", {**key, "seconds": 2.0}) is None
     (tmp_path / "cove.json").write_text('{"settings": ')

@@ -69,7 +69,7 @@ def check(report: StoreReport, as_json: bool) -> None:
         click.echo(f"{wrong} findings; --repair sets aside what can be written again")
     elif report.exit_code == StoreError.exit_code:
         click.echo(
-            "something is still wrong that --repair cannot repair: see above for what helps. A plan comes back from a "
+            "something is still wrong, and --repair does not help: see above for what does. A plan comes back from a "
             "copy of its folder below plans/; jobs and base need no copy, and are rendered again"
         )
 

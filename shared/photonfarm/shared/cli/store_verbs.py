@@ -33,7 +33,7 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
     request. It only moves files; in a bucket, a move is a copy and then a delete.
 
     Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
-    4 something is wrong (also what --repair cannot repair, which the text says).
+    4 something is wrong (also where --repair does not help, which the text says).
     """
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.store import Store

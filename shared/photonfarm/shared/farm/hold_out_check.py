@@ -13,6 +13,7 @@ from photonfarm.shared.plan.top_up import PlannedViews
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
+from photonfarm.shared.store.write.plans import content
 
 
 def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Request) -> None:
@@ -38,7 +39,7 @@ def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> PlannedView
     plans = []
     if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
         plans = opened.scene(spec.scene_id).plans()
-    known = PlannedContent((plan.first_row, plan.rows) for plan in plans)
+    known = content(plans)
     first_job, shard_rows = (plans[-1].end_job, plans[0].shard_rows) if plans else (0, SHARD_ROWS)
     new = expand(spec, wanted, known, first_job=first_job, shard_rows=shard_rows).rows
     more = [] if new is None else [(first_job * shard_rows, new)]

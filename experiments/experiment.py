@@ -10,7 +10,9 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import Frozen, Name, SceneSpec, parse_spec, sentences
+from photonfarm.shared.core.models import Frozen, Name, sentences
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 
 HERE = Path(__file__).parent
 SIZES = "sizes.toml"

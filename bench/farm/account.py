@@ -20,7 +20,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import NamedSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import JobWriter, SceneStore, Store
 
 WRITER = "writer of job"  # how a JobWriter's thread is named

@@ -21,7 +21,7 @@ from bench.harness.processes import Processes, answer
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.shared.core.processes import tied
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneStore
 from photonfarm.shared.store.format import markers
 

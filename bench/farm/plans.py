@@ -73,7 +73,7 @@ NamedSteps = Iterable[tuple[str, Callable[[], Any]]]
 def submit(options: argparse.Namespace) -> NamedSteps:
     from photonfarm.shared.farm import submission
     from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec import NamedSpec
+    from photonfarm.shared.scene.spec_loading import NamedSpec
 
     request = Request(modifications=options.samples // options.views, views_per_modification=options.views)
     store = options.folder / "store"

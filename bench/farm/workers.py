@@ -18,7 +18,7 @@ from typing import Any
 from bench.harness import results
 from bench.harness.processes import Processes, answer
 from bench.harness.scenes import square
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 
 WARM_UP = 2  # samples
 

@@ -37,7 +37,8 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.merge import merge_view
 from photonfarm.shared.store.read.reader import SceneReader

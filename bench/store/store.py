@@ -354,7 +354,7 @@ def main() -> int:
 def run(folder: Path, options: argparse.Namespace) -> tuple[list[StoreSpeed], Any, Any]:
     """All measurements: the bytes, which renders the contents, then reading and writing."""
     from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec import load_spec
+    from photonfarm.shared.scene.spec_loading import load_spec
 
     spec = square(load_spec(options.spec), options.size)
     contents = Contents(spec)

@@ -36,7 +36,8 @@ from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photon
 from photonfarm.shared.plan.hold_out import units_of
 from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
 from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, find_scene, load_spec, shape_ids
+from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, shape_ids
+from photonfarm.shared.scene.spec_loading import find_scene, load_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples

@@ -26,7 +26,8 @@ from bench.harness import results
 from bench.harness.contents import Contents, commit, commit_guides
 from bench.harness.scenes import square
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.feed import Feed

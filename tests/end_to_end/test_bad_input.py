@@ -17,7 +17,7 @@ from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import NamedSpec, load_spec
+from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.store_source import StoreSource
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format.schema import guide_arrays
 from photonfarm.shared.store.write.guides import NOISY

@@ -1,6 +1,7 @@
 import pytest
 
-from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 
 DESCRIBED = {
     "name": "test-room",

@@ -8,7 +8,8 @@ import pytest
 
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
 from photonfarm.shared.store.format.schema import guide_arrays
 

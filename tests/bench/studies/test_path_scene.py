@@ -15,7 +15,8 @@ from bench.studies.path_scene import Costs
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.core.records import F32, arrays_of
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import sample_view
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.reader import StoredSample

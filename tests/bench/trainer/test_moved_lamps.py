@@ -27,7 +27,8 @@ from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.core.records import F32, ViewBuffers
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import Emitters, SceneSpec, load_spec
+from photonfarm.shared.scene.spec import Emitters, SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.data.store_source import StoreSource

@@ -12,7 +12,8 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.dataset import TrainingBatch, read_into

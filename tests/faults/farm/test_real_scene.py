@@ -13,7 +13,7 @@ from photonfarm.renderer.worker.worker import CHILD, run_worker
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.scene.spec import parse_spec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 

@@ -250,7 +250,8 @@ def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded
 def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: type
 ) -> None:
-    from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+    from photonfarm.shared.scene.spec import SceneSpec
+    from photonfarm.shared.scene.spec_loading import parse_spec
 
     folders = [tmp_path / "planned", tmp_path / "here"]
     for i, folder in enumerate(folders):

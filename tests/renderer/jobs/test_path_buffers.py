@@ -17,7 +17,8 @@ from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import rest
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, Store
 
 

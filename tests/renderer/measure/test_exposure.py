@@ -16,7 +16,8 @@ from photonfarm.renderer.measure.exposure import Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec
+from photonfarm.shared.scene.spec import Film, SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 
 
 def pictures(values: np.ndarray, noise: float = 0.0) -> Pictures:

@@ -22,7 +22,8 @@ from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Surface
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, Store
 

@@ -17,7 +17,8 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
 from photonfarm.shared.scene.view import View
 
 SOME = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 0.3)

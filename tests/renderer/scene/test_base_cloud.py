@@ -12,7 +12,7 @@ from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.core.records import STATIC
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 
 CHECKS = {
     "type": "checkerboard",

@@ -17,7 +17,8 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.scene.files import BUILTIN_EMITTING
 from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
 from photonfarm.shared.scene.view import View
 
 Loader = Callable[..., LoadedScene]

@@ -6,7 +6,8 @@ import pytest
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.shared.core.records import ViewBuffers
-from photonfarm.shared.scene.spec import SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import Camera, View
 
 COLOUR = (0.2, 0.4, 0.6)

@@ -17,7 +17,8 @@ from photonfarm.shared.core.keys import make_key, seed_of, view_key
 from photonfarm.shared.core.records import Guides, arrays_of
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.scene.modification import rest
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import Camera, View
 from photonfarm.shared.store.write.guides import NOISY
 

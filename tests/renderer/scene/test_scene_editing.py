@@ -9,7 +9,8 @@ from photonfarm.renderer.scene import acceleration, backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View, sample_view
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.scene.modification import rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import Camera, View
 
 

@@ -18,7 +18,8 @@ from photonfarm.renderer.scene.visibility import seen_points
 from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import SceneSpec, load_spec, parse_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
 from photonfarm.shared.scene.view import View, sample_view
 
 F64 = NDArray[np.float64]

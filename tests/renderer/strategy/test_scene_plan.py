@@ -19,7 +19,8 @@ from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
 from photonfarm.shared.cli.main import main  # noqa: E402
-from photonfarm.shared.scene.spec import Film, SceneSpec, load_spec, parse_spec  # noqa: E402
+from photonfarm.shared.scene.spec import Film, SceneSpec  # noqa: E402
+from photonfarm.shared.scene.spec_loading import load_spec, parse_spec  # noqa: E402
 
 SPEC = """
 name = "small-box"  # the box

@@ -5,7 +5,7 @@ import pytest
 
 from photonfarm.renderer.strategy.output import spec_file
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import find_spec, load_spec
+from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 
 SETTINGS = {"transport": {"connections": 0, "light_ratio": 4.0, "half_spp": 9}, "photons": {"paths": 0, "depth": 2}}
 

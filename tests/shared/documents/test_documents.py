@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
-from pydantic_core import PydanticUndefined
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.cli.settings import file_defaults
@@ -77,7 +76,7 @@ def test_the_page_of_the_scene_spec_lists_every_key_and_its_default(section: str
     fields = SECTIONS[section].model_fields
     assert {name for name in told if "." not in name} == set(fields)
     for name, field in fields.items():
-        if field.default is PydanticUndefined:
+        if field.is_required():
             assert told[name] == "required", name
         elif isinstance(field.default, int | float):
             assert float(told[name]) == field.default, name

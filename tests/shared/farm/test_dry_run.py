@@ -20,7 +20,8 @@ from photonfarm.shared.farm.dry_run import DryRun, costs_by_renderer, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import GuideSpec, NamedSpec, load_spec
+from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.format.schema import bytes_of_rows, most_guide_bytes
 

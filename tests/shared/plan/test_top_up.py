@@ -16,7 +16,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.plan.request import MAX_SAMPLES, Request, sample_key
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 SPP = 8  # of a pass of the small spec: two halves of half_spp = 4

@@ -22,7 +22,7 @@ from photonfarm.shared.farm import submission
 from photonfarm.shared.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, open_queue, queue_status, reconcile, with_password_of
-from photonfarm.shared.scene.spec import NamedSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene

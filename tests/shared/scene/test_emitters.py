@@ -12,7 +12,8 @@ from click.testing import CliRunner
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import Emitters, SceneSpec, find_spec, load_spec, parse_spec
+from photonfarm.shared.scene.spec import Emitters, SceneSpec
+from photonfarm.shared.scene.spec_loading import find_spec, load_spec, parse_spec
 from photonfarm.shared.store import Store
 
 ROOT = Path(__file__).parents[3]

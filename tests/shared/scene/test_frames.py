@@ -12,7 +12,7 @@ from photonfarm.shared.farm.configuration import named_configuration
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 

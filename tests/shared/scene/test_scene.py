@@ -6,7 +6,9 @@ import pytest
 from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import SCENES_VARIABLE, SceneSpec, load_spec, parse_spec, sentences
+from photonfarm.shared.core.models import sentences
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>

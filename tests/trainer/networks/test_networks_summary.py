@@ -2,7 +2,8 @@
 
 import pytest
 
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.trainer.networks.summary import NetworkPart, summary, table
 from photonfarm.trainer.runs.settings import NetworkSettings
 

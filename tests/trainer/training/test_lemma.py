@@ -25,7 +25,8 @@ from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import SceneSpec, load_spec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
 from photonfarm.trainer.networks import ARCHITECTURES, build

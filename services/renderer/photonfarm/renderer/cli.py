@@ -97,7 +97,7 @@ def work(
 def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
     """Write a contact sheet of SPEC's samples: A, B, albedo, normal, depth, photons."""
     from photonfarm.renderer.tools.preview import write_contact_sheet
-    from photonfarm.shared.scene.spec import load_spec
+    from photonfarm.shared.scene.spec_loading import load_spec
     from photonfarm.shared.store.read.reader import SceneReader
 
     write_contact_sheet(SceneReader(store, load_spec(spec).scene_id), count, out)
@@ -188,7 +188,7 @@ def measure_frames(
 def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec import find_spec, load_spec
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
@@ -219,7 +219,7 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
     each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec import find_spec, load_spec
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
@@ -243,7 +243,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     How far views differ in brightness decides how well it is known; more of them help.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec import find_spec, load_spec
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)

@@ -23,9 +23,9 @@ from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.estimate import Estimate, group_means, stated
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import Key, make_key
+from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
-from photonfarm.shared.scene.spec import sentences
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.data.dataset import SampleSource
 from photonfarm.trainer.data.feed import Feed

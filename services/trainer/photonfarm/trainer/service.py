@@ -15,7 +15,7 @@ from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.scene.spec import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
 from photonfarm.trainer.runs.run_folder import held

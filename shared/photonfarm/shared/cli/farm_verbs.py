@@ -27,7 +27,8 @@ def scene() -> None:
 def scene_show(spec: str, as_json: bool) -> None:
     """Check SPEC (a scene.toml, or the name of a ready one) and show what it says."""
     from photonfarm.shared.cli import show
-    from photonfarm.shared.scene.spec import Emitters, load_spec
+    from photonfarm.shared.scene.spec import Emitters
+    from photonfarm.shared.scene.spec_loading import load_spec
 
     loaded = load_spec(spec)
     show.scene(loaded, as_json)
@@ -62,7 +63,7 @@ def submit(
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission
-    from photonfarm.shared.scene.spec import NamedSpec
+    from photonfarm.shared.scene.spec_loading import NamedSpec
 
     named = NamedSpec.load(spec)
     result: submission.Submission
@@ -116,7 +117,7 @@ def top_up(
     """  # noqa: D301 - click wants the character
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import submission
-    from photonfarm.shared.scene.spec import NamedSpec
+    from photonfarm.shared.scene.spec_loading import NamedSpec
 
     url = None if no_queue else redis_url
     result = submission.top_up(NamedSpec.load(spec), store, url, spp, where=where, **options)

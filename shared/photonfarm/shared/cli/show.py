@@ -127,7 +127,7 @@ def submission(result: Submission, as_json: bool) -> None:
         f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
     )
     if result.scenes:
-        from photonfarm.shared.scene.spec import SCENES_VARIABLE
+        from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 

@@ -16,7 +16,8 @@ from photonfarm.shared.farm.submission import Submission
 from photonfarm.shared.plan.allocation import Allocation, CostModel
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import NamedSpec, SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.schema import bytes_of_rows, most_guide_bytes
 from photonfarm.shared.store.io.storage import is_vacant

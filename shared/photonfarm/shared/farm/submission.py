@@ -10,7 +10,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec import NamedSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
 
 

@@ -23,7 +23,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec import SCENES_VARIABLE, NamedSpec, find_spec
+from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5

@@ -27,10 +27,11 @@ from pydantic import Field, ValidationError, model_validator
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key, make_key
+from photonfarm.shared.core.models import Frozen, sentences
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.sampling import contents, modification_keys, modification_vectors, sample_keys, view_vectors
 from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
+from photonfarm.shared.scene.spec import SceneSpec
 
 SHARD_ROWS = 32
 """The default number of samples per job, if neither the caller nor an older plan of the scene sets it."""

@@ -20,6 +20,7 @@ from pydantic import Field, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key
+from photonfarm.shared.core.models import Frozen, sentences
 from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.plan.request import (
     MAX_SAMPLES,
@@ -31,7 +32,7 @@ from photonfarm.shared.plan.request import (
     pack,
 )
 from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
-from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
+from photonfarm.shared.scene.spec import SceneSpec
 
 _A_SHARE = re.compile(r"(?:\d|\d?\.\d{1,25})(?:e-\d{1,3})?")
 """A number as Python writes one between 0 and 1, such as 0.3333333333333333 or 1e-05."""

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.scene.spec import Frozen, sentences
+from photonfarm.shared.core.models import Frozen, sentences
 
 QUEUE = "photonfarm"
 FUNCTION = "photonfarm.renderer.jobs.render.render_shard"

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import Frozen, SceneSpec, sentences
+from photonfarm.shared.core.models import Frozen, sentences
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 
 MOST_FRAMES = 10_000

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,11 +82,6 @@ def _shapeless(root: ElementTree.Element) -> Iterator[str]:
             yield ENVIRONMENT
         elif node.get("type") != "area" and node.get("id"):  # one of type area is there for shapes to refer to
             yield node.get("id", "")
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Up to three known names that resemble an unknown one, for a message."""
-    return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.3)) or "none"
 
 
 def _parse(path: Path) -> ElementTree.Element:

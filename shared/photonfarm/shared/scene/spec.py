@@ -6,42 +6,20 @@ of, is the scene id: equal content gives equal ids on every machine, wherever th
 
 from __future__ import annotations
 
-import json
-import os
-import tomllib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.scene import files as scene_files
+from photonfarm.shared.core.models import Factor, Frozen, Name, Positive, Probability
 
 Vector = tuple[float, float, float]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 BUILTIN_ROOMS = ("cornell", "room")
-SCENES_VARIABLE = "PHOTONFARM_SCENES"
-INPUT_SHOWN = 100
-"""The most characters of a wrong value that a message repeats, as the value may be a whole file."""
-FEW = 3
-"""Up to so many lights, a message about an unknown light names them all."""
-
-
-class Frozen(BaseModel):
-    """A model that cannot change and refuses unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Box(Frozen):
@@ -115,7 +93,7 @@ class Source(Frozen):
 
     file: str | None = None  # beside the spec, or under a folder of PHOTONFARM_SCENES
     builtin: Literal["cornell", "room"] | None = None
-    parameters: dict[str, str] = {}  # values for the scene file's own <default> names
+    parameters: dict[str, str] = Field(default_factory=dict)  # values for the scene file's own <default> names
 
     @model_validator(mode="after")
     def _is_one_or_the_other(self) -> Self:
@@ -193,7 +171,8 @@ class Emitters(Frozen):
     """Factors on the radiance of the scene's own lights: those of its file or built-in room that no `Light` moves."""
 
     all: Factor = 1.0  # for every light: 0 switches it off
-    by_id: dict[str, Factor] = {}  # for single lights instead, by the id of their shape, or "environment"
+    by_id: dict[str, Factor] = Field(default_factory=dict)
+    """For single lights instead, by the id of their shape, or "environment"."""
 
     @model_validator(mode="before")
     @classmethod
@@ -285,159 +264,3 @@ def _canonical(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ",".join(map(_canonical, value)) + "]"
     return repr(value)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-def load_spec(path: str | Path) -> SceneSpec:
-    """The checked spec in a file, TOML or, as stores have it, JSON.
-
-    A bare name such as `room` is looked up among the built-in and ready specs.
-
-    Raises SpecError with one sentence that names the key, the value and the rule.
-    """
-    file = find_spec(str(path))
-    parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
-    try:
-        described = parse(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
-    except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"{file}: cannot be read: {error}") from error
-    except ValueError as error:
-        raise SpecError(f"{file}: is not valid {language}: {error}") from error
-    return parse_spec(described, where=str(file), beside=file.parent)
-
-
-def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = None) -> SceneSpec:
-    """The checked spec in a parsed TOML or JSON document, its scene file found and digested."""
-    spec = _validate({**described, "content": ""}, where)
-    if spec.scene.file is None:
-        content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
-        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
-        _check_shapes(spec, known, where)
-        _check_emitters(spec, scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)], known, where)
-    else:
-        scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
-        content = scene.digest
-        _check_shapes(spec, scene.shape_ids, where)
-        _check_lights(spec, scene.emitting, where)
-        _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
-    return spec.model_copy(update={"content": content})
-
-
-def _validate(described: dict[str, Any], where: str) -> SceneSpec:
-    try:
-        return SceneSpec.model_validate(described)
-    except ValidationError as error:
-        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec)))}") from error
-
-
-def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str]:
-    """One sentence for each fault that a model found: its key, the value and the rule; `known` are the allowed keys."""
-    for fault in error.errors():
-        key = ".".join(map(str, fault["loc"]))
-        rule = fault["msg"].removeprefix("Value error, ")
-        if not key:  # of the whole
-            yield rule
-        elif fault["type"] in ("value_error", "missing"):
-            yield f"{key}: {rule}"
-        elif fault["type"] == "extra_forbidden":
-            yield f"{key}: unknown key; nearest: {scene_files.nearest(str(fault['loc'][-1]), known)}"
-        else:
-            yield f"{key} = {_shortened(repr(fault['input']))}: {rule}"
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
-
-
-def _keys(model: type[BaseModel]) -> set[str]:
-    """The keys of a model and of those in it."""
-    schema = model.model_json_schema()
-    return {key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", ())}
-
-
-def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
-    for group in spec.groups:
-        for shape in group.shapes:
-            if shape not in known:
-                near = scene_files.nearest(shape, known)
-                raise SpecError(
-                    f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene; nearest: {near}"
-                )
-        if isinstance(group, Light) and group.rectangle and group.name in known:
-            raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
-
-
-def _check_lights(spec: SceneSpec, emitting: frozenset[str], where: str) -> None:
-    for light in spec.lights:
-        if light.shapes and not emitting.intersection(light.shapes):
-            raise SpecError(
-                f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
-                "moves belongs under [[objects]]"
-            )
-
-
-def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset[str], where: str) -> None:
-    moved = {shape: light for light in spec.lights for shape in light.shape_ids}
-    for name in spec.emitters.by_id:
-        if name in moved:
-            remedy = "its rectangle has a radiance" if moved[name].rectangle else "to dim it, take it out of [[lights]]"
-            fault = f"is of the movable light {moved[name].name!r}, and factors are of lights that no [[lights]] moves"
-            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; {remedy}")
-        if name not in emitting:
-            fault = "is a shape that emits no light" if name in shapes else "is no light of the scene"
-            own = emitting - set(moved)
-            near = ", ".join(sorted(own)) if 0 < len(own) <= FEW else scene_files.nearest(name, own)
-            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; nearest light: {near}")
-
-
-def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
-    """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
-    if Path(file).is_absolute() and Path(file).is_file():
-        return Path(file)
-    folders = [beside] if beside else []
-    folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
-    for folder in folders:
-        if (folder / file).is_file():
-            return folder / file
-    looked = ", ".join(map(str, folders)) or "nowhere"
-    raise SpecError(
-        f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
-        f"set {SCENES_VARIABLE} to the folder that holds it"
-    )
-
-
-def find_spec(name: str) -> Path:
-    """The file of a spec: a path, or a bare name among `scenes/` here and the built-in ones; else SpecError."""
-    path = Path(name)
-    if path.suffix == ".toml" or path.is_file():
-        return path
-    folders = (Path("scenes"), Path(__file__).parent / "specs")
-    for folder in folders:
-        if (folder / f"{name}.toml").is_file():
-            return folder / f"{name}.toml"
-    known = sorted({file.stem for folder in folders for file in folder.glob("*.toml")})
-    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(known)}")
-
-
-@dataclass(frozen=True, slots=True)
-class NamedSpec:
-    """A checked spec under the name that a user gives it."""
-
-    name: str  # as `load_spec` takes it
-    spec: SceneSpec
-    scenes: str | None
-    """The folder that workers must have in PHOTONFARM_SCENES, if the scene file is found beside the spec alone: workers
-    have the store, and not the spec's file."""
-
-    @classmethod
-    def load(cls, name: str) -> Self:
-        """The spec of a name, as `load_spec` reads it; raises SpecError."""
-        spec = load_spec(name)
-        if spec.scene.file is not None:
-            try:
-                find_scene(spec.scene.file, name)
-            except SpecError:
-                return cls(name, spec, str(find_spec(name).absolute().parent))
-        return cls(name, spec, None)

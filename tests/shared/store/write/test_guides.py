@@ -23,7 +23,8 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.queue import connect, open_queue
 from photonfarm.shared.queue.entries import queued_names
-from photonfarm.shared.scene.spec import GuideSpec, NamedSpec
+from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.shared.store.format.declarations import GUIDES
 from photonfarm.shared.store.write.guides import NOISY, rounded

@@ -34,7 +34,8 @@ from photonfarm.shared.core.records import (
 )
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, parse_spec
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 

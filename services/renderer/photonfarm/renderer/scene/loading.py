@@ -18,7 +18,8 @@ from photonfarm.renderer.scene.dimming import dim, factor_of
 from photonfarm.renderer.scene.rooms.shapes import rectangle_light
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.files import SceneFile
-from photonfarm.shared.scene.spec import SceneSpec, find_scene
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import find_scene
 
 
 def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:

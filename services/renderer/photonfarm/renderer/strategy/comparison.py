@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import Candidate
-from photonfarm.shared.scene.spec import Frozen
+from photonfarm.shared.core.models import Frozen
 
 CLEAR = 2.0
 """The standard errors by which two candidates must differ to be distinguished."""

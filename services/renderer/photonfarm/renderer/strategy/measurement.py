@@ -15,7 +15,8 @@ from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeE
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
 from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
-from photonfarm.shared.scene.spec import Film, Frozen, SceneSpec
+from photonfarm.shared.core.models import Frozen
+from photonfarm.shared.scene.spec import Film, SceneSpec
 
 GRID = tuple(
     Candidate(c, r)

@@ -59,7 +59,7 @@ def _optional(finding: MachineCheck, note: str) -> MachineCheck:
 def _renders() -> str:
     from photonfarm.renderer.scene import backend
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
-    from photonfarm.shared.scene.spec import load_spec
+    from photonfarm.shared.scene.spec_loading import load_spec
     from photonfarm.shared.scene.view import sample_view
 
     mi = backend.load(threads=1)
@@ -116,7 +116,7 @@ def _reaches(url: str) -> str:
 
 
 def _scenes() -> MachineCheck:
-    from photonfarm.shared.scene.spec import SCENES_VARIABLE
+    from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
     folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
     found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))

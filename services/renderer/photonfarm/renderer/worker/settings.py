@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from photonfarm.shared.scene.spec import Count, Frozen, Positive
+from photonfarm.shared.core.models import Count, Frozen, Positive
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.

@@ -13,8 +13,8 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.models import Count, Frozen, Positive, sentences
 from photonfarm.shared.plan.hold_out import HOLD_OUT
-from photonfarm.shared.scene.spec import Count, Frozen, Positive, sentences
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.user_code import is_own
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.scene.spec import sentences
+from photonfarm.shared.core.models import sentences
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import SETTINGS
 from photonfarm.trainer.runs.settings import KEYS, TrainSettings

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
-from photonfarm.shared.scene.spec import sentences
+from photonfarm.shared.core.models import sentences
 from photonfarm.shared.store.io.storage import Storage, put_json
 
 COMMITTED = "committed"

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import CorruptError, SpecError, store_errors
+from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import F32, Guides, arrays_of
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, sentences
+from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.io.storage import Storage, put_json
 from photonfarm.shared.store.write import plans

@@ -16,11 +16,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from photonfarm.shared.core.errors import CorruptError, store_errors
 from photonfarm.shared.core.keys import Key
+from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import UNUSED, Expansion, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema
 from photonfarm.shared.store.io.storage import Storage

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec, sentences
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import plans

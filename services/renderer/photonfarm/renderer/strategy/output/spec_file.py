@@ -15,7 +15,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.files import whole_file
-from photonfarm.shared.scene import spec as scene
+from photonfarm.shared.scene import spec_loading as scene
 
 BYTE_ORDER_MARK = "\ufeff"
 """The character with which some editors begin a file."""

@@ -1,0 +1,155 @@
+"""Spec files: found by name, read, and checked against the scene file that they name."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import BaseModel, ValidationError
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.models import nearest, sentences
+from photonfarm.shared.scene import files as scene_files
+from photonfarm.shared.scene.spec import Light, SceneSpec
+
+SCENES_VARIABLE = "PHOTONFARM_SCENES"
+FEW = 3
+"""Up to so many lights, a message about an unknown light names them all."""
+
+
+def load_spec(path: str | Path) -> SceneSpec:
+    """The checked spec in a file, TOML or, as stores have it, JSON.
+
+    A bare name such as `room` is looked up among the built-in and ready specs.
+
+    Raises SpecError with one sentence that names the key, the value and the rule.
+    """
+    file = find_spec(str(path))
+    parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
+    try:
+        described = parse(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"{file}: cannot be read: {error}") from error
+    except ValueError as error:
+        raise SpecError(f"{file}: is not valid {language}: {error}") from error
+    return parse_spec(described, where=str(file), beside=file.parent)
+
+
+def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = None) -> SceneSpec:
+    """The checked spec in a parsed TOML or JSON document, its scene file found and digested."""
+    spec = _validate({**described, "content": ""}, where)
+    if spec.scene.file is None:
+        content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
+        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
+        _check_shapes(spec, known, where)
+        _check_emitters(spec, scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)], known, where)
+    else:
+        scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
+        content = scene.digest
+        _check_shapes(spec, scene.shape_ids, where)
+        _check_lights(spec, scene.emitting, where)
+        _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
+    return spec.model_copy(update={"content": content})
+
+
+def _validate(described: dict[str, Any], where: str) -> SceneSpec:
+    try:
+        return SceneSpec.model_validate(described)
+    except ValidationError as error:
+        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec)))}") from error
+
+
+def _keys(model: type[BaseModel]) -> set[str]:
+    """The keys of a model and of those in it."""
+    schema = model.model_json_schema()
+    return {key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", ())}
+
+
+def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
+    for group in spec.groups:
+        for shape in group.shapes:
+            if shape not in known:
+                near = nearest(shape, known)
+                raise SpecError(
+                    f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene; nearest: {near}"
+                )
+        if isinstance(group, Light) and group.rectangle and group.name in known:
+            raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
+
+
+def _check_lights(spec: SceneSpec, emitting: frozenset[str], where: str) -> None:
+    for light in spec.lights:
+        if light.shapes and not emitting.intersection(light.shapes):
+            raise SpecError(
+                f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
+                "moves belongs under [[objects]]"
+            )
+
+
+def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset[str], where: str) -> None:
+    moved = {shape: light for light in spec.lights for shape in light.shape_ids}
+    for name in spec.emitters.by_id:
+        if name in moved:
+            remedy = "its rectangle has a radiance" if moved[name].rectangle else "to dim it, take it out of [[lights]]"
+            fault = f"is of the movable light {moved[name].name!r}, and factors are of lights that no [[lights]] moves"
+            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; {remedy}")
+        if name not in emitting:
+            fault = "is a shape that emits no light" if name in shapes else "is no light of the scene"
+            own = emitting - set(moved)
+            near = ", ".join(sorted(own)) if 0 < len(own) <= FEW else nearest(name, own)
+            raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; nearest light: {near}")
+
+
+def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
+    """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
+    if Path(file).is_absolute() and Path(file).is_file():
+        return Path(file)
+    folders = [beside] if beside else []
+    folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
+    for folder in folders:
+        if (folder / file).is_file():
+            return folder / file
+    looked = ", ".join(map(str, folders)) or "nowhere"
+    raise SpecError(
+        f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
+        f"set {SCENES_VARIABLE} to the folder that holds it"
+    )
+
+
+def find_spec(name: str) -> Path:
+    """The file of a spec: a path, or a bare name among `scenes/` here and the built-in ones; else SpecError."""
+    path = Path(name)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    folders = (Path("scenes"), Path(__file__).parent / "specs")
+    for folder in folders:
+        if (folder / f"{name}.toml").is_file():
+            return folder / f"{name}.toml"
+    known = sorted({file.stem for folder in folders for file in folder.glob("*.toml")})
+    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(known)}")
+
+
+@dataclass(frozen=True, slots=True)
+class NamedSpec:
+    """A checked spec under the name that a user gives it."""
+
+    name: str  # as `load_spec` takes it
+    spec: SceneSpec
+    scenes: str | None
+    """The folder that workers must have in PHOTONFARM_SCENES, if the scene file is found beside the spec alone: workers
+    have the store, and not the spec's file."""
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """The spec of a name, as `load_spec` reads it; raises SpecError."""
+        spec = load_spec(name)
+        if spec.scene.file is not None:
+            try:
+                find_scene(spec.scene.file, name)
+            except SpecError:
+                return cls(name, spec, str(find_spec(name).absolute().parent))
+        return cls(name, spec, None)

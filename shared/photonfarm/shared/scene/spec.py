@@ -1,4 +1,4 @@
-"""The scene spec: what to render and what may change, as frozen models read from a `scene.toml`.
+"""The scene spec: what to render and what may change, as frozen models; `spec_loading` reads them from a file.
 
 Lengths are in scene units, angles in degrees. The spec's content digest, with the bytes of every file the scene is made
 of, is the scene id: equal content gives equal ids on every machine, wherever the files lie.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import re
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -37,7 +36,6 @@ BESIDE = {
 that lie close together."""
 
 COLUMNS = 2
-TITLE_WIDTH = 36  # letters of a line
 GREY = "#777777"  # of denoisers; no network has it
 REPLICATES = 4000
 
@@ -180,6 +178,4 @@ def _draw(axes: Axes, room: Room) -> None:
     for each in placed(room, NETWORKS):
         axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
     axes.margins(0.09, 0.1)
-    kind, _, name = room.document["title"].partition(": ")
-    title = "\n".join([f"{kind}:", *textwrap.wrap(name, TITLE_WIDTH)])
-    axes.set(title=title, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")
+    axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")

@@ -70,13 +70,13 @@ def _described(room: Room) -> str:
 
 
 def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
-    """What holds of the rooms: once where it is the same of all, or else each with the rooms that it is of."""
+    """What holds of most rooms, and then what holds of the others, with their names."""
     found: dict[str, list[str]] = {}
     for room in rooms:
         found.setdefault(of(room), []).append(room.name)
-    if len(found) == 1:
-        return next(iter(found))
-    return "; ".join(f"{what} ({', '.join(which)})" for what, which in found.items())
+    most = max(found, key=lambda what: len(found[what]))
+    others = [f"{', '.join(which)}: {what}" for what, which in found.items() if what != most]
+    return f"{most} ({'; '.join(others)})" if others else most
 
 
 def wrapped(text: str, first: str = "", others: str = "") -> str:

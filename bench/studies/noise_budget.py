@@ -283,7 +283,7 @@ intervals of a bootstrap of {len(found.kappas)} replicates, each fitted anew: he
 replacement, the same for all arms of a room, and each arm's mean moved by a normal deviate of what seeds move it,
 pooled over its room. These deviates are drawn independently, though arms of one seed are not quite that: the
 configurations of those with few are among those of the others. Where a range reaches the end of the grid that was
-searched, "or more", "or less", the constant is bounded on one side only, and its best value says little.
+searched, "or more", "or less", the data do not bound the constant at that end, and its best value says little.
 
 {parts}"""
 

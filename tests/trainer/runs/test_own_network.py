@@ -162,6 +162,7 @@ def test_what_is_no_network_is_refused(mine: str, store: Path, name: str, lacks:
         ("    def __init__(self): super().__init__()", "made from (settings, frame)"),
         ("    def forward(self, inputs): return self.layers(inputs.albedo)", "line 4, in forward: RuntimeError: mat1"),
         ("    def forward(self, inputs): return super().forward(inputs)[..., :1]", "(2, 16, 16, 1)"),
+        ("    def forward(self, inputs): return inputs.photons.power", "`needs` does not name are None"),
     ],
 )
 def test_an_error_in_a_users_network_is_one_sentence(

@@ -198,6 +198,6 @@ def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mappi
     before = state["store"]["plans"]
     if list(plans[: len(before)]) != before:
         raise SpecError(
-            f"{path}: was trained on {len(before)} plans with which this store does not begin; "
-            "use another run directory, or the store that it was trained on"
+            f"{path}: was trained on samples of another store, or of other plans; use another run folder (--run), or the "
+            "store that it was trained on (--store)"
         )

@@ -43,6 +43,11 @@ def load(key: str, name: str) -> Any:
     return getattr(found, attribute)
 
 
+def _hint(error: Exception) -> str:
+    is_of_none = isinstance(error, AttributeError) and error.obj is None
+    return "; inputs that the network's `needs` does not name are None" if is_of_none else ""
+
+
 @contextmanager
 def named_in_errors(**own: str) -> Iterator[None]:
     """Turn an error from inside a user's module into a SpecError of one sentence, which names the line.
@@ -59,5 +64,5 @@ def named_in_errors(**own: str) -> Iterator[None]:
             file = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
             if is_own(name) and (found := [frame for frame in frames if frame.filename == file]):
                 where = f"{file}, line {found[-1].lineno}, in {found[-1].name}"
-                raise SpecError(f"{key} = {name!r}: {where}: {type(error).__name__}: {error}") from error
+                raise SpecError(f"{key} = {name!r}: {where}: {type(error).__name__}: {error}{_hint(error)}") from error
         raise

@@ -198,6 +198,6 @@ def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mappi
     before = state["store"]["plans"]
     if list(plans[: len(before)]) != before:
         raise SpecError(
-            f"{path}: was trained on samples of another store, or of other plans; use another run folder (--run), or the "
-            "store that it was trained on (--store)"
+            f"{path}: was trained on samples of another store, or of other plans; use another run folder (--run), or "
+            "the store that it was trained on (--store)"
         )

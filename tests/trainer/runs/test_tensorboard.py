@@ -1,6 +1,7 @@
 """What TensorBoard reads of a run, by its own reader."""
 
 import io
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,7 @@ def test_what_was_shown_after_the_checkpoint_is_taken_back_when_the_run_goes_on(
 def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tiny, run) -> None:
     for steps in (12, 12, 15):
         trained(make_source(24), tiny(max_steps=steps), run)
+        time.sleep(1)  # event files are read by name, and their names order sessions of one process by the second
     events = accumulated(run)
     assert [e.step for e in events.Scalars("error/held out")] == [0, 5, 10, 12, 15]
     assert [e.step for e in events.Images("held out/target above prediction")] == [0, 5, 10, 12, 15]

@@ -1,0 +1,139 @@
+"""What an export holds of each sample: its columns, by name, with type, shape, unit and meaning.
+
+Shape letters: H W image, G movable groups, P points of the cloud, K photon slots, L lit points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.records import Guides
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store.format import declarations, schema
+
+BUFFERS = ("albedo", "normal", "depth")
+"""The buffers that every view has."""
+
+GUIDES = tuple(field.name for field in fields(Guides))
+"""The guides, which views of a scene with guides have too."""
+
+HALVES = ("A", "B")
+"""The names of the two half-estimates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A value that each sample has."""
+
+    name: str
+    dtype: str  # numpy's name of it; "str" for text
+    shape: tuple[int, ...]  # () for a single value
+    unit: str
+    meaning: str
+    fact: bool = False  # it says what the sample is: kilobytes at most, written as JSON where a format has JSON
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What each file of an export holds."""
+
+    columns: tuple[Column, ...]
+    about: dict[str, Any]  # what is the same for all samples, for formats that have JSON
+    single: bool  # one sample per file
+
+    @property
+    def facts(self) -> list[Column]:
+        """What says what a sample is."""
+        return [column for column in self.columns if column.fact]
+
+    @property
+    def images(self) -> list[Column]:
+        """What has a value for each pixel."""
+        size = self._size
+        return [column for column in self.columns if not column.fact and column.shape[:2] == size]
+
+    @property
+    def others(self) -> list[Column]:
+        """What is neither."""
+        size = self._size
+        return [column for column in self.columns if not column.fact and column.shape[:2] != size]
+
+    @property
+    def _size(self) -> tuple[int, ...]:
+        return next(column.shape[:2] for column in self.columns if column.name == HALVES[0])
+
+
+def buffers_named(text: str, *, has_guides: bool) -> tuple[str, ...]:
+    """The buffers that `--buffers` asks for: "all", "none", or names with commas between them.
+
+    Raises SpecError for a name that is not there.
+    """
+    there = (*BUFFERS, *GUIDES) if has_guides else BUFFERS
+    if text in ("all", "none"):
+        return there if text == "all" else ()
+    asked = [name.strip() for name in text.split(",")]
+    for name in asked:
+        if name not in there:
+            lacks = "the scene has no guides, which `photonfarm store upgrade` adds; " if name in GUIDES else ""
+            raise SpecError(f"--buffers: {name!r} is not there: {lacks}allowed are all, none, or {', '.join(there)}")
+    return tuple(name for name in there if name in asked)
+
+
+def columns(spec: SceneSpec, buffers: Sequence[str], *, visibility: bool) -> tuple[Column, ...]:
+    """The columns of a scene's samples: facts, the half-estimates, buffers, and visibility if it is asked for."""
+    size = (spec.film.height, spec.film.width)
+    unit, _ = _declared("radiance")
+    halves = [Column(name, "float32", (*size, 3), unit, _half(name)) for name in HALVES]
+    return (*_facts(spec), *halves, *(_stored(spec, name) for name in buffers), *(_seen(spec) if visibility else ()))
+
+
+def _half(name: str) -> str:
+    other = HALVES[name == "A"]
+    return f"linear RGB, mean over the pixel, not clipped; a noisy estimate of the image, independent of {other}"
+
+
+def _facts(spec: SceneSpec) -> list[Column]:
+    groups = len(spec.groups)
+    moved = Column("modification", "float32", (groups, 4), "scene units; the last: 1", "of each movable group, in the "
+                   "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed")  # fmt: skip
+    found = [
+        Column("row", "int64", (), "1", "the sample's row in the store"),
+        Column("key", "str", (), "", "the sample's content key, hexadecimal"),
+        Column("split", "str", (), "", "train, or held-out: of a configuration to be kept from training"),
+        Column("pass", "int64", (), "1", "number of the noisy pass of this view, from 0"),
+        Column("configuration_key", "str", (), "", "content key of the configuration: equal for all its views"),
+        Column("view_key", "str", (), "", "content key of configuration and view: equal for all its passes"),
+        *([moved] if groups else []),
+        Column("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
+        Column("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
+        Column("camera_to_world", "float64", (4, 4), "scene units", "columns: the camera's right, up and backward, "
+               "and where it stands (the convention of NeRF and OpenGL)"),
+        Column("seed_A", "int64", (), "1", "seed of A"),
+        Column("seed_B", "int64", (), "1", "seed of B"),
+        Column("job", "int64", (), "1", "the render job that it came from"),
+        Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
+    ]  # fmt: skip
+    return [Column(each.name, each.dtype, each.shape, each.unit, each.meaning, fact=True) for each in found]
+
+
+def _stored(spec: SceneSpec, name: str) -> Column:
+    """A buffer or guide in the type that the store has: its values are the stored ones."""
+    array = (schema.output_arrays(spec) | schema.guide_arrays(spec))[name]
+    return Column(name, array.dtype.name, array.shape, *_declared(name))
+
+
+def _seen(spec: SceneSpec) -> list[Column]:
+    found = []
+    for name, count in schema.bit_counts(spec).items():
+        what = "point of the cloud" if name == "point_seen" else "photon of the configuration"
+        found.append(Column(name, "bool", (count,), "1", f"whether the view sees each {what}"))
+    return [column for column in found if column.shape[0]]
+
+
+def _declared(name: str) -> tuple[str, str]:
+    """Unit and convention of an array, as the store's format declares them."""
+    (found,) = (each for each in (*declarations.OUTPUTS, *declarations.GUIDES) if each.name == name)
+    return found.unit, found.convention

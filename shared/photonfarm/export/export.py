@@ -1,0 +1,210 @@
+"""`photonfarm export`: what is complete of a scene, in a folder that may be continued and grows with the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from photonfarm.export import card, configurations, folder, manifest
+from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns
+from photonfarm.export.folder import Files, Planned
+from photonfarm.export.formats import Exported, Format, format_named
+from photonfarm.export.manifest import Manifest, SceneName
+from photonfarm.export.rows import ranges, spans
+from photonfarm.export.settings import ExportSettings, Extra, FormatName
+from photonfarm.export.snapshot import Snapshot, Split, Values, constants, scene_of
+from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.plan.hold_out import HOLD_OUT
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.format.declarations import VERSION
+
+FILE_BYTES = 128 << 20
+"""About how large a file of several samples becomes, unless their number is given."""
+
+OnProgress = Callable[[int, int, int], None]
+"""Called with the samples written, those to write, and the bytes of the values written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a user asks to be exported."""
+
+    to: FormatName
+    split: Split | Literal["all"] = "all"
+    rows: str = ""  # such as 0-31,40; "": all
+    buffers: str = "all"
+    extras: tuple[Extra, ...] = ()
+    samples_per_file: int | None = None  # None: as many as the format has, or as make FILE_BYTES
+    hold_out: float = HOLD_OUT
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What an export wrote."""
+
+    folder: str
+    scene_id: str
+    samples: int  # in the folder
+    new: int  # of them, written now
+    configurations: int
+    files: int
+    size_bytes: int
+
+
+def export_scene(
+    store: str | Path, scene: str, out: Path, request: Request, log: Callable[[str], None], on_progress: OnProgress
+) -> Result:
+    """Export what is complete of a scene and not in the folder yet.
+
+    Raises StoreError for a folder with something else in it, a scene that is not there, or a package that is missing;
+    SpecError for what the scene does not have; IncompleteError if no sample is complete.
+    """
+    form = format_named(request.to)
+    opened = Store(store)
+    stored = scene_of(opened, scene)
+    has_guides = stored.guides.settings() is not None
+    buffers = buffers_named(request.buffers, has_guides=has_guides)
+    configurations.check_extras(stored.spec, request.extras)
+    contents = _contents(form, stored.spec, buffers, request)
+    settings = _settings(buffers, contents, request)
+    name = SceneName(id=stored.scene_id, name=stored.spec.name)
+    wanted = Manifest(scene=name, store=opened.store_id, settings=settings, constants=contents.about)
+    with folder.held(out, wanted) as found:
+        job = _Export(form, out, contents, found, log, on_progress)
+        if not has_guides:
+            log(f"without guides: scene {name.name} has none; `photonfarm store upgrade` adds them")
+        return job.run(_snapshot(store, stored, settings, log), request)
+
+
+def _contents(form: Format, spec: SceneSpec, buffers: Sequence[str], request: Request) -> Contents:
+    single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and request.samples_per_file in (None, 1))
+    if form.ONE_PER_FILE and request.samples_per_file not in (None, 1):
+        raise SpecError(f"--samples-per-file {request.samples_per_file}: --to {request.to} has one sample per file")
+    found = columns(spec, buffers, visibility="visibility" in request.extras)
+    return Contents(found, constants(spec), single)
+
+
+def _settings(buffers: tuple[str, ...], contents: Contents, request: Request) -> ExportSettings:
+    per_file = 1 if contents.single else request.samples_per_file or max(1, FILE_BYTES // _bytes_of(contents.columns))
+    extras = tuple(sorted(request.extras))
+    return ExportSettings(
+        to=request.to, buffers=buffers, extras=extras, samples_per_file=per_file, hold_out=request.hold_out
+    )
+
+
+def _bytes_of(found: Sequence[Column]) -> int:
+    """The bytes of a sample's values, without text."""
+    return sum(int(np.prod(each.shape)) * np.dtype(each.dtype).itemsize for each in found if each.dtype != "str")
+
+
+def _snapshot(store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]) -> Snapshot:
+    guides = not set(GUIDES).isdisjoint(settings.buffers)
+    log(f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})")
+    snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
+    with_them = " with their guides" if guides else ""
+    log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete{with_them}")
+    return snapshot
+
+
+class _Export:
+    """One run of an export, in a folder that is locked."""
+
+    def __init__(
+        self,
+        form: Format,
+        out: Path,
+        contents: Contents,
+        found: Manifest,
+        log: Callable[[str], None],
+        on_progress: OnProgress,
+    ) -> None:
+        self._form, self._out, self._contents, self._manifest = form, out, contents, found
+        self._log, self._on_progress = log, on_progress
+        self._files = Files(out, form.SUFFIX, found.settings.samples_per_file, single=contents.single)
+        self._configurations = set(configurations.written(out))
+        self._done = self._total = self._bytes = 0
+
+    def run(self, snapshot: Snapshot, request: Request) -> Result:
+        """Write what is new, and then what describes the whole."""
+        chosen = _chosen(snapshot, request)
+        there, written = self._files.there(self._manifest.parts)
+        new = sorted(set(chosen) - set(there))
+        splits = {split: [row for row in new if snapshot.split_of(row) == split] for split in ("train", "held-out")}
+        planned, parts = self._files.plan(splits, written)
+        if there:
+            self._log(f"{self._out} holds {len(there)} samples already; {len(new)} are new")
+        self._total = len(new)
+        self._manifest = self._manifest.model_copy(update={"complete": False, "parts": tuple(parts)})
+        manifest.write(self._out, self._manifest)
+        for part in planned:
+            self._form.write(part.file, self._samples(snapshot, part), self._contents)
+        self._finish(snapshot, [*there, *new])
+        return self._result(snapshot, len(there), len(new))
+
+    def _samples(self, snapshot: Snapshot, part: Planned) -> Iterator[Values]:
+        """The samples of a file; what belongs to their configurations is written before them."""
+        extras = [each for each in self._manifest.settings.extras if each in configurations.OF_CONFIGURATION]
+        for row in part.rows:
+            sample = snapshot.sample(row)
+            values = snapshot.values(sample, self._contents.columns)
+            key = values["configuration_key"]
+            if extras and key not in self._configurations:
+                configurations.write_configuration(configurations.file_of(self._out, key), sample, extras)
+                self._configurations.add(key)
+            yield values
+            self._done += 1
+            self._bytes += _bytes_of(self._contents.columns)
+            self._on_progress(self._done, self._total, self._bytes)
+
+    def _finish(self, snapshot: Snapshot, rows: Collection[int]) -> None:
+        """Write the manifest, the card, and what else the format describes its files by."""
+        before = self._manifest.versions.get("rendered_by", [])
+        rendered = [*before, *(each for each in snapshot.versions if each not in before)]
+        versions = {"photonfarm-shared": version("photonfarm-shared"), "store": VERSION, "rendered_by": rendered}
+        update = {
+            "complete": True,
+            "samples": len(rows),
+            "rows": ranges(rows),
+            "configurations": len(self._configurations),
+            "columns": tuple(_described(column) for column in self._contents.columns),
+            "credits": snapshot.spec.credits and snapshot.spec.credits.model_dump(),
+            "jobs": ranges(snapshot.jobs_of(rows)),
+            "plans": tuple(snapshot.plans()),
+            "versions": versions,
+        }
+        self._manifest = self._manifest.model_copy(update=update)
+        self._log(f"describing {len(rows)} samples")
+        exported = Exported(self._out, snapshot, self._contents, self._manifest)
+        self._form.finish(exported)
+        card.write_card(exported)
+        manifest.write(self._out, self._manifest)
+
+    def _result(self, snapshot: Snapshot, there: int, new: int) -> Result:
+        files = [file.stat().st_size for file in self._out.rglob("*") if file.is_file()]
+        about = (str(self._out), snapshot.spec.scene_id, there + new, new, len(self._configurations))
+        return Result(*about, files=len(files), size_bytes=sum(files))
+
+
+def _chosen(snapshot: Snapshot, request: Request) -> list[int]:
+    """The rows that are asked for; raises IncompleteError if none of them is complete."""
+    asked = spans(request.rows)
+    rows = [row for row in snapshot.rows if not asked or any(row in span for span in asked)]
+    if request.split != "all":
+        rows = [row for row in rows if snapshot.split_of(row) == request.split]
+    if not rows:
+        narrowed = " that is asked for (--rows, --split)" if len(snapshot.rows) else ""
+        raise IncompleteError(
+            f"scene {snapshot.spec.name}: no sample{narrowed} is complete; `photonfarm status` shows what is missing"
+        )
+    return rows
+
+
+def _described(column: Column) -> dict[str, object]:
+    about = {"name": column.name, "dtype": column.dtype, "shape": list(column.shape)}
+    return {**about, "unit": column.unit, "meaning": column.meaning}

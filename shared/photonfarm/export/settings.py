@@ -1,0 +1,22 @@
+"""What is asked of an export."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from photonfarm.shared.core.models import Frozen
+
+FormatName = Literal["webdataset", "exr", "npz", "parquet"]
+Extra = Literal["points", "photons", "visibility"]
+
+
+class ExportSettings(Frozen):
+    """What every sample of an export holds, and in which files: the same for all of a folder's."""
+
+    to: FormatName
+    buffers: tuple[str, ...]  # names of buffers and guides
+    extras: tuple[Extra, ...] = ()  # what is exported only where it is asked for
+    samples_per_file: Annotated[int, Field(ge=1)]
+    hold_out: Annotated[float, Field(gt=0, lt=1)]  # the share of configurations labelled as held out

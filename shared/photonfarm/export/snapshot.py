@@ -1,0 +1,200 @@
+"""The samples of a scene that are complete now, as values by the names of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.data import Sample, Scene
+from photonfarm.export.columns import GUIDES, HALVES, Column
+from photonfarm.shared.core.keys import seed_of, view_key
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.read.find import scene_named
+
+Split = Literal["train", "held-out"]
+
+Values = dict[str, Any]
+"""The values of one sample, by the names of columns: arrays, numbers and text."""
+
+
+def scene_of(store: Store, named: str) -> SceneStore:
+    """The scene that a user names: by a spec's file, or by name or id among those in the store.
+
+    Raises StoreError, which names the scenes that are there, and SpecError for a file that is no spec.
+    """
+    text = load_spec(named).scene_id if Path(named).suffix in (".toml", ".json") else named
+    return store.scene(scene_named(store, text))
+
+
+class Snapshot:
+    """The complete samples of a scene: what they hold, what they are, and which jobs they came from."""
+
+    def __init__(self, place: str | Path, stored: SceneStore, *, guides: bool, hold_out: float) -> None:
+        """Look once; samples that are completed later are not in it. With `guides` samples come with their guides."""
+        self._stored = stored
+        self._scene = Scene(place, stored.scene_id, guides=guides)  # it is not refreshed
+        self.spec: SceneSpec = self._scene.spec
+        self._place = {row: place for place, row in enumerate(self._scene.rows.tolist())}
+        self._held_out = set(self._scene.split("held-out", hold_out=hold_out).rows.tolist())
+        self._job: _Job | None = None
+        self.versions: list[dict[str, str]] = []
+        """The versions of the packages that rendered what has been read so far, each set once."""
+
+    @property
+    def rows(self) -> Collection[int]:
+        """The rows of all complete samples, ascending."""
+        return self._place.keys()
+
+    def split_of(self, row: int) -> Split:
+        """Whether the sample in a row is to be trained on or held out."""
+        return "held-out" if row in self._held_out else "train"
+
+    def jobs_of(self, rows: Iterable[int]) -> list[int]:
+        """The jobs of rows, each once."""
+        return sorted({row // self._shard_rows for row in rows})
+
+    def plans(self) -> list[dict[str, Any]]:
+        """The plans of the scene: number, first row, samples and request of each."""
+        return [
+            {"number": p.number, "first_row": p.first_row, "samples": p.samples, "request": p.request.model_dump()}
+            for p in self._stored.plans()
+        ]
+
+    @property
+    def planned(self) -> int:
+        """The number of samples in all plans."""
+        return sum(plan.samples for plan in self._stored.plans())
+
+    @property
+    def _shard_rows(self) -> int:
+        return self._stored.plans()[0].shard_rows
+
+    # ----------------------------------------------------------------------------------------------------- of a sample
+
+    def sample(self, row: int) -> Sample:
+        """The sample in a row; raises CorruptError if stored bytes are not what was committed."""
+        found: Sample = self._scene[self._place[row]]
+        return found
+
+    def values(self, sample: Sample, columns: Sequence[Column]) -> Values:
+        """The values of a sample, each in its column's type."""
+        found = self._facts(sample.row) | dict(zip(HALVES, sample.radiance, strict=True))
+        return {column.name: _of(sample, column, found) for column in columns}
+
+    def inputs(self, row: int) -> tuple[Modification, View]:
+        """The configuration and the view of a row, complete or not."""
+        return self._of_job(row // self._shard_rows).inputs(row)
+
+    def _facts(self, row: int) -> Values:
+        """What the sample in a row is: all its columns but images and visibility."""
+        job = self._of_job(row // self._shard_rows)
+        modification, view = job.inputs(row)
+        sample = job.samples[row]
+        key = modification.key(self.spec.scene_id)
+        return {
+            "row": row,
+            "key": sample.key.hex(),
+            "split": self.split_of(row),
+            "pass": sample.pass_,
+            "configuration_key": key.hex(),
+            "view_key": view_key(key, view.vector).hex(),
+            "modification": modification.vector,
+            "origin": view.origin,
+            "target": view.target,
+            "camera_to_world": camera_to_world(view, self.spec),
+            "seed_A": seed_of(sample.key, "half A"),
+            "seed_B": seed_of(sample.key, "half B"),
+            "job": job.number,
+            "core_s": self._core_s(job),
+        }
+
+    def _of_job(self, number: int) -> _Job:
+        """A job; the last one is kept, as rows come in order."""
+        if self._job is None or self._job.number != number:
+            self._job = _Job(self._stored, number)
+        return self._job
+
+    def _core_s(self, job: _Job) -> float:
+        if job.versions not in self.versions:
+            self.versions.append(job.versions)
+        return job.core_s
+
+
+class _Job:
+    """A job: its inputs and, of a committed one, its cost per sample, and what rendered it."""
+
+    def __init__(self, stored: SceneStore, number: int) -> None:
+        self._stored, self.number = stored, number
+        self._rows = stored.job_rows(number)
+        self.samples = {sample.row: sample for sample in self._rows.samples}
+
+    def inputs(self, row: int) -> tuple[Modification, View]:
+        sample = self.samples[row]
+        return self._rows.modifications[sample.modification_row], self._rows.views[sample.view_row]
+
+    @cached_property
+    def _figures(self) -> dict[str, Any]:
+        figures: dict[str, Any] = self._stored.marker(self.number)["figures"]
+        return figures
+
+    @property
+    def core_s(self) -> float:
+        return float(self._figures["core_s"]) / len(self.samples)
+
+    @property
+    def versions(self) -> dict[str, str]:
+        return dict(self._figures["versions"])
+
+
+def _of(sample: Sample, column: Column, found: Values) -> Any:
+    """The value of a column, in its type."""
+    if column.name in found:
+        value = found[column.name]
+    elif column.name == "point_seen":
+        value = sample.point_cloud.seen
+    elif column.name == "photon_seen":
+        value = sample.seen_photons
+    else:
+        value = sample.guides[column.name] if column.name in GUIDES else getattr(sample, column.name)
+    return np.ascontiguousarray(value, column.dtype) if column.shape else value
+
+
+def camera_to_world(view: View, spec: SceneSpec) -> NDArray[np.float64]:
+    """The camera of a view as NeRF and OpenGL have it, (4, 4): columns right, up, backward, origin."""
+    camera = Camera.of(view, spec)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([camera.right, -camera.down, -camera.forward, camera.origin], axis=1)
+    return matrix
+
+
+def constants(spec: SceneSpec) -> dict[str, Any]:
+    """What is the same for all samples of a scene: its id and name, its movable groups, its camera, its light."""
+    width, half_angle = spec.film.width, 0.5 * np.radians(spec.view.fov_deg)
+    return {
+        "scene": {"id": spec.scene_id, "name": spec.name},
+        "groups": [group.name for group in spec.groups],
+        "camera": {
+            "fov_deg": spec.view.fov_deg,  # along the width
+            "focal_px": float(0.5 * width / np.tan(half_angle)),
+            "width": width,
+            "height": spec.film.height,
+            "up": list(spec.view.up),
+        },
+        "half_spp": spec.transport.half_spp,
+        "exposure": spec.exposure,
+    }
+
+
+def plain(values: Values, columns: Sequence[Column]) -> dict[str, Any]:
+    """The facts among the values of a sample, as JSON holds them."""
+    facts = {column.name: values[column.name] for column in columns if column.fact}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in facts.items()}

@@ -17,12 +17,14 @@ from photonfarm.export.formats import Exported, Format, format_named
 from photonfarm.export.manifest import Manifest, SceneName
 from photonfarm.export.rows import ranges, spans
 from photonfarm.export.settings import ExportSettings, Extra, FormatName
-from photonfarm.export.snapshot import Snapshot, Split, Values, constants, scene_of
+from photonfarm.export.snapshot import Snapshot, Split, Values, constants
 from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.waiting import waiting
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.declarations import VERSION
+from photonfarm.shared.store.read.find import scene_or_spec
 
 FILE_BYTES = 128 << 20
 """About how large a file of several samples becomes, unless their number is given."""
@@ -67,7 +69,7 @@ def export_scene(
     """
     form = format_named(request.to)
     opened = Store(store)
-    stored = scene_of(opened, scene)
+    stored = scene_or_spec(opened, scene)
     has_guides = stored.guides.settings() is not None
     buffers = buffers_named(request.buffers, has_guides=has_guides)
     configurations.check_extras(stored.spec, request.extras)
@@ -105,8 +107,8 @@ def _bytes_of(found: Sequence[Column]) -> int:
 
 def _snapshot(store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]) -> Snapshot:
     guides = not set(GUIDES).isdisjoint(settings.buffers)
-    log(f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})")
-    snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
+    with waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
+        snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
     with_them = " with their guides" if guides else ""
     log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete{with_them}")
     return snapshot

@@ -34,9 +34,9 @@ def write(file: Path, samples: Iterator[Values], contents: Contents) -> None:
     half_a, half_b = (values[name] for name in HALVES)
     layers = {"": (half_a + half_b) / np.float32(2)}
     layers |= {column.name: values[column.name] for column in contents.images}
-    matrix = np.linalg.inv(values["camera_to_world"]).T.astype(np.float32)  # OpenEXR multiplies row vectors
+    matrix = np.linalg.inv(values["camera_to_world"]).T  # OpenEXR multiplies row vectors
     said = json.dumps(plain(values, contents.facts) | contents.about)
-    write_layers(file, layers, {"worldToCamera": matrix, "photonfarm": said})
+    write_layers(file, layers, {"worldToCamera": np.ascontiguousarray(matrix, np.float32), "photonfarm": said})
 
 
 def finish(exported: Exported) -> None:

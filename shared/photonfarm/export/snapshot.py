@@ -15,24 +15,13 @@ from photonfarm.export.columns import GUIDES, HALVES, Column
 from photonfarm.shared.core.keys import seed_of, view_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import Camera, View
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.shared.store import SceneStore
 
 Split = Literal["train", "held-out"]
 
 Values = dict[str, Any]
 """The values of one sample, by the names of columns: arrays, numbers and text."""
-
-
-def scene_of(store: Store, named: str) -> SceneStore:
-    """The scene that a user names: by a spec's file, or by name or id among those in the store.
-
-    Raises StoreError, which names the scenes that are there, and SpecError for a file that is no spec.
-    """
-    text = load_spec(named).scene_id if Path(named).suffix in (".toml", ".json") else named
-    return store.scene(scene_named(store, text))
 
 
 class Snapshot:

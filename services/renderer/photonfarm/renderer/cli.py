@@ -1,4 +1,4 @@
-"""Verbs of the render service: buffers, doctor, measure-frames, preview, report, scene cost/exposure/plan, work."""
+"""Verbs of the renderer: buffers, doctor, measure-frames, preview, render, report, scene cost/exposure/plan, work."""
 
 from __future__ import annotations
 
@@ -278,3 +278,32 @@ def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int
     report.write(found, out, " ".join(["photonfarm report stability", *arguments]))
     click.echo(out / "stability.md")
     sys.exit(0 if found.passed else 1)
+
+
+@click.command()
+@click.argument("scene", metavar="SPEC_OR_SCENE")
+@store_option
+@click.option("--row", type=click.IntRange(0), required=True, help="A sample, by its row in the store.")
+@click.option("--pass", "pass_number", type=click.IntRange(0), metavar="P",
+              help="Another pass of its view, stored or not.  [default: that of the row]")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
+@json_option
+def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
+    """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
+
+    On the same kind of machine, with the same versions, it is equal to the bit. Elsewhere it differs by rounding.
+
+    Exit codes: 0 equal to the bit, or the store does not have this pass; 1 it differs, by no more than chance (a block
+    z-test); 4 it differs by more.
+    """
+    from photonfarm.renderer.jobs.repeat import check_suffix, repeat
+
+    if out is not None:
+        check_suffix(out)
+    found = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
+    if out is not None:
+        found.write(out)
+        click.echo(f"written to {out}", err=True)
+    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+    sys.exit(found.exit_code)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import StoreError, store_errors
@@ -39,8 +40,9 @@ def _channels(layers: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     for layer, values in layers.items():
         if values.ndim == 3:
             names = "XYZ" if "normal" in layer else "RGB"
-            parts = {name: values[..., i].copy() for i, name in enumerate(names)}
+            parts = {name: values[..., i] for i, name in enumerate(names)}
         else:
             parts = {"Z" if "depth" in layer else "V": values}
-        found |= {f"{layer}.{name}" if layer else name: part for name, part in parts.items()}
+        contiguous = {name: np.ascontiguousarray(part) for name, part in parts.items()}  # OpenEXR minds no strides
+        found |= {f"{layer}.{name}" if layer else name: part for name, part in contiguous.items()}
     return found

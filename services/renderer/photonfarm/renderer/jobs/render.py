@@ -293,7 +293,9 @@ class _Rendering:
                     visibility = visibility_of(self._scene, view, points, photons)
                     self._out.view(sample.view_row, self._buffers(sample, view), visibility)
                     new_views.remove(sample.view_row)
-                self._out.radiance(sample.row, self._halves(sample, view))
+                halves, thrown = halves_of(self._scene, sample.key, view)
+                self._redrawn += thrown
+                self._out.radiance(sample.row, halves)
         return self._redrawn
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
@@ -302,37 +304,39 @@ class _Rendering:
         _check_finite(arrays_of(buffers), f"view {sample.view_row}", f" (sample {sample.key.hex()})")
         return buffers
 
-    def _halves(self, sample: SampleRow, view: View) -> F32:
-        """Two independent estimates, (2, H, W, 3)."""
-        purposes = ("half A", "half B")
-        seed_a = next(_seeds(sample.key, purposes[0], ()))
-        seed_b = next(_seeds(sample.key, purposes[1], (seed_a,)))
-        halves = self._scene.render_halves(view, (seed_a, seed_b))
-        for half, purpose in enumerate(purposes):
-            if not np.isfinite(halves[half]).all():
-                halves[half] = self._again(sample.key, purpose, view, (seed_a, seed_b))
-        return halves
-
-    def _again(self, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> F32:
-        """Render another estimate in place of a non-finite one, with seeds that are not `taken`."""
-        self._discard(key, purpose)
-        for seed in islice(_seeds(key, purpose, taken), ATTEMPTS - 1):
-            image = self._scene.render_halves(view, (seed,))[0]
-            if np.isfinite(image).all():
-                return image
-            self._discard(key, purpose)
-        raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
-
-    def _discard(self, key: Key, purpose: str) -> None:
-        self._redrawn += 1
-        _log_discarded(key, purpose)
-
 
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
     """Raise IncompleteError unless all values of arrays that depend on no seed are finite."""
     for name, values in arrays.items():
         if not np.isfinite(values.astype(np.float32)).all():
             raise IncompleteError(f"{name} of {what} came out non-finite{more}")
+
+
+def halves_of(scene: SceneRenderer, key: Key, view: View) -> tuple[F32, int]:
+    """Two independent estimates of a view, (2, H, W, 3), by a sample's key, and the number of discarded renders.
+
+    Raises IncompleteError if they stay non-finite.
+    """
+    purposes = ("half A", "half B")
+    seed_a = next(_seeds(key, purposes[0], ()))
+    seed_b = next(_seeds(key, purposes[1], (seed_a,)))
+    halves, thrown = scene.render_halves(view, (seed_a, seed_b)), 0
+    for half, purpose in enumerate(purposes):
+        if not np.isfinite(halves[half]).all():
+            halves[half], more = _drawn_again(scene, key, purpose, view, (seed_a, seed_b))
+            thrown += more
+    return halves, thrown
+
+
+def _drawn_again(scene: SceneRenderer, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
+    """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
+    _log_discarded(key, purpose)
+    for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):
+        image = scene.render_halves(view, (seed,))[0]
+        if np.isfinite(image).all():
+            return image, attempt
+        _log_discarded(key, purpose)
+    raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
 
 def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:

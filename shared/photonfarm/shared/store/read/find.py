@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import FoundSample, Place, SceneMatch
+from photonfarm.shared.store.write.scene_store import SceneStore
 from photonfarm.shared.store.write.store import Store
 
-__all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named"]
+__all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named", "scene_or_spec"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,15 @@ def scene_named(store: Store, text: str) -> str:
         known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return found[0]
+
+
+def scene_or_spec(store: Store, named: str) -> SceneStore:
+    """The scene that a user names by a spec's file, or as `scene_named` takes it.
+
+    Raises StoreError, which names the scenes that are there, and SpecError for a file that is no spec.
+    """
+    text = load_spec(named).scene_id if Path(named).suffix in (".toml", ".json") else named
+    return store.scene(scene_named(store, text))
 
 
 def _name(store: Store, scene_id: str) -> str | None:

@@ -393,6 +393,14 @@ def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
     return ("radiance", scaled) if _stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
 
 
+def as_stored(radiance: F32, exponent: int) -> F32:
+    """Radiance as readers give it once it is stored: rounded to float16 at the store's scale, if that can hold it."""
+    name, values = _radiance(radiance, exponent)
+    return (
+        values if name == "radiance_wide" else values.astype(np.float16).astype(np.float32) * np.float32(2.0**-exponent)
+    )
+
+
 def _stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
     """Whether all values are finite in the type that they are stored in, to which the writer's thread rounds them.
 

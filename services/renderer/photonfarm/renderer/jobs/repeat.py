@@ -1,0 +1,195 @@
+"""`photonfarm render`: a pass of a view made again, and compared with what the store has of it.
+
+Shape letters: H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photonfarm.renderer.jobs.render import SceneLoader, halves_of, load_scene, located, versions
+from photonfarm.shared.core import pictures
+from photonfarm.shared.core.archives import write_arrays
+from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
+from photonfarm.shared.core.exr import write_layers
+from photonfarm.shared.core.files import whole_file
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import block_z_test
+from photonfarm.shared.core.waiting import waiting
+from photonfarm.shared.plan.request import sample_key
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.read.find import scene_or_spec
+from photonfarm.shared.store.read.query import Query
+from photonfarm.shared.store.read.scene_match import SceneMatch
+from photonfarm.shared.store.write.commit import as_stored
+
+SUFFIXES = (".npz", ".exr", ".png")
+"""The kinds of files that a pass is written as."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """How far a pass that was made again is from the stored one."""
+
+    different: int  # values that are not the same to the bit
+    values: int
+    largest: float  # difference of two values
+    relative: float  # root mean square of the differences, over that of the stored values
+    z: float  # largest of the block z-test…
+    z_limit: float  # …and what chance allows
+    other_versions: dict[str, tuple[str, str]]  # packages that are other ones here: that of the store, that of here
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether all values are the same to the bit."""
+        return self.different == 0
+
+    @property
+    def exit_code(self) -> int:
+        """0: equal to the bit, 1: differs by no more than chance, 4: by more."""
+        return 0 if self.is_equal else 1 if self.z < self.z_limit else StoreError.exit_code
+
+    def line(self) -> str:
+        """It in words."""
+        if self.is_equal:
+            return f"equal to the bit, {self.values} values"
+        verdict = "within what chance allows" if self.z < self.z_limit else "more than chance allows"
+        others = [f"{name} {there} there, {here} here" for name, (there, here) in self.other_versions.items()]
+        size = f"by at most {self.largest:.2g}, by {self.relative:.2g} of the image (RMS)"
+        test = f"block z-test {self.z:.2g} of {self.z_limit:.2g}: {verdict}"
+        versions_differ = f"; other versions: {', '.join(others)}" if others else ""
+        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repeated:
+    """A pass that was made again."""
+
+    scene_id: str
+    row: int | None  # in the store; None for a pass that is not planned
+    pass_number: int
+    key: str
+    exposure: float
+    halves: F32  # (2, H, W, 3) as they were rendered
+    comparison: Comparison | None  # None if the store does not have this pass
+
+    @property
+    def exit_code(self) -> int:
+        """That of the comparison; 0 without one."""
+        return 0 if self.comparison is None else self.comparison.exit_code
+
+    def document(self) -> dict[str, Any]:
+        """It in figures, as JSON holds them."""
+        compared = self.comparison and {**asdict(self.comparison), "equal": self.comparison.is_equal}
+        return {"scene": self.scene_id, "row": self.row, "pass": self.pass_number, "key": self.key, "stored": compared}
+
+    def line(self) -> str:
+        """It in words."""
+        if self.comparison is None:
+            planned = "is not planned" if self.row is None else f"(row {self.row}) is not complete"
+            return f"pass {self.pass_number} {planned}: there is nothing to compare it with"
+        return f"row {self.row}, pass {self.pass_number}: {self.comparison.line()}"
+
+    def write(self, file: Path) -> None:
+        """Write it as an archive or as an image with layers; as a PNG, its mean as a display shows it.
+
+        Raises StoreError if the disk refuses or OpenEXR is missing.
+        """
+        mean = (self.halves[0] + self.halves[1]) / np.float32(2)
+        about = {"scene": self.scene_id, "key": self.key, "pass": self.pass_number}
+        if file.suffix == ".npz":
+            arrays = {name: np.asarray(value) for name, value in about.items()}
+            write_arrays(file, {"A": self.halves[0], "B": self.halves[1], **arrays}, "rendered pass")
+        elif file.suffix == ".exr":
+            said = {name: str(value) for name, value in about.items()}
+            write_layers(file, {"": mean, "A": self.halves[0], "B": self.halves[1]}, said)
+        else:
+            from PIL import Image
+
+            with store_errors("write a picture", file), whole_file(file) as part:
+                Image.fromarray(pictures.display(mean, self.exposure)).save(part, "PNG")
+
+
+def repeat(
+    store: str | Path,
+    scene: str,
+    row: int,
+    pass_number: int | None,
+    log: Callable[[str], None],
+    load: SceneLoader = load_scene,
+) -> Repeated:
+    """Render the sample in a row again, or another pass of its view, and compare it with the stored one.
+
+    Raises StoreError for a scene or row that is not there, SceneNotHereError if the scene's files are not on this
+    machine, IncompleteError if renders stay non-finite.
+    """
+    opened = Store(store)
+    stored = scene_or_spec(opened, scene)
+    spec = located(stored.spec)
+    reader = SceneReader(store, stored.scene_id)
+    reader.refresh()
+    modification, view, planned_pass = _planned(stored, row)
+    number = planned_pass if pass_number is None else pass_number
+    key = sample_key(stored.scene_id, modification, view.vector, number)
+    at = next(iter(SceneMatch(stored, Query(sample=key)).rows.tolist()), None)
+    with waiting(log, f"loading scene {spec.name}"):
+        loaded = load(spec)
+        loaded.apply(modification)
+    with waiting(log, f"rendering pass {number} of the view in row {row}"):
+        halves, _ = halves_of(loaded, key, view)
+    there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
+    return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
+
+
+def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
+    """The configuration, the view and the pass in a row; raises StoreError if no plan has a sample there."""
+    plans = stored.plans()
+    if plans and row < plans[-1].end_row:
+        rows = stored.job_rows(row // plans[0].shard_rows)
+        for sample in rows.samples:
+            if sample.row == row:
+                return rows.modifications[sample.modification_row], rows.views[sample.view_row], sample.pass_
+    there = f"rows go up to {plans[-1].first_row + plans[-1].samples - 1}" if plans else "nothing is planned"
+    raise StoreError(f"row {row} of scene {stored.scene_id} ({stored.spec.name}): no sample is planned there; {there}")
+
+
+def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparison:
+    """The comparison of both halves with those in a row; what is rendered is rounded as the store rounds."""
+    here = as_stored(halves, stored.spec.radiance_exponent)
+    difference = here.astype(np.float64) - there
+    test = block_z_test(_interleaved(here), _interleaved(there), blocks=8)
+    root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))
+    rendered_by = stored.marker(row // stored.plans()[0].shard_rows)["figures"]["versions"]
+    others = {name: (said, here_) for name, said in rendered_by.items() if (here_ := versions().get(name)) != said}
+    return Comparison(
+        different=int(np.count_nonzero(here.view(np.uint32) != there.view(np.uint32))),
+        values=here.size,
+        largest=float(np.abs(difference).max()),
+        relative=float(np.sqrt(np.mean(difference**2))) / root if root else 0.0,
+        z=test.z_max,
+        z_limit=test.z_limit,
+        other_versions={name: (said, here_ or "not installed") for name, (said, here_) in others.items()},
+    )
+
+
+def _interleaved(images: F32) -> F32:
+    """Each image as 16 small ones, of every fourth pixel: estimates of nearly the same image, with noise of their own.
+
+    What differs between them beside the noise only makes the test more lenient; two estimates would be too few for it.
+    """
+    count, height, width, channels = images.shape
+    small = images.reshape(count, height // 4, 4, width // 4, 4, channels).transpose(0, 2, 4, 1, 3, 5)
+    return small.reshape(16 * count, height // 4, width // 4, channels)
+
+
+def check_suffix(file: Path) -> None:
+    """Raise SpecError for a name that is of no kind of file that a pass is written as."""
+    if file.suffix not in SUFFIXES:
+        raise SpecError(f"--out {file}: names of {', '.join(SUFFIXES)} files are allowed")

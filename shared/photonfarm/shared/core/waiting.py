@@ -1,0 +1,29 @@
+"""Something to read while something takes long."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+EVERY_S = 4.0
+
+
+@contextmanager
+def waiting(log: Callable[[str], None], what: str, every_s: float = EVERY_S) -> Iterator[None]:
+    """Say what is done, and every few seconds for how long it has been, until the block ends."""
+    began, done = time.monotonic(), threading.Event()
+
+    def say() -> None:
+        while not done.wait(every_s):
+            log(f"{what}: {time.monotonic() - began:.0f} s so far")
+
+    log(what)
+    teller = threading.Thread(target=say, daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        done.set()
+        teller.join()

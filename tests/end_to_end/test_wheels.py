@@ -53,7 +53,7 @@ def test_the_installed_packages_are_those_of_the_wheels(python: Path, tmp_path: 
 
 def test_every_verb_and_the_ready_specs_are_there(python: Path, tmp_path: Path) -> None:
     listed = run(python, tmp_path, "-m", "photonfarm.shared.cli", "--help")
-    for verb in ("submit", "up", "work", "preview", "train", "evaluate", "report", "store"):
+    for verb in ("submit", "up", "work", "preview", "render", "train", "evaluate", "report", "store", "export"):
         assert f"\n  {verb} " in listed
         run(python, tmp_path, "-m", "photonfarm.shared.cli", verb, "--help")
     assert "cornell" in run(python, tmp_path, "-m", "photonfarm.shared.cli", "scene", "show", "cornell")

@@ -19,6 +19,7 @@ def test_the_page_of_the_check_lists_every_cause_with_its_sentence_and_what_help
 DISTRIBUTIONS = {
     "## shared": "shared/photonfarm/shared",
     "## photonfarm.data": "shared/photonfarm/data",
+    "## photonfarm.export": "shared/photonfarm/export",
     "## services/renderer": "services/renderer/photonfarm/renderer",
     "## services/trainer": "services/trainer/photonfarm/trainer",
     "## bench": "bench",

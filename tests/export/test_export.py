@@ -21,7 +21,7 @@ from pyarrow import parquet
 from photonfarm.data import Sample, open_scene
 from photonfarm.export import export
 from photonfarm.export.export import Result, export_scene
-from photonfarm.export.rows import rows_in
+from photonfarm.export.rows import ranges, rows_in, spans
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, SpecError, StoreError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import GuideSpec
@@ -32,7 +32,7 @@ FORMATS = ("webdataset", "exr", "npz", "parquet")
 BRIGHT = 3  # a row whose radiance float16 cannot hold
 
 
-def planned(place: Path, *, views: int = 1, modifications: int = 10, **changes: Any) -> SceneStore:
+def planned(place: str | Path, *, views: int = 1, modifications: int = 10, **changes: Any) -> SceneStore:
     """A scene with jobs of 2 samples, and its base."""
     store = Store(place, create=True)
     request = Request(modifications=modifications, views_per_modification=views)
@@ -189,6 +189,27 @@ def test_archives_of_several_samples_have_them_along_the_first_axis(scene: Scene
                 np.testing.assert_array_equal(archive["B"][i], opened.row(row).radiance[1])
                 seen.append(row)
     assert seen == opened.split("train").rows.tolist()
+
+
+def test_a_scene_in_a_bucket_is_exported_as_one_in_a_folder_is(url: str, tmp_path: Path) -> None:
+    scene = planned(url, modifications=2)
+    samples.commit_all(scene)
+    export_scene(url, "small", tmp_path / "out", export.Request(to="npz"), lambda _: None, lambda *_: None)
+    found = read(tmp_path / "out", "npz")
+    assert sorted(found) == [0, 1]
+    np.testing.assert_array_equal(found[1]["A"], samples.outputs(scene, 0).radiance[1][0])
+
+
+@pytest.mark.parametrize(("rows", "text"), [([], ""), ([7], "7"), ([3, 0, 1, 2, 9, 11, 12], "0-3,9,11-12")])
+def test_rows_are_written_as_ranges_and_read_back(rows: list[int], text: str) -> None:
+    assert ranges(rows) == text
+    assert rows_in(text) == sorted(rows)
+
+
+@pytest.mark.parametrize("text", ["x", "3-1", "-1", "1-", "1:3", "1--3"])
+def test_what_is_no_rows_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="no row"):
+        spans(text)
 
 
 # --------------------------------------------------------------------------------------------- going on, and growing

@@ -137,7 +137,6 @@ def _origin(found: Manifest) -> str:
         f"- half-estimates of {about['half_spp']} samples per pixel each; exposure {about['exposure']:g} for display",
         f"- {camera['width']} × {camera['height']} pixels, field of view {camera['fov_deg']:g}° along the width",
         f"- movable groups, in the order of `modification`: {groups}",
-        f"- {DATA if found.parts else 'samples'}: train, and held-out: a share {found.settings.hold_out:g} of the "
-        "configurations, chosen by a hash of their content",
+        f"- held out: a share {found.settings.hold_out:g} of the configurations, chosen by a hash of their content",
         "- versions and plans: export.json",
     ])  # fmt: skip

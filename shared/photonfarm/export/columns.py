@@ -111,8 +111,8 @@ def _facts(spec: SceneSpec) -> list[Column]:
         Column("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
         Column("camera_to_world", "float64", (4, 4), "scene units", "columns: the camera's right, up and backward, "
                "and where it stands (the convention of NeRF and OpenGL)"),
-        Column("seed_A", "int64", (), "1", "seed of A"),
-        Column("seed_B", "int64", (), "1", "seed of B"),
+        Column("seed_A", "int64", (), "1", "seed of A; a render that was not finite was drawn again with another"),
+        Column("seed_B", "int64", (), "1", "seed of B, likewise"),
         Column("job", "int64", (), "1", "the render job that it came from"),
         Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
     ]  # fmt: skip

@@ -20,7 +20,7 @@ def ranges(rows: Iterable[int]) -> str:
 
 
 def spans(text: str) -> list[range]:
-    """The ranges that a text names, in its order, which may be longer than memory; raises ValueError for other text."""
+    """The ranges that a text names, in its order; raises ValueError for other text."""
     found = []
     for part in filter(None, text.split(",")):
         match = _RANGE.fullmatch(part.strip())

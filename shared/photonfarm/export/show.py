@@ -29,16 +29,18 @@ def progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
         began = last = time.monotonic()
 
         def show(done: int, total: int, size_bytes: int) -> None:
-            nonlocal began, last
+            nonlocal last
             now = time.monotonic()
             rate = done / max(now - began, 1e-9)
             speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
             bars.update(bar, completed=done, total=total, rate=speed, visible=True)
             if not console.is_terminal and (now - last > LINE_S or done == total):
                 last = now
-                say(f"{done}/{total} samples, {speed}, {(total - done) / rate:.0f} s left")
+                console.print(f"{done}/{total} samples, {speed}, {(total - done) / rate:.0f} s left", highlight=False)
 
         def say(line: str) -> None:
+            nonlocal began
+            began = time.monotonic()  # the samples begin after the last line about what was before them
             console.print(line, markup=False, highlight=False)
 
         yield say, show

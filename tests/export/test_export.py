@@ -19,9 +19,9 @@ import yaml
 from pyarrow import parquet
 
 from photonfarm.data import Sample, open_scene
-from photonfarm.export import export
 from photonfarm.export.export import Result, export_scene
 from photonfarm.export.rows import ranges, rows_in, spans
+from photonfarm.export.settings import ExportRequest
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, SpecError, StoreError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import GuideSpec
@@ -71,7 +71,7 @@ def commit(scene: SceneStore, job: int) -> None:
 
 def exported(scene: SceneStore, out: Path, to: str, on_progress: Any = lambda *_: None, **asked: Any) -> Result:
     store = scene.folder.parent.parent
-    return export_scene(store, scene.scene_id, out, export.Request(to=to, **asked), lambda _: None, on_progress)  # type: ignore[arg-type]
+    return export_scene(store, scene.scene_id, out, ExportRequest(to=to, **asked), lambda _: None, on_progress)  # type: ignore[arg-type]
 
 
 def several(to: str, number: int = 3) -> dict[str, int]:
@@ -194,7 +194,7 @@ def test_archives_of_several_samples_have_them_along_the_first_axis(scene: Scene
 def test_a_scene_in_a_bucket_is_exported_as_one_in_a_folder_is(url: str, tmp_path: Path) -> None:
     scene = planned(url, modifications=2)
     samples.commit_all(scene)
-    export_scene(url, "small", tmp_path / "out", export.Request(to="npz"), lambda _: None, lambda *_: None)
+    export_scene(url, "small", tmp_path / "out", ExportRequest(to="npz"), lambda _: None, lambda *_: None)
     found = read(tmp_path / "out", "npz")
     assert sorted(found) == [0, 1]
     np.testing.assert_array_equal(found[1]["A"], samples.outputs(scene, 0).radiance[1][0])
@@ -217,13 +217,14 @@ def test_what_is_no_rows_is_refused(text: str) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from photonfarm.export.export import Request, export_scene
+from photonfarm.export.export import export_scene
+from photonfarm.export.settings import ExportRequest
 
 def progress(done, total, size):
     if done == 5:
         os._exit(9)
 
-request = Request(to=sys.argv[4], samples_per_file=int(sys.argv[5]) or None, extras=("points",))
+request = ExportRequest(to=sys.argv[4], samples_per_file=int(sys.argv[5]) or None, extras=("points",))
 export_scene(sys.argv[1], sys.argv[2], Path(sys.argv[3]), request, print, progress)
 """
 
@@ -356,7 +357,7 @@ def test_guides_are_said_to_be_missing_and_only_samples_that_have_them_are_expor
     scene = planned(tmp_path / "store", modifications=5)
     samples.commit_all(scene)
     said: list[str] = []
-    store, request = scene.folder.parent.parent, export.Request(to="npz")
+    store, request = scene.folder.parent.parent, ExportRequest(to="npz")
     export_scene(store, "small", tmp_path / "without", request, said.append, lambda *_: None)
     assert any("without guides" in line for line in said)
     assert "direct" not in read(tmp_path / "without", "npz")[0]

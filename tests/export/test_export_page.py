@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import store_samples as samples
 
-from photonfarm.export import export
 from photonfarm.export.card import READING
 from photonfarm.export.export import export_scene
-from photonfarm.export.settings import FormatName
+from photonfarm.export.settings import ExportRequest, FormatName
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
 
@@ -42,7 +41,7 @@ def test_the_example_reads_what_the_command_has_written(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: FormatName
 ) -> None:
     folder = tmp_path / FOLDERS[to]
-    export_scene(store, "small", folder, export.Request(to=to), lambda _: None, lambda *_: None)
+    export_scene(store, "small", folder, ExportRequest(to=to), lambda _: None, lambda *_: None)
     code = READING[to].format(folder=folder.name)
     assert code in (folder / "README.md").read_text()
     for name in ("HF_HUB_OFFLINE", "HF_DATASETS_OFFLINE"):

@@ -7,7 +7,7 @@ from typing import Any
 
 from photonfarm.export.columns import Column
 from photonfarm.export.folder import DATA
-from photonfarm.export.formats import Exported
+from photonfarm.export.formats.format import Exported
 from photonfarm.export.manifest import Manifest
 from photonfarm.export.settings import FormatName
 from photonfarm.shared.core.errors import store_errors

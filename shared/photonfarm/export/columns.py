@@ -35,6 +35,11 @@ class Column:
     meaning: str
     fact: bool = False  # it says what the sample is: kilobytes at most, written as JSON where a format has JSON
 
+    def described(self) -> dict[str, Any]:
+        """It as JSON holds it."""
+        about = {"name": self.name, "dtype": self.dtype, "shape": list(self.shape)}
+        return {**about, "unit": self.unit, "meaning": self.meaning}
+
 
 @dataclass(frozen=True, slots=True)
 class Contents:

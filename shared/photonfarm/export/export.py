@@ -6,21 +6,20 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from photonfarm.export import card, configurations, folder, manifest
 from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns
 from photonfarm.export.folder import Files, Planned
-from photonfarm.export.formats import Exported, Format, format_named
+from photonfarm.export.formats.format import Exported, Format, format_named
 from photonfarm.export.manifest import Manifest, SceneName
 from photonfarm.export.rows import ranges, spans
-from photonfarm.export.settings import ExportSettings, Extra, FormatName
-from photonfarm.export.snapshot import Snapshot, Split, Values, constants
+from photonfarm.export.settings import ExportRequest, ExportSettings
+from photonfarm.export.snapshot import Snapshot, Values, constants
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.waiting import waiting
-from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.declarations import VERSION
@@ -31,19 +30,6 @@ FILE_BYTES = 128 << 20
 
 OnProgress = Callable[[int, int, int], None]
 """Called with the samples written, those to write, and the bytes of the values written."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What a user asks to be exported."""
-
-    to: FormatName
-    split: Split | Literal["all"] = "all"
-    rows: str = ""  # such as 0-31,40; "": all
-    buffers: str = "all"
-    extras: tuple[Extra, ...] = ()
-    samples_per_file: int | None = None  # None: as many as the format has, or as make FILE_BYTES
-    hold_out: float = HOLD_OUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +46,12 @@ class Result:
 
 
 def export_scene(
-    store: str | Path, scene: str, out: Path, request: Request, log: Callable[[str], None], on_progress: OnProgress
+    store: str | Path,
+    scene: str,
+    out: Path,
+    request: ExportRequest,
+    log: Callable[[str], None],
+    on_progress: OnProgress,
 ) -> Result:
     """Export what is complete of a scene and not in the folder yet.
 
@@ -84,7 +75,7 @@ def export_scene(
         return job.run(_snapshot(store, stored, settings, log), request)
 
 
-def _contents(form: Format, spec: SceneSpec, buffers: Sequence[str], request: Request) -> Contents:
+def _contents(form: Format, spec: SceneSpec, buffers: Sequence[str], request: ExportRequest) -> Contents:
     single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and request.samples_per_file in (None, 1))
     if form.ONE_PER_FILE and request.samples_per_file not in (None, 1):
         raise SpecError(f"--samples-per-file {request.samples_per_file}: --to {request.to} has one sample per file")
@@ -92,7 +83,7 @@ def _contents(form: Format, spec: SceneSpec, buffers: Sequence[str], request: Re
     return Contents(found, constants(spec), single)
 
 
-def _settings(buffers: tuple[str, ...], contents: Contents, request: Request) -> ExportSettings:
+def _settings(buffers: tuple[str, ...], contents: Contents, request: ExportRequest) -> ExportSettings:
     per_file = 1 if contents.single else request.samples_per_file or max(1, FILE_BYTES // _bytes_of(contents.columns))
     extras = tuple(sorted(request.extras))
     return ExportSettings(
@@ -132,7 +123,7 @@ class _Export:
         self._configurations = set(configurations.written(out))
         self._done = self._total = self._bytes = 0
 
-    def run(self, snapshot: Snapshot, request: Request) -> Result:
+    def run(self, snapshot: Snapshot, request: ExportRequest) -> Result:
         """Write what is new, and then what describes the whole."""
         chosen = _chosen(snapshot, request)
         there, written = self._files.there(self._manifest.parts)
@@ -165,27 +156,29 @@ class _Export:
             self._on_progress(self._done, self._total, self._bytes)
 
     def _finish(self, snapshot: Snapshot, rows: Collection[int]) -> None:
-        """Write the manifest, the card, and what else the format describes its files by."""
-        before = self._manifest.versions.get("rendered_by", [])
-        rendered = [*before, *(each for each in snapshot.versions if each not in before)]
-        versions = {"photonfarm-shared": version("photonfarm-shared"), "store": VERSION, "rendered_by": rendered}
-        update = {
-            "complete": True,
-            "samples": len(rows),
-            "rows": ranges(rows),
-            "configurations": len(self._configurations),
-            "columns": tuple(_described(column) for column in self._contents.columns),
-            "credits": snapshot.spec.credits and snapshot.spec.credits.model_dump(),
-            "jobs": ranges(snapshot.jobs_of(rows)),
-            "plans": tuple(snapshot.plans()),
-            "versions": versions,
-        }
-        self._manifest = self._manifest.model_copy(update=update)
+        """Write what describes all files: the format's own, the card and, last, the manifest."""
         self._log(f"describing {len(rows)} samples")
+        self._manifest = self._manifest.model_copy(update=self._description(snapshot, rows))
         exported = Exported(self._out, snapshot, self._contents, self._manifest)
         self._form.finish(exported)
         card.write_card(exported)
         manifest.write(self._out, self._manifest)
+
+    def _description(self, snapshot: Snapshot, rows: Collection[int]) -> dict[str, Any]:
+        """What the manifest says of a folder with these rows."""
+        before = self._manifest.versions.get("rendered_by", [])
+        rendered = [*before, *(each for each in snapshot.versions if each not in before)]
+        return {
+            "complete": True,
+            "samples": len(rows),
+            "rows": ranges(rows),
+            "configurations": len(self._configurations),
+            "columns": tuple(column.described() for column in self._contents.columns),
+            "credits": snapshot.spec.credits and snapshot.spec.credits.model_dump(),
+            "jobs": ranges(snapshot.jobs_of(rows)),
+            "plans": tuple(snapshot.plans()),
+            "versions": {"photonfarm-shared": version("photonfarm-shared"), "store": VERSION, "rendered_by": rendered},
+        }
 
     def _result(self, snapshot: Snapshot, there: int, new: int) -> Result:
         files = [file.stat().st_size for file in self._out.rglob("*") if file.is_file()]
@@ -193,7 +186,7 @@ class _Export:
         return Result(*about, files=len(files), size_bytes=sum(files))
 
 
-def _chosen(snapshot: Snapshot, request: Request) -> list[int]:
+def _chosen(snapshot: Snapshot, request: ExportRequest) -> list[int]:
     """The rows that are asked for; raises IncompleteError if none of them is complete."""
     asked = spans(request.rows)
     rows = [row for row in snapshot.rows if not asked or any(row in span for span in asked)]
@@ -201,12 +194,9 @@ def _chosen(snapshot: Snapshot, request: Request) -> list[int]:
         rows = [row for row in rows if snapshot.split_of(row) == request.split]
     if not rows:
         narrowed = " that is asked for (--rows, --split)" if len(snapshot.rows) else ""
+        guides = " with its guides (without them: --buffers albedo,normal,depth)" if snapshot.has_guides else ""
         raise IncompleteError(
-            f"scene {snapshot.spec.name}: no sample{narrowed} is complete; `photonfarm status` shows what is missing"
+            f"scene {snapshot.spec.name}: no sample{narrowed} is complete{guides}; `photonfarm status` shows what is "
+            "missing"
         )
     return rows
-
-
-def _described(column: Column) -> dict[str, object]:
-    about = {"name": column.name, "dtype": column.dtype, "shape": list(column.shape)}
-    return {**about, "unit": column.unit, "meaning": column.meaning}

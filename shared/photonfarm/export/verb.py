@@ -61,11 +61,12 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
     Exit codes: 0 exported, 7 no sample is complete, 4 store or folder, 3 what the scene does not have, 130 Ctrl-C.
     """
     from photonfarm.export import show
-    from photonfarm.export.export import Request, export_scene
+    from photonfarm.export.export import export_scene
+    from photonfarm.export.settings import ExportRequest
 
     try:
         with show.progress() as (log, on_progress):
-            result = export_scene(store, scene, out, Request(**asked), log, on_progress)
+            result = export_scene(store, scene, out, ExportRequest(**asked), log, on_progress)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

@@ -10,7 +10,7 @@ import numpy as np
 
 from photonfarm.export.columns import HALVES, Contents
 from photonfarm.export.folder import SAMPLES
-from photonfarm.export.formats import Exported
+from photonfarm.export.formats.format import Exported
 from photonfarm.export.rows import rows_in
 from photonfarm.export.snapshot import Snapshot, Values, camera_to_world, plain
 from photonfarm.shared.core.archives import write_arrays

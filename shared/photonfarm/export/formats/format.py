@@ -26,7 +26,7 @@ class Exported:
 
 
 class Format(Protocol):
-    """One of the formats; each is a module of this package."""
+    """One of the formats; each is a module of this folder."""
 
     SUFFIX: str  # of its files
     PACKAGES: Sequence[str]  # modules that it needs, of the extra `export`
@@ -46,7 +46,7 @@ _MODULES: dict[FormatName, str] = {"webdataset": "tar_shards", "exr": "exr", "np
 
 def format_named(name: FormatName) -> Format:
     """A format by its name; raises StoreError if a package that it needs is not installed."""
-    found: Any = import_module(f"photonfarm.export.{_MODULES[name]}")
+    found: Any = import_module(f"{__package__}.{_MODULES[name]}")
     for package in found.PACKAGES:
         try:
             import_module(package)

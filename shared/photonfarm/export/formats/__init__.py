@@ -1,0 +1,1 @@
+"""The formats: how samples become a file, and what describes all files of a folder."""

@@ -40,9 +40,9 @@ class Result:
     scene_id: str
     samples: int  # in the folder
     new: int  # of them, written now
-    configurations: int
-    files: int
-    size_bytes: int
+    new_files: int
+    new_bytes: int  # of these files
+    configurations: int  # in the folder
 
 
 def export_scene(
@@ -135,10 +135,15 @@ class _Export:
         self._total = len(new)
         self._manifest = self._manifest.model_copy(update={"complete": False, "parts": tuple(parts)})
         manifest.write(self._out, self._manifest)
+        written_bytes = 0
         for part in planned:
             self._form.write(part.file, self._samples(snapshot, part), self._contents)
-        self._finish(snapshot, [*there, *new])
-        return self._result(snapshot, len(there), len(new))
+            written_bytes += part.file.stat().st_size
+        rows = [*there, *new]
+        with waiting(self._log, f"describing {len(rows)} samples"):
+            self._finish(snapshot, rows)
+        shared = len(self._configurations)
+        return Result(str(self._out), snapshot.spec.scene_id, len(rows), len(new), len(planned), written_bytes, shared)
 
     def _samples(self, snapshot: Snapshot, part: Planned) -> Iterator[Values]:
         """The samples of a file; what belongs to their configurations is written before them."""
@@ -157,7 +162,6 @@ class _Export:
 
     def _finish(self, snapshot: Snapshot, rows: Collection[int]) -> None:
         """Write what describes all files: the format's own, the card and, last, the manifest."""
-        self._log(f"describing {len(rows)} samples")
         self._manifest = self._manifest.model_copy(update=self._description(snapshot, rows))
         exported = Exported(self._out, snapshot, self._contents, self._manifest)
         self._form.finish(exported)
@@ -179,11 +183,6 @@ class _Export:
             "plans": tuple(snapshot.plans()),
             "versions": {"photonfarm-shared": version("photonfarm-shared"), "store": VERSION, "rendered_by": rendered},
         }
-
-    def _result(self, snapshot: Snapshot, there: int, new: int) -> Result:
-        files = [file.stat().st_size for file in self._out.rglob("*") if file.is_file()]
-        about = (str(self._out), snapshot.spec.scene_id, there + new, new, len(self._configurations))
-        return Result(*about, files=len(files), size_bytes=sum(files))
 
 
 def _chosen(snapshot: Snapshot, request: ExportRequest) -> list[int]:

@@ -52,5 +52,5 @@ def result(found: Result, as_json: bool) -> None:
         print_json(asdict(found))
         return
     shared = f", {found.configurations} configurations" if found.configurations else ""
-    size = f"{found.files} files, {found.size_bytes / 1e6:,.1f} MB"
-    click.echo(f"{found.folder}: {found.samples} samples, {found.new} of them new{shared}; {size}")
+    size = f" in {found.new_files} files of {found.new_bytes / 1e6:,.1f} MB" if found.new else ""
+    click.echo(f"{found.folder}: {found.samples} samples{shared}; {found.new} of them new{size}")

@@ -33,6 +33,7 @@ class Snapshot:
         self._scene = Scene(place, stored.scene_id, guides=guides)  # it is not refreshed
         self.spec: SceneSpec = self._scene.spec
         self.has_guides = guides
+        self._plans = stored.plans()
         self._place = {row: place for place, row in enumerate(self._scene.rows.tolist())}
         self._held_out = set(self._scene.split("held-out", hold_out=hold_out).rows.tolist())
         self._job: _Job | None = None
@@ -56,17 +57,17 @@ class Snapshot:
         """The plans of the scene: number, first row, samples and request of each."""
         return [
             {"number": p.number, "first_row": p.first_row, "samples": p.samples, "request": p.request.model_dump()}
-            for p in self._stored.plans()
+            for p in self._plans
         ]
 
     @property
     def planned(self) -> int:
         """The number of samples in all plans."""
-        return sum(plan.samples for plan in self._stored.plans())
+        return sum(plan.samples for plan in self._plans)
 
     @property
     def _shard_rows(self) -> int:
-        return self._stored.plans()[0].shard_rows
+        return self._plans[0].shard_rows
 
     # ----------------------------------------------------------------------------------------------------- of a sample
 

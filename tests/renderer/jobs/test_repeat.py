@@ -49,16 +49,26 @@ def test_a_stored_pass_is_made_again_to_the_bit_and_one_that_is_not_stored_is_re
         again(room, 4, load=LoadedScene.load)
 
 
-@pytest.fixture
-def analytic_store(analytic: ModuleType, store: Store) -> SceneStore:
+def rendered(analytic: ModuleType, store: Store, **changes: Any) -> SceneStore:
     """One job of the analytic scene, rendered."""
-    scene = store.scene(
-        store.plan(
-            analytic.small_spec(film={"width": 32, "height": 32}), Request(modifications=2), shard_rows=4
-        ).scene_id
-    )
+    spec = analytic.small_spec(film={"width": 32, "height": 32}, **changes)
+    scene = store.scene(store.plan(spec, Request(modifications=2), shard_rows=4).scene_id)
     ShardRenderer(store, worker="test", load=analytic.AnalyticScene).render(scene.scene_id, 0)
     return scene
+
+
+@pytest.fixture
+def analytic_store(analytic: ModuleType, store: Store) -> SceneStore:
+    """One job of it."""
+    return rendered(analytic, store)
+
+
+@pytest.mark.parametrize("exposure", [1e-3, 1e5])
+def test_what_is_rendered_is_rounded_as_the_store_rounds(analytic: ModuleType, store: Store, exposure: float) -> None:
+    scene = rendered(analytic, store, exposure=exposure)
+    wide = list(scene.folder.glob("plans/000000/radiance_wide/c.*"))
+    assert bool(wide) == (exposure > 1)
+    assert again(scene, 1, load=analytic.AnalyticScene).exit_code == 0
 
 
 @pytest.mark.parametrize(("factor", "exit_code"), [(1.0, 0), (1 + 1e-3, 1), (1.5, 4)])

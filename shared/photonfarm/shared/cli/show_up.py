@@ -23,7 +23,7 @@ class FarmTalk:
 
     def say(self, line: str) -> None:
         """Print a sentence."""
-        self._console.print(line)
+        self._console.print(line, markup=False)
 
     @contextmanager
     def progress(self, steps: int) -> Iterator[Callable[[FarmProgress, bool], None]]:

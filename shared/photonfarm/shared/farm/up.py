@@ -23,6 +23,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.scene.plausibility import warnings
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -86,6 +87,8 @@ def run_farm(
     After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
     named = NamedSpec.load(spec)
+    for warning in warnings(spec, named.spec):
+        talk.say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
     which = (f"held-out={hold_out}", f"views=first:{reference_views}")  # of the planned views get references
     if train_steps:

@@ -72,6 +72,15 @@ class SceneFile:
         return cls(path, frozenset(shapes), frozenset(emitting), frozenset(_shapeless(root)), digest)
 
 
+def light_ids(path: Path) -> frozenset[str]:
+    """The ids of a scene file's lights, as those of `SceneFile`; "" stands for all that have none."""
+    root = _parse(path)
+    lights = {node.get("id") for node in root.iter("emitter")} - {None}
+    shining = {node.get("id", "") for node in root.iter("shape") if _emits(node, lights)}
+    unnamed = {"" for node in root.findall("emitter") if node.get("type") != "area" and not node.get("id")}
+    return frozenset(shining | unnamed | set(_shapeless(root)))
+
+
 def _emits(shape: ElementTree.Element, lights: Set[str | None]) -> bool:
     return any(part.tag == "emitter" or (part.tag == "ref" and part.get("id") in lights) for part in shape)
 

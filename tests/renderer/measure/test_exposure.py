@@ -71,7 +71,7 @@ def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: No
     assert told == ["rendering 16 views of cornell, 32 × 32, 2 × 8 spp"]
     assert found.scene_id == cornell().scene_id
     assert found.low < found.exposure < (found.high or 0)
-    scene = LoadedScene.load(exposure._small(cornell()))
+    scene = LoadedScene.load(exposure.shrunk(cornell(), exposure.SIDE).model_copy(update={"exposure": 1.0}))
     halves = np.stack(list(exposure._rendered(scene, 16, 32)))  # more samples
     assert display_values(np.float32(found.exposure) * halves.mean(axis=1)).mean() == pytest.approx(0.4, abs=0.004)
     again = propose(cornell().model_copy(update={"exposure": 9.0}), None, told.append, target=0.4, frames=16)
@@ -92,7 +92,7 @@ def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -
     ("film", "small"), [((64, 64), (64, 64)), ((256, 256), (64, 64)), ((1280, 720), (64, 32)), ((2048, 8), (64, 8))]
 )
 def test_large_films_are_rendered_small(film: tuple[int, int], small: tuple[int, int]) -> None:
-    found = exposure._small(cornell(width=film[0], height=film[1])).film
+    found = exposure.shrunk(cornell(width=film[0], height=film[1]), exposure.SIDE).film
     assert (found.width, found.height) == small
 
 

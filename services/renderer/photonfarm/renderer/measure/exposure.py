@@ -123,7 +123,7 @@ def propose(
 
     The backend must have been loaded. Raises SpecError as loading does, and if too much is black for any exposure.
     """
-    small = _small(spec)
+    small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
     spp = _half_spp(small.film)
     log(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
     pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp))))
@@ -155,12 +155,12 @@ def _proposal(spec: SceneSpec, pictures: Pictures, target: float, exposure: floa
     )
 
 
-def _small(spec: SceneSpec) -> SceneSpec:
-    """The spec on a film of `SIDE` pixels at most, without photons, and with the same views whatever its exposure."""
-    times = -(-max(spec.film.width, spec.film.height) // SIDE)
-    width, height = (max(8, side // times // 8 * 8) for side in (spec.film.width, spec.film.height))
+def shrunk(spec: SceneSpec, side: int) -> SceneSpec:
+    """The spec on a film of `side` pixels at most along the longer side, without photons."""
+    times = -(-max(spec.film.width, spec.film.height) // side)
+    width, height = (max(8, pixels // times // 8 * 8) for pixels in (spec.film.width, spec.film.height))
     photons = spec.photons.model_copy(update={"paths": 0})
-    return spec.model_copy(update={"film": Film(width=width, height=height), "photons": photons, "exposure": 1.0})
+    return spec.model_copy(update={"film": Film(width=width, height=height), "photons": photons})
 
 
 def _half_spp(film: Film) -> int:

@@ -38,11 +38,7 @@ def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
 def cloud_of(scene: Any, geometry: Geometry, count: int, scene_id: str) -> BasePointCloud:
     """`count` points uniform on the scene's surfaces, as they are at rest; the scene id determines which."""
     face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", scene_id), "surface"))
-    corners = geometry.vertices[geometry.faces[face]].astype(np.float64)  # (P, 3 corners, 3)
-    position = np.einsum("pk,pkx->px", barycentric, corners)
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    si = _surface_at(scene, geometry, face, barycentric, position, across)
+    position, si = surfaces_at(scene, geometry, face, barycentric)
     emission = si.emitter(scene).eval(si)
     albedo = diffuse_reflectance(si, mi.Bool(True))
     dr.eval(si.n, albedo, emission)
@@ -56,15 +52,17 @@ def cloud_of(scene: Any, geometry: Geometry, count: int, scene_id: str) -> BaseP
     )
 
 
-def _surface_at(
-    scene: Any,
-    geometry: Geometry,
-    face: NDArray[np.uint32],
-    barycentric: NDArray[np.float64],
-    position: NDArray[np.float64],
-    across: NDArray[np.float64],
-) -> Any:
-    """Mitsuba's surface interactions at the points, seen from their front; not found by rays, which may meet others."""
+def surfaces_at(
+    scene: Any, geometry: Geometry, face: NDArray[np.uint32], barycentric: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], Any]:
+    """Points of triangles, (P, 3), and Mitsuba's surface interactions there, seen from their front.
+
+    They are not found by rays, which may meet other surfaces.
+    """
+    corners = geometry.vertices[geometry.faces[face]].astype(np.float64)  # (P, 3 corners, 3)
+    position = np.einsum("pk,pkx->px", barycentric, corners)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
     shape = geometry.face_shape[face]
     first = np.searchsorted(geometry.face_shape, np.arange(len(geometry.shape_group)))  # each shape's first face
     hit = dr.zeros(mi.PreliminaryIntersection3f, len(face))
@@ -76,4 +74,4 @@ def _surface_at(
     ray = mi.Ray3f(o=points(position + across), d=mi.Vector3f(points(-across)))
     si = hit.compute_surface_interaction(ray)
     si.wi = mi.Vector3f(0, 0, 1)
-    return si
+    return position, si

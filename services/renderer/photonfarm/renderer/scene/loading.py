@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
@@ -71,7 +72,7 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
     added = _added_lights(spec)
     if len(shining) == len(free) and not added:
         return scene
-    return _joined([*scene.shapes(), *shining], added)
+    return scene_of([*scene.shapes(), *shining], added)
 
 
 @contextmanager
@@ -85,7 +86,7 @@ def _threads_to_read_with() -> Iterator[None]:
         dr.set_thread_count(count)
 
 
-def _joined(parts: list[Any], added: dict[str, Any]) -> Any:
+def scene_of(parts: list[Any], added: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """A scene of loaded parts, which keep their ids, and of added ones that are loaded here."""
     ids = [part.id() for part in parts]
     keys = [f"_part_{i}" for i in range(len(parts))]  # ids need not be there, and may have dots, which no key may

@@ -1,4 +1,4 @@
-"""Verbs of the renderer: buffers, doctor, measure-frames, preview, render, report, scene cost/exposure/plan, work."""
+"""Verbs of the renderer: buffers, doctor, measure-frames, preview, render, report, scene …, work."""
 
 from __future__ import annotations
 
@@ -307,3 +307,53 @@ def render(scene: str, store: str | Path, row: int, pass_number: int | None, out
         click.echo(f"written to {out}", err=True)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
     sys.exit(found.exit_code)
+
+
+@click.command()
+@click.argument("spec")
+@json_option
+def scene_shapes(spec: str, as_json: bool) -> None:
+    """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
+    from photonfarm.renderer.check import shapes
+    from photonfarm.shared.cli import show
+
+    found = shapes.listed(spec)
+    if as_json:
+        show.print_json([shape.document() for shape in found])
+        return
+    show.print_table((shape.row() for shape in found), shapes.HEAD)
+    unnamed = sum(not shape.id for shape in found)
+    if unnamed:
+        click.echo(f"{unnamed} of {len(found)} shapes have no id, without which no group can name them", err=True)
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
+              help="The page.")  # fmt: skip
+@json_option
+def scene_check(spec: str, out: Path, as_json: bool) -> None:
+    """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
+
+    The page shows plan and elevation, sixteen random configurations, every shape, and what cameras see. Nothing is
+    written to a store. The exit code is 0 whatever is found, as long as the spec can be used.
+    """
+    if out.suffix not in (".html", ".htm"):
+        raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.scene.spec_lines import SpecLines
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded, file = load_spec(spec), find_spec(spec)
+    backend.load()
+    from photonfarm.renderer.check import page, scene_check
+
+    check, lines = scene_check.check(loaded, file.parent, partial(click.echo, err=True)), SpecLines.of(file)
+    page.write(check, lines, out)
+    if as_json:
+        show.print_json([finding.document(lines) for finding in check.findings])
+        return
+    for finding in check.findings:
+        click.echo(f"{'warning' if finding.serious else 'note'}: {finding.line(lines)}")
+    click.echo(f"{out}: {len(check.findings) or 'no'} finding{'' if len(check.findings) == 1 else 's'}")

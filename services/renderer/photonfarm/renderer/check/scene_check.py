@@ -1,0 +1,90 @@
+"""`photonfarm scene check`: a scene is loaded once, measured, drawn and rendered, and its spec compared with that."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from photonfarm.renderer.check import drawings, samples, shape_pictures
+from photonfarm.renderer.check.drawings import Drawing
+from photonfarm.renderer.check.findings import Finding, Measured, findings
+from photonfarm.renderer.check.placements import placements
+from photonfarm.renderer.check.shapes import ShapeFacts, facts_of, groups_by_shape
+from photonfarm.renderer.scene.free_space import boxes_of
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.pictures import Picture
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.spec import SceneSpec
+
+PICTURED = 240
+"""The most shapes that get a picture: those of movable groups, and then the largest."""
+
+QUIET_S = 3.0
+"""The most seconds between two lines of progress, unless one step takes longer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneCheck:
+    """All that a check found."""
+
+    spec: SceneSpec
+    shapes: list[ShapeFacts]
+    pictures: dict[int, Picture]  # of some shapes, by their number
+    room: F32  # (2, 3) the box of what does not move
+    measured: Measured
+    drawings: list[Drawing]
+    findings: list[Finding]
+    seconds: float
+
+
+def check(spec: SceneSpec, beside: Path | None, log: Callable[[str], None]) -> SceneCheck:
+    """Check a spec; the backend must have been loaded. Raises SpecError and BackendError as loading does."""
+    begun = time.monotonic()
+    log(f"loading {spec.name}")
+    scene = LoadedScene.load(samples.small(spec), beside)
+    group_of = groups_by_shape(spec)
+    shapes = facts_of(scene.scene, group_of)
+    boxes = boxes_of(scene.scene.shapes())
+    still = np.array([shape.group is None for shape in shapes])
+    room = _around(boxes[still] if still.any() else boxes)
+    log(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")
+    geometry, cloud = scene.base()
+    placed = placements(scene, geometry)
+    colours = shape_pictures.colours(scene.scene, geometry)
+    drawn = drawings.drawings(scene.scene, spec, geometry, colours, placed, room)
+    up = int(np.abs(spec.view.up).argmax())
+    pictured = _pictured(shapes, boxes)
+    pictures = {number: shape_pictures.picture(geometry, number, colours[number], up) for number in pictured}
+    rendered = samples.render(scene, spec, cloud, _now_and_then(log))
+    low, high = _around(boxes)
+    measured = Measured(low, high, placed, rendered)
+    found = findings(spec, beside, measured)
+    return SceneCheck(spec, shapes, pictures, room, measured, drawn, found, time.monotonic() - begun)
+
+
+def _around(boxes: F32) -> F32:
+    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def _pictured(shapes: list[ShapeFacts], boxes: F32) -> list[int]:
+    """The numbers of the shapes that get a picture."""
+    size = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1)
+    order = sorted(range(len(shapes)), key=lambda number: (shapes[number].group is None, -size[number]))
+    return order[:PICTURED]
+
+
+def _now_and_then(log: Callable[[str], None]) -> Callable[[str], None]:
+    """`log`, but for lines that follow another one too soon."""
+    last = 0.0
+
+    def say(line: str) -> None:
+        nonlocal last
+        if time.monotonic() - last > QUIET_S:
+            last = time.monotonic()
+            log(line)
+
+    return say

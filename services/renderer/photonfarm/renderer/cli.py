@@ -95,7 +95,7 @@ def work(
 @click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
 def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
-    """Write a contact sheet of SPEC's samples: A, B, albedo, normal, depth, photons."""
+    """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
     from photonfarm.renderer.tools.preview import write_contact_sheet
     from photonfarm.shared.scene.spec_loading import load_spec
     from photonfarm.shared.store.read.reader import SceneReader

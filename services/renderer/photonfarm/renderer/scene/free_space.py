@@ -1,0 +1,152 @@
+"""Where points stand in a scene: in the open, inside a solid, or outside, told by rays in 64 directions.
+
+**Inside a solid.** A ray that starts inside a closed surface crosses it an odd number of times, whichever way its
+normals point and whether it is two-sided. Rays are followed through everything, and crossings are counted by shape. A
+point is inside a shape if at least `INSIDE` of its directions cross that shape an odd number of times. That allows for
+a missing bottom, and leaves out single sheets such as curtains, floors and leaves, which at most half of all directions
+cross.
+
+A room can be one closed mesh, too. So a shape whose box contains the boxes of more than half of all other shapes is
+*hollow*: to be inside it is to be in the room. One mesh that holds most of a scene's furniture is taken for a room.
+
+**Outside.** Outside a room about half of all directions, or more, meet no surface: just outside a wall it is half of
+them. The same holds under an open sky, where nothing is wrong with it.
+
+In six furnished rooms of 22 to 856 shapes, maps of all three at three heights show furniture, walls and rooms as they
+stand; a thousand points take 0.01 to 0.07 s of one core. What is missed are cupboards made of several single sheets, in
+which a point's `reach` is short.
+
+Shape letters: N points, R rays, S shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.scene.arrays import points as mi_points
+from photonfarm.shared.core.records import F32
+
+DIRECTIONS = 64
+
+INSIDE = 0.75
+"""The share of directions that must cross a shape an odd number of times: from the middle of a cube without a bottom it
+is 5/6, beside a sheet 1/2."""
+
+LEAVING = 0.45
+"""The share of directions that may meet no surface, of a point in the open."""
+
+NONE = -1
+
+_POINTS = 256  # at a time
+_CROSSINGS = 256  # followed of a ray, which ends every ray that rounding would let hang on a surface
+_STEP = 1e-5  # beyond a crossing, as a share of the scene's diagonal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What surrounds points, by 64 rays from each."""
+
+    solid: NDArray[np.int32]  # (N,) the number of the shape that a point is inside of, by the scene's order, or NONE
+    leaving: F32  # (N,) the share of directions that meet no surface
+    clearance: F32  # (N,) the distance to the nearest surface that a ray meets; inf without one
+    reach: F32  # (N,) the median distance to the first surface; inf if half the rays meet none
+
+    @property
+    def open(self) -> NDArray[np.bool_]:
+        """Whether points are inside no solid, and not outside, (N,)."""
+        return (self.solid == NONE) & (self.leaving <= LEAVING)
+
+
+def surroundings(scene: Any, points: F32) -> Surroundings:
+    """What surrounds points (N, 3) of a Mitsuba scene in its present state."""
+    boxes = boxes_of(scene.shapes())
+    step = np.float32(_STEP * np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
+    hollow, numbers = hollow_boxes(boxes), _numbers_of(scene)
+    parts = [
+        _surroundings(scene, points[start : start + _POINTS], step, hollow, numbers)
+        for start in range(0, max(len(points), 1), _POINTS)
+    ]
+    return Surroundings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def boxes_of(shapes: list[Any]) -> F32:
+    """The bounding boxes of shapes, (S, 2, 3): their lower and upper corners."""
+    corners = [[list(shape.bbox().min), list(shape.bbox().max)] for shape in shapes]
+    return np.array(corners, np.float32).reshape(-1, 2, 3)
+
+
+def hollow_boxes(boxes: F32) -> NDArray[np.bool_]:
+    """Which boxes (S, 2, 3) contain more than half of the others, within 1 % of their size, (S,); a single one does."""
+    slack = 0.01 * (boxes[:, 1] - boxes[:, 0]).max(axis=1, keepdims=True)
+    above = boxes[None, :, 0] >= (boxes[:, 0] - slack)[:, None]
+    below = boxes[None, :, 1] <= (boxes[:, 1] + slack)[:, None]
+    others = (above & below).all(axis=2).sum(axis=1) - 1
+    hollow: NDArray[np.bool_] = (2 * others > len(boxes) - 1) | (len(boxes) == 1)
+    return hollow
+
+
+def directions() -> F32:
+    """`DIRECTIONS` unit vectors, spread evenly over the sphere by a Fibonacci lattice."""
+    place = np.arange(DIRECTIONS) + 0.5
+    height = 1 - 2 * place / DIRECTIONS
+    angle = np.pi * (1 + 5**0.5) * place
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1).astype(np.float32)
+
+
+def _numbers_of(scene: Any) -> NDArray[np.int64]:
+    """The number of a shape in the scene's order, by its number in Dr.Jit's registry."""
+    registered = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    numbers = np.zeros(registered.max() + 1, np.int64)
+    numbers[registered] = np.arange(len(registered))
+    return numbers
+
+
+def _surroundings(
+    scene: Any, points: F32, step: np.float32, hollow: NDArray[np.bool_], numbers: NDArray[np.int64]
+) -> tuple[NDArray[Any], ...]:
+    """The fields of `Surroundings`, of a few points."""
+    first, odd = _followed(scene, points, step, numbers, len(hollow))
+    odd_share = odd.reshape(len(points), DIRECTIONS, len(hollow)).mean(axis=1)
+    odd_share[:, hollow] = 0
+    first = first.reshape(len(points), DIRECTIONS)
+    solid = np.where(odd_share.max(axis=1) >= INSIDE, odd_share.argmax(axis=1), NONE).astype(np.int32)
+    leaving = np.isinf(first).mean(axis=1, dtype=np.float32)
+    return solid, leaving, first.min(axis=1), np.sort(first, axis=1)[:, DIRECTIONS // 2]
+
+
+def _followed(
+    scene: Any, points: F32, step: np.float32, numbers: NDArray[np.int64], shapes: int
+) -> tuple[F32, NDArray[np.bool_]]:
+    """The distances to the first surfaces (R,), and which shapes are crossed an odd number of times (R, S)."""
+    origin = np.repeat(points.astype(np.float32), DIRECTIONS, axis=0)
+    direction = np.tile(directions(), (len(points), 1))
+    first = np.full(len(origin), np.inf, np.float32)
+    odd = np.zeros((len(origin), shapes), np.bool_)
+    alive = np.arange(len(origin))
+    for crossing in range(_CROSSINGS):
+        if not len(alive):
+            break
+        distance, shape = _next_crossing(scene, origin[alive], direction[alive])
+        met = np.isfinite(distance)
+        alive, distance = alive[met], distance[met]
+        if crossing == 0:
+            first[alive] = distance
+        odd[alive, numbers[shape[met]]] ^= True
+        origin[alive] += (distance + step)[:, None] * direction[alive]
+    return first, odd
+
+
+def _next_crossing(scene: Any, origin: F32, direction: F32) -> tuple[F32, NDArray[np.uint32]]:
+    """The distances to the next surfaces, inf without one, and the registered numbers of their shapes; (R,) each."""
+    ray = mi.Ray3f(o=mi_points(origin), d=mi.Vector3f(mi_points(direction)))
+    hit = scene.ray_intersect_preliminary(ray)
+    distance, shape = hit.t, dr.reinterpret_array(mi.UInt32, hit.shape)
+    dr.eval(distance, shape)
+    return np.array(distance), np.array(shape)

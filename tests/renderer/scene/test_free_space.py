@@ -1,0 +1,100 @@
+"""Where points stand: in rooms whose walls are made and oriented in every way."""
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from photonfarm.renderer.scene.free_space import NONE, directions, hollow_boxes, surroundings
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.scene.spec_loading import load_spec
+
+
+def box(low: list[float], high: list[float], *, inwards: bool = False) -> dict[str, Any]:
+    """A closed box of six faces, whose normals point outwards or inwards."""
+    low_, high_ = np.array(low), np.array(high)
+    place = mi.ScalarTransform4f().translate(list((low_ + high_) / 2)).scale(list((high_ - low_) / 2))
+    return {"type": "cube", "to_world": place, "flip_normals": inwards}
+
+
+def scene_of(**shapes: dict[str, Any]) -> Any:
+    return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+
+def numbered(scene: Any, name: str) -> int:
+    return [shape.id() for shape in scene.shapes()].index(name)
+
+
+IN_ROOM, IN_BLOCK, OUTSIDE = ([[-1.5, 1.0, -1.5], [1.2, 2.5, 0.7]], [[0.5, 0.5, 0.5]], [[3.0, 1.0, 0.0]])
+PLACES = np.array(IN_ROOM + IN_BLOCK + OUTSIDE, np.float32)
+
+
+@pytest.mark.parametrize("walls_inwards", [False, True])
+@pytest.mark.parametrize("block_inwards", [False, True])
+def test_normals_do_not_matter(walls_inwards: bool, block_inwards: bool) -> None:
+    scene = scene_of(
+        walls=box([-2, 0, -2], [2, 3, 2], inwards=walls_inwards),
+        block=box([0, 0, 0], [1, 1, 1], inwards=block_inwards),
+        vase=box([-1, 0, 1], [-0.8, 0.5, 1.2]),
+    )
+    found = surroundings(scene, PLACES)
+    np.testing.assert_array_equal(found.solid, [NONE, NONE, numbered(scene, "block"), NONE])
+    np.testing.assert_array_equal(found.open, [True, True, False, False])
+    assert found.leaving[0] == 0
+    assert found.leaving[3] > 0.5
+
+
+def test_a_wall_of_two_sides_is_a_solid_and_the_room_between_walls_is_open() -> None:
+    walls = {
+        "floor": box([-2.2, -0.2, -2.2], [2.2, 0, 2.2]),
+        "ceiling": box([-2.2, 3, -2.2], [2.2, 3.2, 2.2]),
+        "left": box([-2.2, 0, -2.2], [-2, 3, 2.2]),
+        "right": box([2, 0, -2.2], [2.2, 3, 2.2]),
+        "back": box([-2, 0, -2.2], [2, 3, -2]),
+    }  # and no front
+    scene = scene_of(**walls)
+    found = surroundings(scene, np.array([[0, 1.5, 0], [-2.1, 1.5, 0], [0, 1.5, 4]], np.float32))
+    np.testing.assert_array_equal(found.solid, [NONE, numbered(scene, "left"), NONE])
+    np.testing.assert_array_equal(found.open, [True, False, False])
+
+
+def test_a_single_sheet_holds_no_point() -> None:
+    sheet = mi.ScalarTransform4f().translate([0, 1, 0]).scale(0.9)
+    scene = scene_of(walls=box([-2, 0, -2], [2, 3, 2]), curtain={"type": "rectangle", "to_world": sheet})
+    near = np.array([[0, 1, 0.001], [0, 1, -0.001], [0.5, 1.5, 0.3]], np.float32)
+    found = surroundings(scene, near)
+    assert found.open.all()
+    np.testing.assert_allclose(found.clearance[:2], 0.001, rtol=0.1)
+
+
+def test_distances_are_those_of_a_sphere() -> None:
+    scene = scene_of(sky={"type": "sphere", "radius": 5.0})
+    found = surroundings(scene, np.zeros((1, 3), np.float32))
+    np.testing.assert_allclose([found.clearance[0], found.reach[0]], 5, rtol=1e-5)
+    assert found.open.all()
+
+
+def test_no_points_have_no_surroundings() -> None:
+    assert surroundings(scene_of(one=box([0, 0, 0], [1, 1, 1])), np.zeros((0, 3), np.float32)).open.shape == (0,)
+
+
+def test_directions_are_unit_vectors_without_a_bias() -> None:
+    np.testing.assert_allclose(np.linalg.norm(directions(), axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(directions().mean(axis=0), 0, atol=0.01)
+
+
+def test_a_box_of_most_others_is_hollow() -> None:
+    boxes = np.array([[[0, 0, 0], [9, 9, 9]], [[1, 1, 1], [3, 3, 3]], [[2, 2, 2], [3, 3, 3]]], np.float32)
+    np.testing.assert_array_equal(hollow_boxes(boxes), [True, False, False])
+    assert hollow_boxes(boxes[2:]).all()
+
+
+def test_the_built_in_room_is_open_but_in_its_furniture() -> None:
+    room = LoadedScene.load(load_spec("room")).scene
+    stands = {"pedestal-stone": [-2.1, 0.3, -1.35], "sofa-fabric": [1.85, 0.25, 0.3]}
+    free = [[0.3, 1.5, 0.9], [-1.9, 1.1, 1.6]]
+    found = surroundings(room, np.array([*stands.values(), *free, [0, 1, 9]], np.float32))
+    ids = [shape.id() for shape in room.shapes()]
+    assert [ids[number] for number in found.solid[:2]] == list(stands)
+    np.testing.assert_array_equal(found.open, [False, False, True, True, False])

@@ -81,6 +81,15 @@ def test_plans_are_seen_from_above_whatever_axis_is_up(up) -> None:
     np.testing.assert_array_equal(np.cross(right, upward), up)
 
 
+def test_a_scene_without_a_single_job_has_a_sheet_too(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store", create=True)
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=6)).scene_id)
+    write_contact_sheet(samples.reader_of(scene), 24, tmp_path / "preview.html")
+    text = (tmp_path / "preview.html").read_text()
+    assert "0 complete samples" in text
+    assert len(rectangles(text, "may")) == 1
+
+
 @needs_chromium
 def test_the_sheet_says_what_stands_where_and_fits_a_phone(tmp_path: Path) -> None:
     store = Store(tmp_path / "store", create=True)

@@ -20,7 +20,7 @@ from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import ReportContents, gathered
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, half_floats, light_data
 from photonfarm.trainer.report.verdict import Verdict
-from photonfarm.trainer.report.views import Layer, ShownView, light, views_of
+from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
 
 
 @pytest.fixture
@@ -96,13 +96,13 @@ def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_p
 
 def test_the_inputs_are_those_that_the_network_is_given(measured, scene, contents) -> None:
     """No network here reads guides, so that a store's guides are none of its inputs."""
-    names = [layer.name for layer in views_of(contents)[0].inputs]
+    names = [layer.name for layer in shown_views(contents)[0].inputs]
     assert names == ["albedo", "normal", "depth"]
     store, runs, references = measured
     scene.guides.want(GuideSpec(light_samples=5))
     assert Store(store).scene(scene.scene_id).guides.settings() is not None
     again = gathered(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
-    assert [layer.name for layer in views_of(again)[0].inputs] == names
+    assert [layer.name for layer in shown_views(again)[0].inputs] == names
 
 
 def test_large_films_are_reduced_and_light_that_does_not_fit_is_left_out() -> None:

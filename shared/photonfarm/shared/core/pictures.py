@@ -18,7 +18,7 @@ Picture = NDArray[np.uint8]  # (H, W, 3)
 
 GAMMA = 2.2
 
-EXACT, LARGEST = 128, 256
+EXACT, LARGEST = 96, 256
 """Pictures in pages: up to this width without loss, and up to this size at all."""
 
 V = TypeVar("V", np.uint8, np.float32)

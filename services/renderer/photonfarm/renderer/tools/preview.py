@@ -13,13 +13,18 @@ from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import Photons
+from photonfarm.shared.core.records import Geometry, Photons
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 COLUMNS = ("A", "B", "albedo", "normal", "depth", "photons")
+
+NO_GEOMETRY = Geometry(
+    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), np.zeros(0, np.int32), np.zeros(0, np.int16)
+)
+"""What is known of a scene before its first job."""
 
 TEMPLATE = Path(__file__).with_name("preview.html.j2")
 
@@ -50,7 +55,7 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
     reader.refresh()
     shown = reader.rows[np.unique(np.linspace(0, len(reader.rows) - 1, min(count, len(reader.rows))).astype(np.int64))]
     spec = reader.spec
-    plan = PlanView.of(spec, reader.base()[0])
+    plan = PlanView.of(spec, reader.base()[0] if reader.ready() else NO_GEOMETRY)
     return rendered(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",

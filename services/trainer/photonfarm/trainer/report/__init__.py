@@ -22,7 +22,7 @@ from photonfarm.trainer.report.page import page
 from photonfarm.trainer.report.pictures import OVERVIEW, overview
 from photonfarm.trainer.report.plots import plots
 from photonfarm.trainer.report.verdict import Verdict
-from photonfarm.trainer.report.views import views_of
+from photonfarm.trainer.report.views import shown_views
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -53,7 +53,7 @@ def write_report(
         store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, on_progress=on_progress, timed=timed,
     )  # fmt: skip
-    drawn, views, verdict = plots(contents), views_of(contents), Verdict.of(contents)
+    drawn, views, verdict = plots(contents), shown_views(contents), Verdict.of(contents)
     text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)
     with store_errors("write the report", out):
         for plot in drawn:

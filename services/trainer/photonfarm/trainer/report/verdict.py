@@ -90,8 +90,8 @@ def _of_references(references: References | None, metrics: ImageMetrics | None) 
     """The sentence on references: what the images are compared with, and what came of it."""
     if references is None or metrics is None:
         return (
-            "There are no references: pictures stand beside the mean of both noisy halves, and the paper’s columns "
-            "are empty; `photonfarm up --reference-views 6` renders some, `photonfarm report --references` takes them."
+            "There are no references, such as “photonfarm up --reference-views 6” renders: pictures stand beside the "
+            "mean of both noisy halves, and the paper’s columns are empty."
         )
     mse, mssim = metrics.mse.estimate.mean, metrics.mssim.estimate.mean
     return (

@@ -58,7 +58,7 @@ class ShownView:
     mse: float  # of the first predictor, in the metric space, with the target's noise
 
 
-def views_of(contents: ReportContents) -> list[ShownView]:
+def shown_views(contents: ReportContents) -> list[ShownView]:
     """The views with an image by the first predictor: that of median error first, so that no choice flatters."""
     there = contents.entries[0].row.shown
     found = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]

@@ -3,7 +3,7 @@
 import base64
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,7 @@ import pytest
 from chromium import chromium, needs_chromium
 
 from photonfarm.shared.core.estimate import Estimate, group_means
-from photonfarm.shared.scene.spec import GuideSpec
-from photonfarm.shared.store import Store
+from photonfarm.shared.core.records import Guides
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -25,9 +24,9 @@ from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
 
 @pytest.fixture
 def contents(measured) -> ReportContents:
-    store, runs, references = measured
-    loaded = [TrainedRun.load(run) for run in runs[:1]]
-    return gathered(store, loaded, [], references=references, inception=None, timed=False)
+    """Of one run, without references."""
+    store, runs, _ = measured
+    return gathered(store, [TrainedRun.load(runs[0])], [], references=None, inception=None, timed=False)
 
 
 def errors(*per_sample: float) -> HeldOutErrors:
@@ -67,17 +66,17 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
 
 
 def test_without_references_the_verdict_says_so_and_with_them_what_they_show(contents, measured) -> None:
-    store, runs, _ = measured
-    mssim = contents.entries[0].row.metrics.mssim.estimate.mean
-    assert f"{mssim:.3f}" in Verdict.of(contents).further[-1]
-    without = gathered(store, [TrainedRun.load(runs[0])], [], references=None, inception=None, timed=False)
-    assert "no references" in Verdict.of(without).further[-1]
-    assert Verdict.of(without).sentence == Verdict.of(contents).sentence
+    store, runs, references = measured
+    assert "no references" in Verdict.of(contents).further[-1]
+    more = gathered(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
+    mssim = more.entries[0].row.metrics.mssim.estimate.mean
+    assert f"{mssim:.3f}" in Verdict.of(more).further[-1]
+    assert Verdict.of(more).sentence == Verdict.of(contents).sentence
 
 
 def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_path) -> None:
-    store, runs, references = measured
-    figures = write_report(store, runs, tmp_path / "out", references=references, timed=False)
+    store, runs, _ = measured
+    figures = write_report(store, runs, tmp_path / "out", timed=False)
     page = (tmp_path / "out/report.html").read_text()
     assert figures["verdict"].replace("_", "_<wbr>") in page
     assert figures["verdict"] in (tmp_path / "out/report.md").read_text()
@@ -94,15 +93,20 @@ def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_p
         np.testing.assert_array_equal(shown.astype(np.float64), sample.radiance[0] * sample.scale)
 
 
-def test_the_inputs_are_those_that_the_network_is_given(measured, scene, contents) -> None:
-    """No network here reads guides, so that a store's guides are none of its inputs."""
-    names = [layer.name for layer in shown_views(contents)[0].inputs]
-    assert names == ["albedo", "normal", "depth"]
-    store, runs, references = measured
-    scene.guides.want(GuideSpec(light_samples=5))
-    assert Store(store).scene(scene.scene_id).guides.settings() is not None
-    again = gathered(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
-    assert [layer.name for layer in shown_views(again)[0].inputs] == names
+def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these_show_something(contents) -> None:
+    assert [layer.name for layer in shown_views(contents)[0].inputs] == ["albedo", "normal", "depth"]
+    film = contents.card.spec.film
+    ramp = np.linspace(0, 1, film.height * film.width, dtype=np.float32).reshape(film.height, film.width, 1)
+    shapes = {field.name: (film.height, film.width, 3) for field in fields(Guides)}
+    black = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    guides = Guides(**{**black, "direct": ramp.repeat(3, axis=2), "roughness": ramp[..., 0]})
+    inputs = {row: (buffers, guides) for row, (buffers, _) in contents.inputs.items()}
+    spec = contents.card.spec.model_copy(update={"exposure": 4.0})
+    given = replace(contents, inputs=inputs, card=replace(contents.card, spec=spec))
+    layers = {layer.name: layer for layer in shown_views(given)[0].inputs}
+    assert list(layers) == ["albedo", "normal", "depth", "direct light", "roughness"]
+    np.testing.assert_array_equal(layers["direct light"].light, 4 * guides.direct)
+    assert layers["roughness"].light is None
 
 
 def test_large_films_are_reduced_and_light_that_does_not_fit_is_left_out() -> None:

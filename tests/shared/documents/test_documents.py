@@ -13,6 +13,7 @@ from photonfarm.shared.cli.settings import file_defaults
 from photonfarm.shared.cli.verbs import options_by_command
 from photonfarm.shared.core import errors
 from photonfarm.shared.scene import spec as scene_spec
+from photonfarm.shared.scene.free_space import FreeSpace
 
 ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"
@@ -57,6 +58,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "lights": scene_spec.Light,
     "emitters": scene_spec.Emitters,
     "view": scene_spec.ViewSpec,
+    "free space": FreeSpace,
     "film": scene_spec.Film,
     "transport": scene_spec.Transport,
     "photons": scene_spec.PhotonSpec,

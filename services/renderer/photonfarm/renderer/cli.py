@@ -95,7 +95,7 @@ def work(
 @click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
 def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
-    """Write a contact sheet of SPEC's samples: A, B, albedo, normal, depth, photons."""
+    """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
     from photonfarm.renderer.tools.preview import write_contact_sheet
     from photonfarm.shared.scene.spec_loading import load_spec
     from photonfarm.shared.store.read.reader import SceneReader
@@ -252,6 +252,32 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     log = partial(click.echo, err=True)
     found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
+@json_option
+def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
+    """Measure where SPEC's cameras may stand: in the open, by rays, and in no movable group's box.
+
+    With it in the spec, `submit` plans no view from inside a solid or from outside the room, and camera paths are kept
+    out of them.
+    """
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec, measured_again=True)
+    backend.load(threads=1)
+    from photonfarm.renderer.measure.free_cells import measure
+    from photonfarm.renderer.strategy.output import spec_file
+
+    file = spec_file.writable(spec) if write else find_spec(spec)
+    found = measure(loaded, file.parent, partial(click.echo, err=True))
+    click.echo(json.dumps(found.entry()) if as_json else found.line())
+    if write:
+        spec_file.write(file, {"view": {"free_space": found.entry()}})
+        click.echo(f"{file}: [view.free_space] written", err=True)
 
 
 @click.command()

@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from photonfarm.shared.core.pictures import Picture, png_uri
+from photonfarm.shared.core.pictures import data_uri
 
 HERE = Path(__file__).parent
 
@@ -20,13 +20,8 @@ def rendered(template: Path, **values: Any) -> str:
         loader=FileSystemLoader([template.parent, HERE]), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"uri": picture_uri, "breakable": breakable, "base64": lambda data: b64encode(data).decode()}
+    environment.filters |= {"uri": data_uri, "breakable": breakable, "base64": lambda data: b64encode(data).decode()}
     return environment.get_template(template.name).render(**values)
-
-
-def picture_uri(picture: Picture, width: int = 128) -> str:
-    """A picture as a data URI, each of its pixels drawn as several if it is narrower than `width` pixels."""
-    return png_uri(picture, max(1, -(-width // picture.shape[1])))
 
 
 def breakable(text: str) -> Markup:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,11 @@ from photonfarm.shared.core.records import F32
 Picture = NDArray[np.uint8]  # (H, W, 3)
 
 GAMMA = 2.2
+
+EXACT, LARGEST = 96, 256
+"""Pictures in pages: up to this width without loss, and up to this size at all."""
+
+V = TypeVar("V", np.uint8, np.float32)
 
 
 def display_values(exposed: F32) -> F32:
@@ -46,13 +52,24 @@ def of_depth(depth: F32) -> Picture:
     return _bytes(np.repeat((hit * (1 - 0.9 * np.clip(depth / far, 0, 1)))[..., None], 3, axis=2))
 
 
-def png_uri(picture: Picture, scale: int = 1) -> str:
-    """The picture as a `data:` address of a PNG, each pixel drawn `scale` × `scale`."""
+def reduced(image: NDArray[V]) -> NDArray[V]:
+    """An image (H, W, C) of at most `LARGEST` pixels along each side: means over blocks, less a rest at the edges."""
+    by = -(-max(image.shape[:2]) // LARGEST)
+    if by == 1:
+        return image
+    height, width = (side // by for side in image.shape[:2])
+    blocks = image[: height * by, : width * by].reshape(height, by, width, by, -1)
+    return blocks.mean(axis=(1, 3)).astype(image.dtype)
+
+
+def data_uri(picture: Picture) -> str:
+    """The picture as a `data:` address: PNG, or WebP if it is wider than `EXACT` pixels; large ones are reduced."""
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(picture.repeat(scale, axis=0).repeat(scale, axis=1)).save(stream, "PNG")
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+    kind = "PNG" if picture.shape[1] <= EXACT else "WEBP"
+    Image.fromarray(reduced(picture)).save(stream, kind, quality=90)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
 def _bytes(unit: NDArray[np.floating]) -> Picture:

@@ -224,7 +224,8 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     of_view = np.repeat(np.arange(len(counts)), counts)
     index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
     of_modification = modification_keys(spec, modifications)
-    views = view_vectors(spec, [of_modification[m] for m in of_view.tolist()], request.seed, index)
+    standing = None if spec.view.free_space is None else modifications[of_view]
+    views = view_vectors(spec, [of_modification[m] for m in of_view.tolist()], request.seed, index, standing)
     modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
     view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
 

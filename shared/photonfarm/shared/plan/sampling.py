@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.keys import Key, encoded, key_of
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.shared.scene.view import MOST_DRAWS, in_free_space, nowhere, sample_view
 
 F64 = NDArray[np.float64]
 U64 = NDArray[np.uint64]
@@ -55,13 +56,22 @@ def view_keys(modification_keys: list[Key], vectors: F32) -> list[Key]:
     return [key_of(begin + encoded(key) + vector) for key, vector in views]
 
 
-def view_vectors(spec: SceneSpec, modification_keys: list[Key], seed: int, indices: NDArray[np.int64]) -> F32:
-    """The vectors of views of configurations, (N, 6): `indices` has the number of each view within its own."""
+def view_vectors(
+    spec: SceneSpec,
+    modification_keys: list[Key],
+    seed: int,
+    indices: NDArray[np.int64],
+    modifications: F32 | None = None,
+) -> F32:
+    """The vectors of views of configurations, (N, 6): `indices` has the number of each view within its own.
+
+    `modifications` (N, G, 4) are these configurations, by default the scene at rest; only free space needs them.
+    """
     vectors = np.empty((len(indices), 6), np.float32)
     begin, of_seed = encoded("view"), encoded(seed)
     number = {index: encoded(index) for index in np.unique(indices).tolist()}
-    low = np.concatenate([spec.view.origin.low, spec.view.look_at.low])
-    high = np.concatenate([spec.view.origin.high, spec.view.look_at.high])
+    if modifications is None:
+        modifications = np.broadcast_to(rest(spec).vector, (len(indices), len(spec.groups), 4))
     for start in range(0, len(indices), _AT_ONCE):
         end = min(start + _AT_ONCE, len(indices))
         numbers = indices[start:end].tolist()
@@ -69,10 +79,30 @@ def view_vectors(spec: SceneSpec, modification_keys: list[Key], seed: int, indic
             key_of(begin + encoded(key) + of_seed + number[index])
             for key, index in zip(modification_keys[start:end], numbers, strict=True)
         ]
-        vectors[start:end] = low + _uniform(keys, 6) * (high - low)
+        _draw(spec, keys, vectors[start:end], modifications[start:end])
     for i in _looking_at_themselves(spec, vectors):
-        vectors[i] = sample_view(spec, modification_keys[i], seed, int(indices[i])).vector
+        configuration = Modification.from_vector(modifications[i])
+        vectors[i] = sample_view(spec, modification_keys[i], seed, int(indices[i]), configuration).vector
     return vectors
+
+
+def _draw(spec: SceneSpec, keys: list[Key], vectors: F32, modifications: F32) -> None:
+    """Draw views (N, 6) from the streams of keys, again and again until their origins are in free space.
+
+    Those that look at themselves are left to `sample_view`.
+    """
+    low = np.concatenate([spec.view.origin.low, spec.view.look_at.low])
+    high = np.concatenate([spec.view.origin.high, spec.view.look_at.high])
+    left = np.arange(len(keys))
+    for draw in range(MOST_DRAWS):
+        vectors[left] = low + _uniform([keys[i] for i in left.tolist()], 6, first=6 * draw) * (high - low)
+        done = in_free_space(spec, vectors[left, :3], modifications[left])
+        if not done.all():
+            done[_looking_at_themselves(spec, vectors[left])] = True
+        left = left[~done]
+        if not len(left):
+            return
+    raise nowhere(spec)
 
 
 def _looking_at_themselves(spec: SceneSpec, vectors: F32) -> list[int]:
@@ -107,12 +137,16 @@ def contents(array: F32) -> Iterator[bytes]:
 # ------------------------------------------------------------------------------------------------------------ streams
 
 
-def _uniform(keys: list[Key], count: int) -> F64:
-    """The first `count` numbers of the stream "placement" of each key, in [0, 1); (N, count). See `keys.Stream`."""
+def _uniform(keys: list[Key], count: int, first: int = 0) -> F64:
+    """`count` numbers of the stream "placement" of each key, after its `first` ones, in [0, 1); (N, count).
+
+    See `keys.Stream`.
+    """
     purpose = encoded("placement")
     words = np.frombuffer(b"".join(key_of(encoded(key) + purpose) for key in keys), "<u8").reshape(-1, 2)
-    blocks = _philox(words.astype(np.uint64), -(-count // 4))
-    raw = blocks.transpose(2, 0, 1).reshape(len(keys), -1)[:, :count]
+    begin = first // 4
+    blocks = _philox(words.astype(np.uint64), begin, -(-(first + count) // 4))
+    raw = blocks.transpose(2, 0, 1).reshape(len(keys), -1)[:, first - 4 * begin :][:, :count]
     return (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
@@ -120,9 +154,9 @@ _MULTIPLIERS = (np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157))
 _INCREMENTS = (np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B))
 
 
-def _philox(keys: U64, blocks: int) -> U64:
-    """The first words of Philox 4x64-10 for each key (N, 2), as (blocks, 4, N) [Salmon et al., SC 2011]."""
-    counters = np.arange(1, blocks + 1, dtype=np.uint64)[:, None]  # numpy counts before it draws
+def _philox(keys: U64, begin: int, end: int) -> U64:
+    """Blocks of words of Philox 4x64-10 for each key (N, 2), as (end − begin, 4, N) [Salmon et al., SC 2011]."""
+    counters = np.arange(begin + 1, end + 1, dtype=np.uint64)[:, None]  # numpy counts before it draws
     a = np.repeat(counters, len(keys), axis=1)
     b, c, d = (np.zeros_like(a) for _ in range(3))
     key_0, key_1 = keys[:, 0], keys[:, 1]

@@ -6,6 +6,8 @@ Shape letters: K key views, F frames.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -15,12 +17,16 @@ from pydantic import Field, FiniteFloat, ValidationError
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.models import Frozen, sentences
+from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View
+from photonfarm.shared.scene.view import View, in_free_space, in_group
 
 MOST_FRAMES = 10_000
 ORBIT = 0.9
 """Size of the ellipse of an orbit over that of the box of origins."""
+
+SMALLER, HEIGHTS = (ORBIT, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1), (0.5, 0.75, 0.95, 0.25, 0.05)
+"""Ellipses to try among solids, in this order: their sizes, and their heights in the box of origins."""
 
 FinitePoint = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
@@ -67,19 +73,58 @@ class CameraPath(Frozen):
         return found
 
 
-def orbit(spec: SceneSpec, frames: int) -> list[View]:
+def orbit(spec: SceneSpec, frames: int, modification: Modification | None = None) -> list[View]:
     """Once around: on an ellipse in the middle of the spec's box of origins, looking at the middle of the other box.
 
-    The ellipse is perpendicular to the axis nearest to up. It may pass through objects.
+    The ellipse is perpendicular to the axis nearest to up. In a spec with free space it is the largest one, at any of a
+    few heights, on which no camera stands in what is there in this configuration, by default the scene at rest; raises
+    SpecError where there is none. Otherwise it may pass through objects.
     """
+    for size, height in product(SMALLER, HEIGHTS) if spec.view.free_space else [(ORBIT, HEIGHTS[0])]:
+        views = _ellipse(spec, frames, size, height)
+        if next(_obstacles(spec, views, modification), None) is None:
+            return views
+    raise SpecError(
+        f"{spec.name}: no orbit keeps clear of what stands there, by view.free_space; give a camera path of your own, "
+        "or another configuration"
+    )
+
+
+def kept_clear(spec: SceneSpec, views: list[View], modification: Modification) -> list[View]:
+    """The views of a path, if all its cameras are in free space; raises SpecError for the first that is not.
+
+    Free space is known in the box of origins alone; beyond it, only the movable groups are looked at.
+    """
+    for frame, what in _obstacles(spec, views, modification):
+        x, y, z = views[frame].origin.tolist()
+        raise SpecError(
+            f"camera path: in frame {frame} the camera at ({x:.3g}, {y:.3g}, {z:.3g}) stands {what}; lead the path "
+            "around it, or take view.free_space out of the spec"
+        )
+    return views
+
+
+def _obstacles(spec: SceneSpec, views: list[View], modification: Modification | None) -> Iterator[tuple[int, str]]:
+    """The frames whose cameras are not in free space, each with what they stand in."""
+    vectors = (rest(spec) if modification is None else modification).vector[None].repeat(len(views), axis=0)
+    origins = np.stack([view.origin for view in views])
+    around = {group.name: in_group(spec, g, origins, vectors) for g, group in enumerate(spec.groups)}
+    for frame in np.flatnonzero(~in_free_space(spec, origins, vectors)).tolist():
+        names = [name for name, holds in around.items() if holds[frame]]
+        yield frame, f"in the box around {names[0]!r}" if names else "in a solid of the scene, or close to one"
+
+
+def _ellipse(spec: SceneSpec, frames: int, size: float, height: float) -> list[View]:
+    """Views on an ellipse of this size, at this height, both as shares of the box of origins."""
     low, high = np.array(spec.view.origin.low), np.array(spec.view.origin.high)
     target = 0.5 * (np.array(spec.view.look_at.low) + np.array(spec.view.look_at.high))
     up = int(np.abs(spec.view.up).argmax())
     first, second = (axis for axis in range(3) if axis != up)
     angle = 2 * np.pi * np.arange(frames) / frames
     origins = np.repeat(0.5 * (low + high)[None], frames, axis=0)
-    origins[:, first] += ORBIT * 0.5 * (high - low)[first] * np.cos(angle)
-    origins[:, second] += ORBIT * 0.5 * (high - low)[second] * np.sin(angle)
+    origins[:, up] += (height - 0.5) * (high - low)[up]
+    origins[:, first] += size * 0.5 * (high - low)[first] * np.cos(angle)
+    origins[:, second] += size * 0.5 * (high - low)[second] * np.sin(angle)
     return [View(origin.astype(np.float32), target.astype(np.float32)) for origin in origins]
 
 

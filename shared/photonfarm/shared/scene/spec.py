@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 
 from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.core.models import Factor, Frozen, Name, Positive, Probability
+from photonfarm.shared.scene.free_space import FreeSpace
 
 Vector = tuple[float, float, float]
 
@@ -111,6 +112,7 @@ class ViewSpec(Frozen):
     up: Vector = (0.0, 1.0, 0.0)
     near: Positive = 0.01  # also the near plane of window depth
     far: Positive = 1000.0
+    free_space: FreeSpace | None = Field(default=None, exclude_if=lambda said: said is None)  # then left out of ids
 
     @model_validator(mode="after")
     def _is_a_camera(self) -> Self:
@@ -240,6 +242,15 @@ class SceneSpec(Frozen):
         not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
         described = self.model_dump(mode="json", exclude=not_of_it)
         return make_key("scene", _canonical(described)).hex()
+
+    @property
+    def free_space_digest(self) -> str:
+        """The digest of all that free space depends on: geometry, groups as they were modelled, boxes of views."""
+        groups = [{"shapes": list(shape_ids(group)), "at": list(group.at)} for group in self.groups]
+        scene = self.scene.model_dump(mode="json", exclude={"file"})
+        view = self.view.model_dump(mode="json", include={"origin", "look_at", "near"})
+        described = {"scene": scene, "content": self.content, "groups": groups, "view": view}
+        return make_key("free space", _canonical(described)).hex()
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A changed copy; pydantic would keep the id of the original."""

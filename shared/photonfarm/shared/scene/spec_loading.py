@@ -21,10 +21,11 @@ FEW = 3
 """Up to so many lights, a message about an unknown light names them all."""
 
 
-def load_spec(path: str | Path) -> SceneSpec:
+def load_spec(path: str | Path, *, measured_again: bool = False) -> SceneSpec:
     """The checked spec in a file, TOML or, as stores have it, JSON.
 
-    A bare name such as `room` is looked up among the built-in and ready specs.
+    A bare name such as `room` is looked up among the built-in and ready specs. With `measured_again` it is without free
+    space, which is measured anew.
 
     Raises SpecError with one sentence that names the key, the value and the rule.
     """
@@ -36,6 +37,8 @@ def load_spec(path: str | Path) -> SceneSpec:
         raise SpecError(f"{file}: cannot be read: {error}") from error
     except ValueError as error:
         raise SpecError(f"{file}: is not valid {language}: {error}") from error
+    if measured_again and isinstance(view := described.get("view"), dict):
+        view.pop("free_space", None)
     return parse_spec(described, where=str(file), beside=file.parent)
 
 
@@ -53,7 +56,13 @@ def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = N
         _check_shapes(spec, scene.shape_ids, where)
         _check_lights(spec, scene.emitting, where)
         _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
-    return spec.model_copy(update={"content": content})
+    spec = spec.model_copy(update={"content": content})
+    if spec.view.free_space is not None and spec.view.free_space.of != spec.free_space_digest:
+        raise SpecError(
+            f"{where}: view.free_space: was measured for other geometry, groups or boxes of views; "
+            f"take it out, or run `photonfarm scene free-space {where} --write` again"
+        )
+    return spec
 
 
 def _validate(described: dict[str, Any], where: str) -> SceneSpec:

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec, ViewSpec
 
 
@@ -85,16 +88,60 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def sample_view(spec: SceneSpec, modification_key: Key, seed: int, index: int) -> View:
+MOST_DRAWS = 1000
+"""The draws of a camera's position after which it is given up: then fewer than one in a hundred is free, or so."""
+
+
+def sample_view(
+    spec: SceneSpec, modification_key: Key, seed: int, index: int, modification: Modification | None = None
+) -> View:
     """The `index`-th random view of one configuration under a master seed [supplement 2.2].
 
-    Origin and look-at point are uniform in their boxes and independent; origins inside objects are not rejected. Only
-    a look-at point nearer than 1e-4 of the boxes' joint diagonal is drawn again.
+    Origin and look-at point are uniform in their boxes and independent. Both are drawn again where they are nearer to
+    each other than 1e-4 of the boxes' joint diagonal and, in a spec with free space, where the origin is not in it.
+    Then origins are uniform in what is free in this configuration, which is `modification`, or else the scene at rest.
+    Raises SpecError where almost nothing is free.
     """
     stream = Stream(make_key("view", modification_key, seed, index), "placement")
     boxes = (spec.view.origin, spec.view.look_at)
     diagonal = np.linalg.norm(np.max([b.high for b in boxes], axis=0) - np.min([b.low for b in boxes], axis=0))
-    while True:
+    vector = (rest(spec) if modification is None else modification).vector[None]
+    for _ in range(MOST_DRAWS):
         origin, target = (stream.uniform_in(box.low, box.high).astype(np.float32) for box in boxes)
-        if np.linalg.norm(target.astype(np.float64) - origin.astype(np.float64)) >= 1e-4 * diagonal:
+        apart = np.linalg.norm(target.astype(np.float64) - origin.astype(np.float64)) >= 1e-4 * diagonal
+        if apart and in_free_space(spec, origin[None], vector)[0]:
             return View(origin, target)
+    raise nowhere(spec)
+
+
+def nowhere(spec: SceneSpec) -> SpecError:
+    """The error for a configuration without a place for a camera."""
+    return SpecError(
+        f"{spec.name}: view.origin: of {MOST_DRAWS} cameras none stood in the open, by view.free_space; make the box "
+        "larger, or let groups leave room in it"
+    )
+
+
+def in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[np.bool_]:
+    """Whether origins (N, 3) are in the open in configurations (N, G, 4), (N,): in free cells, in no group's box.
+
+    All are in a spec without free space.
+    """
+    space = spec.view.free_space
+    if space is None:
+        return np.ones(len(origins), np.bool_)
+    free = space.holds(spec.view.origin.low, spec.view.origin.high, origins)
+    for g in range(len(spec.groups)):
+        free &= ~in_group(spec, g, origins, modifications)
+    return free
+
+
+def in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> NDArray[np.bool_]:
+    """Whether origins (N, 3) are in the box around a group, where configurations (N, G, 4) put it, (N,)."""
+    space, group = spec.view.free_space, spec.groups[g]
+    if space is None or group.name not in space.groups:
+        return np.zeros(len(origins), np.bool_)
+    low, high = np.array(space.groups[group.name])
+    offset = origins.astype(np.float64) - (np.array(group.at) + modifications[:, g, :3])
+    within: NDArray[np.bool_] = ((low <= offset) & (offset <= high)).all(axis=1) & (modifications[:, g, 3] != 0)
+    return within

@@ -20,7 +20,7 @@ from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
 from photonfarm.shared.farm.configuration import named_configuration
-from photonfarm.shared.scene.camera_path import CameraPath, orbit
+from photonfarm.shared.scene.camera_path import CameraPath, kept_clear, orbit
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -40,7 +40,10 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     stored = opened.scene(scene_named(opened, scene))
     configuration = named_configuration(opened, stored, modification)
     spec = located(stored.spec)
-    views = orbit(spec, path) if isinstance(path, int) else path.sampled()
+    if isinstance(path, int):
+        views = orbit(spec, path, configuration)
+    else:
+        views = kept_clear(spec, path.sampled(), configuration)
     cloud = stored.base()[1] if stored.has_base() else None
     frames_of(spec, configuration, views, cloud, guides=stored.guides.settings()).write(out)
     return len(views)

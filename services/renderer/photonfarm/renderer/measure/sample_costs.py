@@ -124,7 +124,7 @@ def sample_costs(scene: LoadedScene, frames: int, log: Callable[[str], None] | N
 def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     spec = scene.spec
     modification = sample_modification(spec, SEED, number)
-    view = sample_view(spec, modification.key(spec.scene_id), SEED, number)
+    view = sample_view(spec, modification.key(spec.scene_id), SEED, number, modification)
     configuration_s, (points, photons) = _timed(partial(_configure, scene, cloud, modification))
     view_s, _ = _timed(partial(_look, scene, view, points, photons))
     guides_s, _ = _timed(partial(_guide, scene, view, cloud, modification))

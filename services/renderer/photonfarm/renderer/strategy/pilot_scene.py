@@ -67,4 +67,4 @@ class PilotScene:
 def _draw(spec: SceneSpec, count: int) -> Iterator[tuple[Modification, View]]:
     for i in range(count):
         modification = sample_modification(spec, SEED, i)
-        yield modification, sample_view(spec, modification.key(spec.scene_id), SEED, i)
+        yield modification, sample_view(spec, modification.key(spec.scene_id), SEED, i, modification)

@@ -1,4 +1,4 @@
-"""The contact sheet: the samples of a store on one page that needs no other file."""
+"""The contact sheet: the samples of a store on one page that needs no other file, each with a plan of its room."""
 
 from __future__ import annotations
 
@@ -6,18 +6,37 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
 
+from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import Photons
+from photonfarm.shared.core.records import Geometry, Photons
+from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 COLUMNS = ("A", "B", "albedo", "normal", "depth", "photons")
 
+NO_GEOMETRY = Geometry(
+    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), np.zeros(0, np.int32), np.zeros(0, np.int16)
+)
+"""What is known of a scene before its first job."""
+
 TEMPLATE = Path(__file__).with_name("preview.html.j2")
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A movable group, and where it stands in a configuration."""
+
+    number: int  # in the plans
+    name: str
+    is_light: bool
+    place: str | None  # None: it is not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +44,10 @@ class SheetRow:
     """One sample of the sheet."""
 
     number: int  # its row in the store
-    removed: list[str]  # groups that are not there
-    panels: tuple[Picture, ...]  # in the order of COLUMNS
+    camera: str
+    plan: Markup
+    standing: list[Standing]
+    panels: list[tuple[str, Picture]]  # by COLUMNS
 
 
 def contact_sheet(reader: SceneReader, count: int) -> str:
@@ -34,13 +55,18 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
     reader.refresh()
     shown = reader.rows[np.unique(np.linspace(0, len(reader.rows) - 1, min(count, len(reader.rows))).astype(np.int64))]
     spec = reader.spec
-    caption = (
-        f"{len(reader.rows)} complete samples of scene {spec.scene_id}; {len(shown)} shown. A and B are independent "
-        f"half-estimates of {spec.transport.half_spp} samples per pixel each, shown as "
-        f"clip({spec.exposure:g} · I, 0, 1)^(1/2.2)."
+    plan = PlanView.of(spec, reader.base()[0] if reader.ready() else NO_GEOMETRY)
+    return rendered(
+        TEMPLATE,
+        title=f"photonfarm: {spec.name}",
+        spec=spec,
+        complete=len(reader.rows),
+        hues=[hue(i) for i in range(len(spec.groups))],
+        shell=plan.shell(),
+        places=plan.places(),
+        groups=[(_of_group(spec, i), group) for i, group in enumerate(spec.groups)],
+        rows=[_row(reader, plan, int(row)) for row in shown],
     )
-    rows = [_line(reader, int(row)) for row in shown]
-    return rendered(TEMPLATE, title=f"photonfarm: {spec.name}", caption=caption, columns=COLUMNS, rows=rows)
 
 
 def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
@@ -49,7 +75,7 @@ def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
     out.write_text(contact_sheet(reader, count))
 
 
-def _line(reader: SceneReader, row: int) -> SheetRow:
+def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
     sample, spec = reader.read(row), reader.spec
     a, b = (pictures.display(half, spec.exposure) for half in sample.radiance)
     panels = (
@@ -60,8 +86,26 @@ def _line(reader: SceneReader, row: int) -> SheetRow:
         pictures.of_depth(sample.buffers.depth),
         photon_picture(sample, reader.read_photons(row) if spec.photons.paths else None, spec),
     )
-    removed = [g.name for g, there in zip(spec.groups, sample.modification.present, strict=True) if not there]
-    return SheetRow(row, removed, panels)
+    return SheetRow(
+        row,
+        f"camera at {said(sample.view.origin)}, looking at {said(sample.view.target)}",
+        plan.configuration(sample.modification, [sample.view]),
+        [_of_group(spec, i, sample.modification) for i in range(len(spec.groups))],
+        list(zip(COLUMNS, panels, strict=True)),
+    )
+
+
+def _of_group(spec: SceneSpec, i: int, modification: Modification | None = None) -> Standing:
+    """Where a group stands, or where it was modelled."""
+    group, place = spec.groups[i], None
+    if modification is None or modification.present[i]:
+        place = said(np.array(group.at) + (0 if modification is None else modification.translation[i]))
+    return Standing(i + 1, group.name, i >= len(spec.objects), place)
+
+
+def said(point: NDArray[np.floating]) -> str:
+    """A point in words."""
+    return f"({', '.join(f'{value:.3g}' for value in np.where(np.abs(point) < 1e-6, 0, point))})"
 
 
 def photon_picture(sample: StoredSample, photons: Photons | None, spec: SceneSpec) -> Picture:

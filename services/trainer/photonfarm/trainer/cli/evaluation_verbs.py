@@ -129,6 +129,7 @@ def report(
 
     with _progress() as on_progress:
         figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
+    click.echo(figures["verdict"], err=True)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
 
 

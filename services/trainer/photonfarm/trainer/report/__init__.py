@@ -21,6 +21,8 @@ from photonfarm.trainer.report.markdown_page import markdown
 from photonfarm.trainer.report.page import page
 from photonfarm.trainer.report.pictures import OVERVIEW, overview
 from photonfarm.trainer.report.plots import plots
+from photonfarm.trainer.report.verdict import Verdict
+from photonfarm.trainer.report.views import shown_views
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -51,15 +53,16 @@ def write_report(
         store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, on_progress=on_progress, timed=timed,
     )  # fmt: skip
-    text, drawn = json.dumps(contents.document(), indent=2, ensure_ascii=False), plots(contents)
+    drawn, views, verdict = plots(contents), shown_views(contents), Verdict.of(contents)
+    text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)
     with store_errors("write the report", out):
         for plot in drawn:
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
         (out / "report.json").write_text(text + "\n")
-        (out / "report.md").write_text(markdown(contents, drawn, COMPARISON))
-        (out / "report.html").write_text(page(contents, drawn))
+        (out / "report.md").write_text(markdown(contents, verdict, drawn, COMPARISON))
+        (out / "report.html").write_text(page(contents, verdict, views, drawn))
     write_png(comparison(contents.evaluation), out / COMPARISON)
-    if contents.evaluation.shown:
-        write_png(overview(contents), out / OVERVIEW)
+    if views:
+        write_png(overview(views), out / OVERVIEW)
     document: dict[str, Any] = json.loads(text)
     return document

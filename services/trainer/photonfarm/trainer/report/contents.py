@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.frame_costs import FrameCosts
-from photonfarm.shared.core.records import F32, ViewBuffers, arrays_of
+from photonfarm.shared.core.records import F32, Guides, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
@@ -26,6 +26,8 @@ from photonfarm.trainer.report.published import Published, table_of
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, worst_cases
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
+
+R = TypeVar("R", ViewBuffers, Guides)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +55,7 @@ class ReportContents:
     machine: Machine  # on which times were taken
     worst: tuple[WorstCase, ...]
     published: str | None  # the name of the paper's table beside ours
+    inputs: Mapping[int, tuple[ViewBuffers, Guides | None]]  # of the shown rows, as far as the first run is given them
 
     @property
     def measure(self) -> ReportEntry:
@@ -118,7 +121,27 @@ def gathered(
         machine=close_look.machine,
         worst=tuple(close_look.worst),
         published=found[0] if found and any(entry.published for entry in entries) else None,
+        inputs=_inputs(store, first, [target.row for target in evaluation.shown]),
     )
+
+
+def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
+    """The buffers of some rows, and their guides if the run reads these, in memory of their own."""
+    source = StoreSource(store, run.scene_id)
+    if run.needs.guides:
+        source.follow_guides()
+    there = set(source.refresh().tolist())
+    found = {}
+    for row in rows:
+        if row in there:
+            (sample,) = source.read_samples([row])
+            found[row] = (_copied(sample.buffers), None if sample.guides is None else _copied(sample.guides))
+    return found
+
+
+def _copied(record: R) -> R:
+    """A record in float32, in memory of its own; a source reads the next row into the memory of the last."""
+    return type(record)(**{name: part.astype(np.float32) for name, part in arrays_of(record).items()})
 
 
 def _entries(
@@ -175,7 +198,6 @@ class _CloseLook:
         views = []
         for row in references.keys() & images.keys():
             (sample,) = source.read_samples([row])
-            read = {name: part.astype(np.float32) for name, part in arrays_of(sample.buffers).items()}
             a, b = references[row].half_a, references[row].half_b
-            views.append(HeldOutView(row, images[row], a, b, ViewBuffers(**read), surfaces.get(row)))
+            views.append(HeldOutView(row, images[row], a, b, _copied(sample.buffers), surfaces.get(row)))
         return sorted(views, key=lambda view: view.row)

@@ -6,15 +6,17 @@ from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import Table, facts, tables
+from photonfarm.trainer.report.verdict import Verdict
 
 
-def markdown(contents: ReportContents, drawn: list[Plot], pictures: str) -> str:
+def markdown(contents: ReportContents, verdict: Verdict, drawn: list[Plot], pictures: str) -> str:
     """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
     first, *others = tables(contents)
     card = "\n".join(f"- **{name}**: {value}" for name, value in facts(contents))
     shown = "Targets and predictions, as clip(exposure · I, 0, 1)^(1/2.2)."
     blocks = [
         f"# {contents.card.spec.name}",
+        " ".join((f"**{verdict.sentence}**", *verdict.further)),
         _table(first),
         *(_plots(*kind) for kind in by_kind(drawn)),
         f"## Held-out views\n\n{shown}\n\n![targets and predictions]({pictures})",

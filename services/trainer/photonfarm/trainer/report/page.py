@@ -1,53 +1,77 @@
-"""The report as one HTML file that needs nothing else: pictures and plots are in it."""
+"""The report as one HTML file that needs nothing else: pictures, plots and what shows them are in it.
+
+Shape letters: H W image.
+"""
 
 from __future__ import annotations
 
+from base64 import b64encode
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from photonfarm.shared.core.pages import rendered
-from photonfarm.trainer.compare.evaluation_table import views_of
-from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.shared.core.pictures import reduced
+from photonfarm.shared.core.records import F32
+from photonfarm.trainer.compare import evaluation_table
 from photonfarm.trainer.report.contents import ReportContents
-from photonfarm.trainer.report.pictures import cases, first_row, legend_of_cases
-from photonfarm.trainer.report.plots import CURVES, Plot, by_kind
+from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import facts, tables
+from photonfarm.trainer.report.verdict import Verdict, headline
+from photonfarm.trainer.report.views import PREDICTION, ShownView, legend
 
 TEMPLATE = Path(__file__).with_name("report.html.j2")
-LARGE_WIDTH = 256  # px, at least, of the pictures of the first row
+VIEWER = Path(__file__).with_name("viewer.js")
+
+MOST_LIGHT = 1_600_000
+"""Characters of a page that light in half floats may take; layers beyond show their pictures' 8 bits, cut at white."""
+
+LARGEST_HALF = np.float32(np.finfo(np.float16).max)
 
 
-def page(contents: ReportContents, drawn: list[Plot]) -> str:
+def page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], drawn: list[Plot]) -> str:
     """The report's HTML."""
-    curves = [plot for plot in drawn if plot.name.startswith(CURVES)]
     return rendered(
         TEMPLATE,
         title=f"photonfarm: {contents.card.spec.name}",
-        first_row=first_row(contents),
-        large_width=LARGE_WIDTH,
-        curves=by_kind(curves),
+        verdict=verdict,
         headline=headline(contents),
-        views=views_of(contents.evaluation),
+        measured=evaluation_table.views_of(contents.evaluation),
+        views=views,
+        prediction=PREDICTION,
+        legend=legend(contents),
+        light=light_data(views),
+        viewer=VIEWER.read_text(),
+        plots=by_kind(drawn),
         tables=tables(contents),
-        other_plots=by_kind([plot for plot in drawn if plot not in curves]),
-        cases=cases(contents),
-        legend=legend_of_cases(contents),
         facts=facts(contents),
     )
 
 
-def headline(contents: ReportContents) -> list[tuple[str, str]]:
-    """Figures of the data and of the first entry, each with what it is."""
-    card, evaluation = contents.card, contents.evaluation
-    samples, colour = card.samples, contents.baselines.mean_colour.error.mean
-    first = contents.entries[0]
-    error, reach = first.row.held_out.error, confidence_interval(first.row.held_out.error)
-    spread = "" if reach is None else f" (95 %: {reach[0]:.3g} … {reach[1]:.3g})"
-    rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
-    return [
-        (f"{samples.rows}", f"samples of {samples.planned} planned, held-out ones among them"),
-        ("–" if rate is None else f"{rate:.2f}", "samples per core-second"),
-        (f"{error.mean:.4g}", f"held-out error of {first.name}{spread}"),
-        (f"{contents.baselines.untrained.error.mean:.4g}", f"of {first.name} before its first step"),
-        (f"{colour:.4g}", f"of the mean colour{f': {colour / error.mean:.1f} × as much' if error.mean > 0 else ''}"),
-        (f"{evaluation.noise_floor:.4g}", "noise of the targets"),
-    ]
+def light_data(views: Sequence[ShownView]) -> list[dict[str, str]]:
+    """The light of each view's layers by their names, as many as fit: first those of all views that come first."""
+    found: list[dict[str, str]] = [{} for _ in views]
+    left = MOST_LIGHT
+    for place, name, light in _by_importance(views):
+        text = half_floats(light)
+        left -= len(text)
+        if left < 0:
+            break
+        found[place][name] = text
+    return found
+
+
+def _by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str, F32]]:
+    """The first light of every view, then the second, and so on, each with the place of its view."""
+    of_views = [[each for each in (*view.images, *view.inputs) if each.light is not None] for view in views]
+    for number in range(max(map(len, of_views), default=0)):
+        for place, layers in enumerate(of_views):
+            if number < len(layers) and (light := layers[number].light) is not None:
+                yield place, layers[number].name, light
+
+
+def half_floats(light: F32) -> str:
+    """Light (H, W, 3) as base64 of little-endian half floats; of a large film, the means over blocks of pixels."""
+    halves = np.clip(reduced(np.nan_to_num(light)), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
+    return b64encode(halves.tobytes()).decode()

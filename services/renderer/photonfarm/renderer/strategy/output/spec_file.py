@@ -7,7 +7,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import tomlkit
 import tomlkit.items
@@ -20,8 +20,8 @@ from photonfarm.shared.scene import spec_loading as scene
 BYTE_ORDER_MARK = "\ufeff"
 """The character with which some editors begin a file."""
 
-SpecTables = Mapping[str, Mapping[str, int | float]]
-"""The numbers to write, by table and key."""
+SpecTables = Mapping[str, Mapping[str, int | float | dict[str, Any]]]
+"""The numbers and tables to write, by table and key."""
 
 
 def writable(name: str) -> Path:

@@ -1,0 +1,116 @@
+"""The verdict of a report: what its first predictor has learned, in words, from numbers alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core.estimate import group_means
+from photonfarm.trainer.compare.evaluation_samples import References
+from photonfarm.trainer.compare.evaluation_table import counted
+from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
+from photonfarm.trainer.report.contents import ReportContents
+
+LARGE = 10  # times less error: from here on it is said as a fraction, below in percent
+
+
+Kind = Literal["better", "mixed", "worse"]
+"""Than the mean colour; "mixed": in the mean over all configurations, but not in most of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One sentence, and the sentences that say how far it can be trusted."""
+
+    kind: Kind
+    sentence: str
+    further: tuple[str, ...]
+
+    @classmethod
+    def of(cls, contents: ReportContents) -> Verdict:
+        """The verdict on the first entry, against the mean colour and against the network before its first step."""
+        evaluation, first = contents.evaluation, contents.entries[0]
+        errors, constant = first.row.held_out, contents.baselines.mean_colour
+        further = (
+            _won(errors, constant, evaluation.unit),
+            _since_start(errors.error.mean, contents.baselines.untrained.error.mean),
+            _of_references(evaluation.references, first.row.metrics),
+        )
+        return cls(*_against(first.name, errors, constant, evaluation.unit), further)
+
+
+def _against(name: str, errors: HeldOutErrors, constant: HeldOutErrors, unit: str) -> tuple[Kind, str]:
+    error, colour, better = errors.error.mean, constant.error.mean, _better(errors, constant)
+    if error <= 0:
+        return "better", f"{name} predicts unseen {unit}s with no error that these views can show."
+    if error >= colour:
+        times = f"{error / colour:.3g} times that of one colour for every pixel"
+        return "worse", f"{name} is worse than the mean colour: on unseen {unit}s its error is {times}."
+    share = _share(error / colour)
+    if 2 * better.sum() < len(better):
+        mean = f"only in the mean over all has it {share} that error"
+        return "mixed", f"{name} is worse than the mean colour in most unseen {unit}s; {mean}."
+    return "better", f"{name} predicts unseen {unit}s with {share} the mean colour’s error."
+
+
+def _share(ratio: float) -> str:
+    """A ratio below 1 as people say it: "1/18 of", "37 % of"."""
+    return f"1/{1 / ratio:.0f} of" if ratio <= 1 / LARGE else f"{100 * ratio:.0f} % of"
+
+
+def _better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]:
+    """In which configurations, or views of a static scene, the error is below that of the mean colour."""
+    own, other = (group_means(of.per_sample, of.units) for of in (errors, constant))
+    return own < other
+
+
+def _won(errors: HeldOutErrors, constant: HeldOutErrors, unit: str) -> str:
+    better = _better(errors, constant)
+    shown, colour = (float(group_means(of.shown, of.units).mean()) for of in (errors, constant))
+    without_lamps = f"; without light above white, such as lamps in view, it is {_share(shown / colour)} it"
+    return (
+        f"Its error is below the mean colour’s in {better.sum()} of {counted(len(better), unit)} that no training "
+        f"saw{without_lamps if 0 < shown < colour else ''}."
+    )
+
+
+def _since_start(error: float, start: float) -> str:
+    if error <= 0:
+        return f"Before its first step its error was {start:.3g}."
+    if error >= start:
+        return "Training has not lowered its error: it was no larger before the first step."
+    return f"Training has lowered its error to {_share(error / start)} what it was before the first step."
+
+
+def _of_references(references: References | None, metrics: ImageMetrics | None) -> str:
+    """The sentence on references: what the images are compared with, and what came of it."""
+    if references is None or metrics is None:
+        return (
+            "There are no references, such as “photonfarm up --reference-views 6” renders: pictures stand beside the "
+            "mean of both noisy halves, and the paper’s columns are empty."
+        )
+    mse, mssim = metrics.mse.estimate.mean, metrics.mssim.estimate.mean
+    return (
+        f"As a display shows it, its MSE against {counted(references.views, 'reference')} is {mse:.4f}, and its MSSIM "
+        f"{mssim:.3f}."
+    )
+
+
+def headline(contents: ReportContents) -> list[tuple[str, str]]:
+    """Figures of the data and of the first entry, each with what it is."""
+    card, evaluation = contents.card, contents.evaluation
+    error = contents.entries[0].row.held_out.error
+    reach = confidence_interval(error)
+    spread = "" if reach is None else f" (95 %: {reach[0]:.2g} … {reach[1]:.2g})"
+    rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
+    return [
+        (f"{error.mean:.3g}", f"held-out error{spread}"),
+        (f"{contents.baselines.mean_colour.error.mean:.3g}", "error of the mean colour"),
+        (f"{evaluation.noise_floor:.3g}", "noise of the targets, which is not in these errors"),
+        (f"{card.samples.rows}", f"samples of {card.samples.planned} planned, held-out ones among them"),
+        ("–" if rate is None else f"{rate:.1f}", "samples rendered per core-second"),
+    ]

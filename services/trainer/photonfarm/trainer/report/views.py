@@ -1,0 +1,149 @@
+"""The views that a report shows, in layers: images and what they are held against, then what the network was given.
+
+Supplement Figs. 6 to 8. Shape letters: H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from photonfarm.shared.core.pictures import Picture, display, display_values, of_albedo, of_depth, of_normal
+from photonfarm.shared.core.records import F32, Guides
+from photonfarm.trainer.compare.evaluation_samples import Target
+from photonfarm.trainer.report.contents import ReportContents
+from photonfarm.trainer.report.worst_cases import caption as worst_view
+
+LARGEST = 0.25  # difference in the metric space that is drawn brightest
+
+PREDICTION, NOISY, DIFFERENCE = "prediction", "noisy half", "difference"
+
+OF_GUIDES = {
+    "direct": "direct light",
+    "gloss": "direct light in gloss",
+    "emission": "emitted light",
+    "specular": "specular albedo",
+    "roughness": "roughness",
+    "throughput": "mirrors and glass",
+    "beyond_albedo": "albedo beyond them",
+}
+"""The guides that are shown where they vary over the view."""
+
+RADIANCE = ("direct", "gloss", "emission")
+
+VARIED = 8.0  # standard deviation of a picture's bytes, above which there is something to see in it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layer:
+    """One image of a view."""
+
+    name: str  # distinct within the view
+    caption: str
+    picture: Picture
+    light: F32 | None = None  # (H, W, 3) linear radiance × exposure; None for what is no light
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownView:
+    """One held-out view."""
+
+    row: int  # of the store
+    caption: str
+    target: str  # the layer that predictions are held against
+    images: tuple[Layer, ...]  # noisy half, prediction, target, difference; then of further predictors
+    inputs: tuple[Layer, ...]
+    mse: float  # of the first predictor, in the metric space, with the target's noise
+
+
+def shown_views(contents: ReportContents) -> list[ShownView]:
+    """The views with an image by the first predictor: that of median error first, so that no choice flatters."""
+    there = contents.entries[0].row.shown
+    found = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]
+    median = sorted(found, key=lambda view: view.mse)[(len(found) - 1) // 2 :][:1]
+    return [*median, *(view for view in found if view not in median)]
+
+
+def _view(contents: ReportContents, target: Target) -> ShownView:
+    first, *others = [
+        (entry.name, entry.row.shown[target.row]) for entry in contents.entries if target.row in entry.row.shown
+    ]
+    against = "reference" if target.is_reference else "mean of both halves"
+    half_spp = contents.card.spec.transport.half_spp
+    prediction, difference, mse = _shown(*first, target.image)
+    images = [
+        light(NOISY, f"noisy half, {half_spp} samples per pixel", target.half_a),
+        prediction,
+        light(against, f"{against}, {target.spp} samples per pixel", target.image),
+        difference,
+    ]
+    for name, image in others:
+        images += _shown(name, image, target.image, of=f" of {name}")[:2]
+    inputs = tuple(_inputs(contents, target.row))
+    return ShownView(target.row, _caption(contents, target), against, tuple(images), inputs, mse)
+
+
+def _caption(contents: ReportContents, target: Target) -> str:
+    kinds = [case.kind for case in contents.worst if case.row == target.row]
+    return f"{worst_view(kinds)}; row {target.row}" if kinds else f"Row {target.row}"
+
+
+def _shown(name: str, image: F32, target: F32, of: str = "") -> tuple[Layer, Layer, float]:
+    """A predictor's image and its difference to the target, with the mean of its square."""
+    apart = display_values(image) - display_values(target)
+    mse = float(np.mean(apart**2))
+    return (
+        light(f"{PREDICTION}{of}", f"prediction by {name}", image),
+        Layer(f"{DIFFERENCE}{of}", f"difference{of}, MSE {mse:.4f}", coloured(np.abs(apart).mean(axis=-1))),
+        mse,
+    )
+
+
+def light(name: str, caption: str, exposed: F32) -> Layer:
+    """A layer of exposed linear radiance, (H, W, 3)."""
+    return Layer(name, caption, display(exposed, 1.0), exposed)
+
+
+def _inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
+    if row not in contents.inputs:
+        return
+    buffers, guides = contents.inputs[row]
+    yield Layer("albedo", "albedo", of_albedo(buffers.albedo))
+    yield Layer("normal", "normal", of_normal(buffers.normal))
+    yield Layer("depth", "depth", of_depth(buffers.depth))
+    if guides is not None:
+        yield from _guides(guides, contents.card.spec.exposure)
+
+
+def _guides(guides: Guides, exposure: float) -> Iterator[Layer]:
+    for field, name in OF_GUIDES.items():
+        values: F32 = getattr(guides, field)
+        if field in RADIANCE:
+            layer = light(name, name, np.float32(exposure) * values)
+        else:
+            layer = Layer(
+                name, name, of_albedo(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2))
+            )
+        if layer.picture.std() > VARIED:
+            yield layer
+
+
+def legend(contents: ReportContents) -> str:
+    """The legend of the pictures, in sentences."""
+    others = "" if not contents.worst else f", and the worst ones of {contents.entries[0].name}, found automatically"
+    return (
+        "No training saw these views: the one with the median error of those shown, the first of the first held-out "
+        f"configurations{others}. Shown as clip(2^EV · exposure · I, 0, 1)^(1/2.2). Differences, to what the "
+        f"prediction is held against, go from black (0) over red to pale yellow ({LARGEST:g} and more)."
+    )
+
+
+def coloured(difference: F32) -> Picture:
+    """Differences (H, W) as colours (H, W, 3), from black at 0 over red to pale yellow at `LARGEST` and above."""
+    import matplotlib as mpl
+
+    shades = mpl.colormaps["magma"](np.clip(difference / LARGEST, 0, 1), bytes=True)
+    picture: Picture = np.ascontiguousarray(shades[..., :3])
+    return picture

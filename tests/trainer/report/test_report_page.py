@@ -1,0 +1,176 @@
+"""The report as people see it: its verdict, its pictures, and what shows them large."""
+
+import base64
+import json
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import chromium, needs_chromium
+
+from photonfarm.shared.core.estimate import Estimate, group_means
+from photonfarm.shared.core.records import Guides
+from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.predict.evaluation import HeldOutErrors
+from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.report import write_report
+from photonfarm.trainer.report.contents import ReportContents, gathered
+from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, half_floats, light_data
+from photonfarm.trainer.report.verdict import Verdict
+from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
+
+
+@pytest.fixture
+def contents(measured) -> ReportContents:
+    """Of one run, without references."""
+    store, runs, _ = measured
+    return gathered(store, [TrainedRun.load(runs[0])], [], references=None, inception=None, timed=False)
+
+
+def errors(*per_sample: float) -> HeldOutErrors:
+    """Errors of samples, two of each configuration."""
+    values, units = np.array(per_sample), tuple(bytes([i // 2]) for i in range(len(per_sample)))
+    return HeldOutErrors(Estimate.of(group_means(values, units)), 0.1, values, values, units)
+
+
+def judged(contents: ReportContents, own: HeldOutErrors, colour: HeldOutErrors) -> Verdict:
+    """The verdict if these had been the errors of the network and of the mean colour."""
+    entry = contents.entries[0]
+    return Verdict.of(
+        replace(
+            contents,
+            entries=(replace(entry, row=replace(entry.row, held_out=own)),),
+            baselines=replace(contents.baselines, mean_colour=colour),
+        )
+    )
+
+
+def test_the_verdict_follows_from_the_numbers(contents) -> None:
+    colour = errors(1.8, 1.8, 1.8, 1.8, 1.8, 1.8)
+    better = judged(contents, errors(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), colour)
+    assert better.kind == "better"
+    assert better.sentence == "light_transport predicts unseen configurations with 1/18 of the mean colour’s error."
+    assert "in 3 of 3 configurations" in better.further[0]
+    assert "with 50 % of " in judged(contents, errors(0.9, 0.9), errors(1.8, 1.8)).sentence
+    worse = judged(contents, errors(3.6, 3.6, 0.1, 0.1, 3.6, 3.6), colour)
+    assert worse.kind == "worse"
+    assert "worse than the mean colour" in worse.sentence
+    assert "in 1 of 3 configurations" in worse.further[0]
+    mixed = judged(contents, errors(2, 2, 0.1, 0.1, 2, 2), colour)
+    assert (mixed.kind, "in 1 of 3" in mixed.further[0]) == ("mixed", True)
+    below_noise = judged(contents, errors(-0.1, 0.05), errors(1.8, 1.8))
+    assert below_noise.kind == "better"
+    assert not re.search(r"1/|inf|nan|-", below_noise.sentence), "no ratio to nothing"
+
+
+def test_without_references_the_verdict_says_so_and_with_them_what_they_show(contents, measured) -> None:
+    store, runs, references = measured
+    assert "no references" in Verdict.of(contents).further[-1]
+    more = gathered(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
+    mssim = more.entries[0].row.metrics.mssim.estimate.mean
+    assert f"{mssim:.3f}" in Verdict.of(more).further[-1]
+    assert Verdict.of(more).sentence == Verdict.of(contents).sentence
+
+
+def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_path) -> None:
+    store, runs, _ = measured
+    figures = write_report(store, runs, tmp_path / "out", timed=False)
+    page = (tmp_path / "out/report.html").read_text()
+    assert figures["verdict"].replace("_", "_<wbr>") in page
+    assert figures["verdict"] in (tmp_path / "out/report.md").read_text()
+    lights = json.loads(re.search(r'<script id="light" type="application/json">(.*?)</script>', page)[1])
+    rows = [int(row) for row in re.findall(r"<summary>.*?row (\d+)</summary>", page, re.IGNORECASE)]
+    assert sorted(rows) == figures["evaluation"]["shown"]
+    assert "prediction of denoise_4" in lights[0], "the second run's"
+    source = StoreSource(store, scene.scene_id)
+    source.refresh()
+    assert scene.spec.exposure == 1
+    for row, layers in zip(rows, lights, strict=True):
+        (sample,) = source.read_samples([row])
+        shown = np.frombuffer(base64.b64decode(layers["noisy half"]), "<f2").reshape(sample.radiance[0].shape)
+        np.testing.assert_array_equal(shown.astype(np.float64), sample.radiance[0] * sample.scale)
+
+
+def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these_show_something(contents) -> None:
+    assert [layer.name for layer in shown_views(contents)[0].inputs] == ["albedo", "normal", "depth"]
+    film = contents.card.spec.film
+    ramp = np.linspace(0, 1, film.height * film.width, dtype=np.float32).reshape(film.height, film.width, 1)
+    shapes = {field.name: (film.height, film.width, 3) for field in fields(Guides)}
+    black = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    guides = Guides(**{**black, "direct": ramp.repeat(3, axis=2), "roughness": ramp[..., 0]})
+    inputs = {row: (buffers, guides) for row, (buffers, _) in contents.inputs.items()}
+    spec = contents.card.spec.model_copy(update={"exposure": 4.0})
+    given = replace(contents, inputs=inputs, card=replace(contents.card, spec=spec))
+    layers = {layer.name: layer for layer in shown_views(given)[0].inputs}
+    assert list(layers) == ["albedo", "normal", "depth", "direct light", "roughness"]
+    np.testing.assert_array_equal(layers["direct light"].light, 4 * guides.direct)
+    assert layers["roughness"].light is None
+
+
+def test_large_films_are_reduced_and_light_that_does_not_fit_is_left_out() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.random((16, 512, 3), np.float32)
+    reduced = np.frombuffer(base64.b64decode(half_floats(image)), "<f2").reshape(8, 256, 3)
+    means = image.reshape(8, 2, 256, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(reduced, means, rtol=1e-3)
+    bright = np.frombuffer(base64.b64decode(half_floats(np.full((1, 1, 3), 1e9, np.float32))), "<f2")
+    assert bright.tolist() == [LARGEST_HALF] * 3
+    square = rng.random((256, 256, 3), np.float32)
+    layers = tuple(light(name, name, square) for name in ("noisy half", "prediction", "reference"))
+    of_data = Layer("normal", "normal", layers[0].picture)
+    views = [ShownView(row, "", "reference", (*layers, of_data), (), 0.0) for row in range(3)]
+    held = light_data(views)
+    assert [list(each) for each in held] == [["noisy half"]] * 3, "of every view the same, and no more than fits"
+    assert sum(len(text) for each in held for text in each.values()) <= MOST_LIGHT
+
+
+@needs_chromium
+def test_the_page_works_in_a_browser(measured, tmp_path) -> None:
+    store, runs, references = measured
+    write_report(store, runs, tmp_path / "out", references=references, timed=False)
+    file: Path = tmp_path / "out/report.html"
+    with chromium() as page:
+        page.open(file, 1280)
+        page.value(SHOWN)
+        assert page.value("document.querySelector('#left').value") == "prediction"
+        assert page.value("document.querySelector('#right').value") == "reference"
+        left, top, width, height = page.value(
+            "(({left, top, width, height}) => [left, top, width, height])(stage.getBoundingClientRect())"
+        )
+        before = page.value(PIXEL)
+        page.press(left + 0.5 * width, top + 0.5 * height, (left + 0.2 * width, top + 0.5 * height))
+        assert float(page.value("document.querySelector('#split').value")) == pytest.approx(20, abs=1)
+        assert page.value(PIXEL) != before, "left of the middle there is the reference now"
+        page.value("exposure.value = -4; exposure.dispatchEvent(new Event('input'))")
+        dark = page.value(PIXEL)
+        assert sum(dark) < sum(before)
+        page.value("document.querySelector('#in').click()")
+        assert page.value("document.querySelector('#zoom').textContent") == "zoom × 2"
+        for width in (390, 1280):
+            page.open(file, width, dark=True)
+            page.value(SHOWN)
+            assert page.value("document.documentElement.scrollWidth <= innerWidth"), "there is nothing beside the page"
+        assert page.errors == []
+        page.call("Emulation.setScriptExecutionDisabled", value=True)
+        page.open(file, 390)
+        boxes = page.call("DOM.getDocument", depth=-1)["root"]
+        found = page.call(
+            "DOM.querySelector", nodeId=boxes["nodeId"], selector='details[open] [data-layer="prediction"]'
+        )
+        assert page.call("DOM.getBoxModel", nodeId=found["nodeId"])["model"]["width"] > 100, "rows without JavaScript"
+
+
+SHOWN = """new Promise((done) => {
+  const look = () => document.querySelector("#stage canvas").width > 300 ? done() : setTimeout(look, 20);
+  look();
+})"""
+"""Waits until the large picture is drawn; an empty canvas is 300 pixels wide."""
+
+PIXEL = """(() => {
+  const canvas = document.querySelector("#stage canvas");
+  const { width, height } = canvas;
+  return [...canvas.getContext("2d").getImageData(0.4 * width, 0, 1, height).data];
+})()"""
+"""A column of the large picture, a little left of its middle."""

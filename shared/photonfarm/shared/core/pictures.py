@@ -18,8 +18,8 @@ Picture = NDArray[np.uint8]  # (H, W, 3)
 
 GAMMA = 2.2
 
-EXACT, LARGEST = 96, 256
-"""Pictures in pages: up to this width without loss, and up to this size at all."""
+EXACT = 96
+"""The width up to which pictures are in pages without loss."""
 
 V = TypeVar("V", np.uint8, np.float32)
 
@@ -52,9 +52,9 @@ def of_depth(depth: F32) -> Picture:
     return _bytes(np.repeat((hit * (1 - 0.9 * np.clip(depth / far, 0, 1)))[..., None], 3, axis=2))
 
 
-def reduced(image: NDArray[V]) -> NDArray[V]:
-    """An image (H, W, C) of at most `LARGEST` pixels along each side: means over blocks, less a rest at the edges."""
-    by = -(-max(image.shape[:2]) // LARGEST)
+def reduced(image: NDArray[V], most: int) -> NDArray[V]:
+    """An image (H, W, C) of at most `most` pixels along each side: means over blocks, less a rest at the edges."""
+    by = -(-max(image.shape[:2]) // most)
     if by == 1:
         return image
     height, width = (side // by for side in image.shape[:2])
@@ -62,13 +62,14 @@ def reduced(image: NDArray[V]) -> NDArray[V]:
     return blocks.mean(axis=(1, 3)).astype(image.dtype)
 
 
-def data_uri(picture: Picture) -> str:
-    """The picture as a `data:` address: PNG, or WebP if it is wider than `EXACT` pixels; large ones are reduced."""
+def data_uri(picture: Picture, most: int | None = None) -> str:
+    """The picture as a `data:` address: PNG, or WebP if it is wider than `EXACT`; of at most `most` pixels a side."""
     from PIL import Image
 
     stream = io.BytesIO()
-    kind = "PNG" if picture.shape[1] <= EXACT else "WEBP"
-    Image.fromarray(reduced(picture)).save(stream, kind, quality=90)
+    shown = picture if most is None else reduced(picture, most)
+    kind = "PNG" if shown.shape[1] <= EXACT else "WEBP"
+    Image.fromarray(shown).save(stream, kind, quality=90)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 

@@ -19,10 +19,12 @@ from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import Plot, by_kind
 from photonfarm.trainer.report.tables import facts, tables
 from photonfarm.trainer.report.verdict import Verdict, headline
-from photonfarm.trainer.report.views import PREDICTION, ShownView, legend
+from photonfarm.trainer.report.views import ShownView, legend
 
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 VIEWER = Path(__file__).with_name("viewer.js")
+
+LARGEST = 256  # px, along each side of what the page shows
 
 MOST_LIGHT = 1_600_000
 """Characters of a page that light in half floats may take; layers beyond show their pictures' 8 bits, cut at white."""
@@ -39,7 +41,7 @@ def page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView],
         headline=headline(contents),
         measured=evaluation_table.views_of(contents.evaluation),
         views=views,
-        prediction=PREDICTION,
+        largest=LARGEST,
         legend=legend(contents),
         light=light_data(views),
         viewer=VIEWER.read_text(),
@@ -73,5 +75,5 @@ def _by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str, F32]]
 
 def half_floats(light: F32) -> str:
     """Light (H, W, 3) as base64 of little-endian half floats; of a large film, the means over blocks of pixels."""
-    halves = np.clip(reduced(np.nan_to_num(light)), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
+    halves = np.clip(reduced(np.nan_to_num(light), LARGEST), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
     return b64encode(halves.tobytes()).decode()

@@ -116,14 +116,14 @@ def _of_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
         yield Finding(
             "view.origin",
             f"{_percent(cameras.behind.mean())} of the cameras stand outside the room, with a wall between them and "
-            "what they look at; make origin smaller",
+            "what they look at; make origin smaller, or keep them out by `photonfarm scene free-space SPEC --write`",
         )
     elif cameras.inside_share >= INSIDE:
         most = " and ".join(repr(name) for name, _ in cameras.holders()[:2])
         yield Finding(
             "view.origin",
             f"{_percent(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; keep "
-            "origin above furniture, or away from it",
+            "origin away from furniture, or cameras out of it by `photonfarm scene free-space SPEC --write`",
         )
     well = cameras.placed_well
     if not well.any():

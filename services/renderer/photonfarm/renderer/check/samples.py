@@ -109,7 +109,7 @@ def _drawn(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]:
     key = modification.key(spec.scene_id)
     first = 0 if spec.groups else number  # as a plan numbers the views of a configuration
     others = (COUNT + number * VIEWS + index for index in range(1, VIEWS))
-    return modification, [sample_view(spec, key, sample_costs.SEED, index) for index in (first, *others)]
+    return modification, [sample_view(spec, key, sample_costs.SEED, index, modification) for index in (first, *others)]
 
 
 def _measured(

@@ -19,9 +19,12 @@ from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
 from photonfarm.trainer.runs.run_folder import held
+from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
+from photonfarm.trainer.runs.shown_views import write_views
 
 if TYPE_CHECKING:
+    from photonfarm.shared.core.records import F32
     from photonfarm.trainer.runs.distributed import TrainingGroup
 
 T = TypeVar("T")
@@ -111,7 +114,14 @@ def _lead(
             there = scene_id in Store(store).scene_ids()
             lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
             log(f"waiting for scene {scene_id}, {lacks}")
-        with _reported(redis_url, store, scene_id, log) as on_draws:
+        progress = RunProgress(settings.max_steps, settings.batch)
+
+        def show(step: int, rows: tuple[int, ...], targets: F32, predictions: F32) -> None:
+            write_views(folder, step, rows, predictions)
+            if board:
+                board.pictures(step, targets, predictions)
+
+        with _reported(redis_url, store, scene_id, log) as on_draws, followed(progress, folder, log):
             followers = [follow for follow in (on_record, board and board.record) if follow]
             outcome = train(
                 source,
@@ -120,8 +130,9 @@ def _lead(
                 Hooks(
                     stop=stop,
                     on_record=lambda record: [follow(record) for follow in followers],
-                    on_draws=on_draws,
-                    on_images=board.pictures if board else None,
+                    on_draws=lambda draws, samples: (on_draws(draws, samples), progress.drawn(draws, samples)),
+                    on_phase=progress.phase,
+                    on_images=show,
                     waited=waited,
                     group=group,
                 ),

@@ -168,6 +168,7 @@ def status(store: str | Path, redis_url: str, as_json: bool) -> None:
 @click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
               help="Samples per pixel of each reference.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
+@click.option("--web/--no-web", default=True, show_default=True, help="Serve pages that show it, on this machine.")
 def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
 

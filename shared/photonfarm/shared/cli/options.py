@@ -95,7 +95,8 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--passes", type=click.IntRange(1), default=1, show_default=True, help="Noisy passes per view."),
         click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
         click.option("--shard-rows", type=click.IntRange(1, 4096), default=None,
-                     help="Samples per job, fixed for a scene by its first plan.  [default: 32]"),
+                     help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
+                     "most 32, and several jobs for every worker]"),
     )  # fmt: skip
     found: Callable[..., Any] = with_request
     for option in reversed(options):

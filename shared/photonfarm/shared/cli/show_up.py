@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from photonfarm.shared.core.durations import in_words
 from photonfarm.shared.farm.up import FarmProgress
 
-PLAIN_LINE_S = 15.0  # between progress lines where there is no terminal for bars
+PLAIN_LINE_S = 5.0  # between progress lines where there is no terminal for bars
+PACE_S = 120.0  # over which the time left is estimated
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class FarmTalk:
@@ -19,7 +24,7 @@ class FarmTalk:
 
     def __init__(self) -> None:
         """Say it on stderr."""
-        self._console = Console(stderr=True, highlight=False)
+        self._console = Console(stderr=True, highlight=False, soft_wrap=True)
 
     def say(self, line: str) -> None:
         """Print a sentence."""
@@ -29,31 +34,45 @@ class FarmTalk:
     def progress(self, steps: int) -> Iterator[Callable[[FarmProgress, bool], None]]:
         """A function that moves the bars, or prints a line now and then, and the last one in any case."""
         last_line = started = time.monotonic()
+        told: set[str] = set()
         with _bars(self._console) as bars:
             samples = bars.add_task("samples", total=None)
             passes = bars.add_task("further passes", total=None, visible=False)
             training = bars.add_task("training steps", total=steps, visible=steps > 0)
+            workers = bars.add_task("", total=None, visible=False)
 
             def show(found: FarmProgress, last: bool) -> None:
                 nonlocal last_line
                 for bar, (committed, planned) in ((samples, found.samples), (passes, found.passes)):
-                    bars.update(bar, completed=committed, total=planned, visible=bar == samples or planned > 0)
+                    first = (samples if found.samples[0] < found.samples[1] else passes) == bar
+                    done = min(committed + found.in_hand * first, planned)
+                    bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
                 bars.update(training, completed=found.step, description=f"training steps{found.note}")
+                bars.update(workers, description=found.doing, visible=bool(found.doing))
+                for wait in found.waits:
+                    if (kind := _NUMBER.sub("…", wait)) not in told:
+                        told.add(kind)
+                        self.say(wait)
                 now = time.monotonic()
-                if not self._console.is_terminal and (now - last_line > PLAIN_LINE_S or last):
+                if not self._console.is_terminal and (now - last_line >= PLAIN_LINE_S or last):
                     last_line = now
-                    self.say(f"{now - started:4.0f} s  {progress_line(found)}")
+                    self.say(f"{now - started:4.0f} s  {progress_line(found, bars.tasks[samples].time_remaining)}")
 
             yield show
 
 
-def progress_line(found: FarmProgress) -> str:
-    """The progress in words."""
+def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
+    """The progress in words, with the time that the samples still take, if it is known."""
     (samples, planned), (passes, further) = found.samples, found.passes
+    in_hand = f" (+{found.in_hand} in hand)" if found.in_hand else ""
+    left = f", {in_words(left_s)} left" if left_s and samples < planned else ""
     words = f"  further passes {passes}/{further}" if further else ""
-    return f"samples {samples}/{planned}{words}  steps {found.step}/{found.steps}{found.note}"
+    training = f"  steps {found.step}/{found.steps}{found.note}" if found.steps else ""
+    why = f"  ({'; '.join(found.waits)})" if found.waits else f"  ({found.doing})" if found.doing else ""
+    return f"samples {samples}/{planned}{in_hand}{left}{words}{training}{why}"
 
 
 def _bars(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+               TimeRemainingColumn())  # fmt: skip
+    return Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=PACE_S)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 from photonfarm.shared import queue
-from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError
+from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError, store_errors
 from photonfarm.shared.queue import Failure, FailureCause, QueueStatus, RenderArguments
 from photonfarm.shared.store import SceneStatus, Store
 
@@ -21,35 +21,46 @@ class StoreQueue:
 
     status: QueueStatus
     causes: list[FailureCause]
+    kept: list[FailureCause] = field(default_factory=list)  # of jobs that this Redis does not know as failed
 
 
 @dataclass(frozen=True, slots=True)
 class NoQueue:
-    """Why nothing is known of a store's queue."""
+    """Why nothing is known of a store's queue, and what the store itself has kept of failures."""
 
     reason: str
+    kept: list[FailureCause] = field(default_factory=list)
+    expected: bool = False  # there need be no Redis: `photonfarm up` brings its own, and does not run here now
 
 
-def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
-    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone."""
+def queue_of(store: Store, redis_url: str, *, expects_redis: bool = True) -> StoreQueue | NoQueue:
+    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone.
+
+    Without `expects_redis`, nobody has named the Redis, and a store without one is nothing to worry about.
+    """
     try:
         with queue.connect(redis_url, only_s=ANSWER_S) as connection:
             queue.check_served(connection, store)
             found = queue.queue_status(connection)
     except QueueError as error:
-        return NoQueue(str(error))
-    return StoreQueue(found, queue.causes(_still_missing(store, found.failed)))
+        return NoQueue(str(error), queue.causes(_kept(store)), expected=not expects_redis)
+    failed = {name: failure for name, failure in found.failed.items() if is_missing(store, name)}
+    kept = {name: failure for name, failure in _kept(store).items() if name not in failed}
+    return StoreQueue(found, queue.causes(failed), queue.causes(kept))
 
 
-def _still_missing(store: Store, failed: Mapping[str, Failure]) -> dict[str, Failure]:
-    """The failures of this store's jobs that are still not committed."""
-    scene_ids, missing = set(store.scene_ids()), {}
-    for name, failure in failed.items():
-        job = RenderArguments.of(name)
-        with contextlib.suppress(CorruptError):  # of a scene whose spec is damaged
-            if job.scene_id in scene_ids and not store.scene(job.scene_id).is_done(job.job):
-                missing[name] = failure
-    return missing
+def _kept(store: Store) -> dict[str, Failure]:
+    """The failures that the store has kept, of jobs that are still missing."""
+    with store_errors("look for failures", store.storage.where):
+        return queue.kept_failures(store, lambda name: is_missing(store, name))
+
+
+def is_missing(store: Store, name: str) -> bool:
+    """Whether a job is one of this store's, and not committed; False for one whose scene is damaged."""
+    job = RenderArguments.of(name)
+    with contextlib.suppress(CorruptError, IndexError):
+        return store.has_scene(job.scene_id) and not store.scene(job.scene_id).is_done(job.job)
+    return False
 
 
 def check_read(scenes: Sequence[SceneStatus]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError
+from photonfarm.shared.farm.job_size import WORKERS, rows_per_job
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec
@@ -43,9 +44,11 @@ def submit(
     *,
     retry: bool = False,
     shard_rows: int | None = None,
+    workers: int = WORKERS,
 ) -> Submission:
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
+    Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
     QueueError; in the last case the plan is kept, and idle workers queue it later. Guides are asked for before the
     plan, so that no worker renders it without them.
@@ -53,9 +56,12 @@ def submit(
     opened = Store(store, create=True)
     scene = opened.add(named.spec)
     scene.guides.check(named.spec.guides)
-    scene.plan(Request(), shard_rows=shard_rows, dry_run=True)  # what is refused leaves no wish for guides behind
+    usual = rows_per_job(named.spec, request, workers)
+    scene.plan(
+        Request(), shard_rows=shard_rows, usual_rows=usual, dry_run=True
+    )  # what is refused leaves no wish for guides behind
     scene.guides.want(named.spec.guides)
-    planned = opened.plan(named.spec, request, shard_rows=shard_rows)
+    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual)
     queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 

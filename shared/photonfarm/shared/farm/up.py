@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import signal
 import subprocess
@@ -11,23 +11,29 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError, store_errors
-from photonfarm.shared.core.estimate import stated
-from photonfarm.shared.core.processes import tied
+from photonfarm.shared.core.processes import free_port, tied
 from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.running_farm import WEB_PORT, announced
+from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_of
 from photonfarm.shared.farm.submission import submit, top_up
+from photonfarm.shared.farm.training import RunFolder, TrainingProgress
+from photonfarm.shared.farm.waits import waits
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.queue import QueueStatus
 from photonfarm.shared.scene.plausibility import warnings
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
 POLL_S = 0.5
+ASK_S = 2.0  # between questions to Redis
 STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives this one 10 s
 AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
 
@@ -44,7 +50,10 @@ class FarmProgress:
     passes: CommittedAndPlanned  # further ones, of views that have samples
     step: int
     steps: int
-    note: str  # the last held-out error, in words
+    note: str  # what training does and its last held-out error, in words
+    in_hand: int = 0  # samples and passes that are rendered, in jobs that are not committed yet
+    doing: str = ""  # what each worker does, in words
+    waits: tuple[str, ...] = ()  # what waits for what, in sentences
 
 
 class Talk(Protocol):
@@ -76,11 +85,12 @@ def run_farm(
     reference_views: int = 0,
     reference_spp: int = 256,
     shard_rows: int | None = None,
+    web: bool = True,
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
-    with them.
+    with them. With `web`, pages that show all of it are served on this machine until the end.
 
     A wrong spec, a hold-out that leaves one side empty, and references of no valid number are refused before anything
     is written, by a SpecError.
@@ -100,7 +110,7 @@ def run_farm(
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows)
+        planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows, workers=workers)
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
@@ -113,10 +123,14 @@ def run_farm(
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=hold_out)
+        opened, address = Store(store), stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
+        trained = run if train_steps else None
+        stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, talk))
         preview = ["preview", spec, "--out", str(out / "preview.html")]
         try:
-            _watch(running, _Farm(scene, run, train_steps), redis, talk)
+            farm = _Farm(scene, run, train_steps, partial(queue_of, opened, redis.url))
+            _watch(running, farm, redis, talk)
             if train_steps:
                 beside: list[str] = []
                 if references:
@@ -205,33 +219,54 @@ def _ask(processes: list[Process], seconds: float) -> None:
             process.wait(max(end - time.monotonic(), 0.0))
 
 
-class _Farm:
-    """The progress of rendering and training, read from their files."""
+@contextmanager
+def _pages(store: str | Path, redis_url: str, run: Path, talk: Talk) -> Iterator[str]:
+    """Serve the farm's pages until the block ends; yields their address."""
+    port = free_port(WEB_PORT)
+    verb = ["web", "--store", str(store), "--redis", redis_url, "--run", str(run), "--port", str(port)]
+    process = _start(verb, os.environ, run / "web.log")
+    address = f"http://localhost:{port}/"
+    talk.say(f"watch it at {address}")
+    try:
+        yield address
+    finally:
+        _stop([process])
 
-    def __init__(self, scene: SceneStore, run: Path, steps: int) -> None:
+
+class _Farm:
+    """The progress of rendering and training, read from their files and their queue."""
+
+    def __init__(
+        self, scene: SceneStore, run: Path, steps: int, ask: Callable[[], StoreQueue | NoQueue] | None = None
+    ) -> None:
+        """Take the scene, the trainer's folder, and how to ask for the queue, which is done now and then."""
         self.scene = scene
         self.run = run
         self.steps = steps
-        self.step = 0
-        self.note = ""
+        self._training = RunFolder(run)
+        self._ask = ask
+        self._queue: StoreQueue | NoQueue = NoQueue("not asked yet")
+        self._asked_s = -math.inf
 
     def look(self) -> FarmProgress:
         """Count the samples and the further passes of their views, and read the trainer's log."""
-        for record in self._records() if self.steps else []:  # else they are of another run
-            self.step = record.get("step", self.step)
-            if record.get("kind") == "validation":
-                error = stated(record["error"], record["standard_error"])
-                self.note = f", held-out error {error} on {record['held_out']} samples"
-        found = self.scene.progress()
+        trained = self._training.look() if self.steps else TrainingProgress("")  # else its files are of another run
+        found, status = self.scene.progress(), self._status()
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
-        return FarmProgress(samples, passes, self.step, self.steps, self.note)
+        named = {self.scene.scene_id: self.scene.spec.name}
+        return FarmProgress(
+            samples, passes, trained.step, self.steps, trained.note,
+            sum(each.samples for each in status.activities.values()) if status else 0,
+            "; ".join(f"{name} {each}" for name, each in sorted(status.activities.items())) if status else "",
+            tuple(waits(self._queue, named, 0)),
+        )  # fmt: skip
 
-    def _records(self) -> list[dict[str, Any]]:
-        """The trainer's log, read whole each time, as a trainer that resumes removes the records it will repeat."""
-        path = self.run / "metrics.jsonl"
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+    def _status(self) -> QueueStatus | None:
+        """The queue's status, at most `ASK_S` old; None while nothing is known of it."""
+        if self._ask is not None and time.monotonic() - self._asked_s >= ASK_S:
+            self._queue, self._asked_s = self._ask(), time.monotonic()
+        return self._queue.status if isinstance(self._queue, StoreQueue) else None
 
 
 def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, talk: Talk) -> None:

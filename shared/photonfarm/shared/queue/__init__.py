@@ -12,6 +12,7 @@ rq:photonfarm:worker:<worker name>  heartbeat of a worker; the value is its host
 job it renders, or -, and the process of its supervisor
 rq:photonfarm:paused:<worker name>  why a worker takes no jobs
 rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
+rq:photonfarm:doing:<worker name>   what a worker is doing, and how far it is
 rq:photonfarm:reconcile             lock of the process that fills the queue
 rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
 rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
@@ -38,9 +39,11 @@ from photonfarm.shared.queue.failures import (
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
 from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import FUNCTION, OVERDUE, QUEUE, STARTS, RenderArguments, job_name
+from photonfarm.shared.queue.kept_failures import keep_failure, kept_failures
 from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
 from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.worker_activity import Activity, clear_activity, report_activity
 
 __all__ = [
     "ALIVE",
@@ -53,6 +56,7 @@ __all__ = [
     "SERVED",
     "STARTS",
     "WORKER",
+    "Activity",
     "Failure",
     "FailureCause",
     "IdleReports",
@@ -65,6 +69,7 @@ __all__ = [
     "bury",
     "causes",
     "check_served",
+    "clear_activity",
     "clear_idle_report",
     "connect",
     "consumed_samples",
@@ -78,6 +83,8 @@ __all__ = [
     "hosts",
     "job_name",
     "job_of_worker",
+    "keep_failure",
+    "kept_failures",
     "open_queue",
     "overdue",
     "put_back",
@@ -86,6 +93,7 @@ __all__ = [
     "record_failure",
     "release",
     "repeating_command",
+    "report_activity",
     "report_consumed",
     "report_idle",
     "serve",

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 
 import redis
@@ -29,6 +29,7 @@ from photonfarm.shared.queue.rq_adapter import (
 )
 from photonfarm.shared.queue.served_store import serve
 from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
+from photonfarm.shared.queue.worker_activity import Activity, read_activities
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
@@ -210,6 +211,7 @@ class QueueStatus:
     workers: int  # with a heartbeat; those of this machine only if their process lives
     failed: dict[str, Failure]  # by job name
     idle_reports: IdleReports
+    activities: Mapping[str, Activity] = field(default_factory=dict)  # by worker
 
 
 def queue_status(connection: Redis) -> QueueStatus:
@@ -221,6 +223,7 @@ def queue_status(connection: Redis) -> QueueStatus:
             workers=len(workers_alive(connection)),
             failed=read_failures(connection),
             idle_reports=read_idle_reports(connection),
+            activities=read_activities(connection),
         )
     except redis.RedisError as error:
         raise QueueError(f"Redis failed while it was asked for its status: {error}") from error

@@ -45,6 +45,12 @@ ATTEMPTS = 3
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
 
+LOADS = "loads the scene"
+COMPILES = "compiles kernels, renders samples"
+RENDERS_GUIDES = "renders guides"
+RENDERS_SAMPLES = "renders samples"
+COMMITS = "commits"
+
 _PACKAGES = ("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "numpy", "zarr")
 
 log = logging.getLogger(__name__)
@@ -80,6 +86,13 @@ class SceneRenderer(Protocol):
 
 SceneLoader = Callable[[SceneSpec], SceneRenderer]
 
+OnProgress = Callable[[str, int, int], object]
+"""A callback with the phase of a job in words, how many of its parts are done, and how many there are; 0: no parts."""
+
+
+def _ignored(phase: str, done: int, total: int) -> None:
+    """No progress is asked for."""
+
 
 def load_scene(spec: SceneSpec) -> SceneRenderer:
     """The scene of a spec, loaded into Mitsuba with a thread pool of one."""
@@ -114,6 +127,7 @@ class _Loaded:
 
     stored: SceneStore
     scene: SceneRenderer
+    compiled: bool = False  # its first image compiles the kernels
     _cloud: BasePointCloud | None = None
 
     def cloud(self) -> BasePointCloud:
@@ -129,9 +143,12 @@ class _Loaded:
 class ShardRenderer:
     """Renders jobs of a store, keeping the most recently used scenes loaded."""
 
-    def __init__(self, store: Store, *, worker: str, load: SceneLoader = load_scene) -> None:
+    def __init__(
+        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignored
+    ) -> None:
         """Take a store; `worker` is the name written into markers."""
         self._store = store
+        self._on_progress = on_progress
         self._worker = worker
         self._load = load
         self._scenes: dict[str, _Loaded] = {}  # in the order of their last use
@@ -159,12 +176,15 @@ class ShardRenderer:
         stored, scene, began = loaded.stored, loaded.scene, self._now()
         rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
         cloud = loaded.cloud()
+        views, done = len(rows.new_views), 0
         with stored.guide_writer(job) as out:
             for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
                 modification = rows.modifications[modification_row]
                 scene.apply(modification)
                 key, lit = modification.key(stored.scene_id), lit_points(cloud, modification)
                 for row in sorted(rows.new_views.intersection(sample.view_row for sample in group)):
+                    self._on_progress(RENDERS_GUIDES, done, views)
+                    done += 1
                     view = rows.views[row]
                     guides = scene.guides(view, view_key(key, view.vector), wanted, lit)
                     _check_finite(arrays_of(guides), f"view {row}")
@@ -175,7 +195,11 @@ class ShardRenderer:
         stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
         cloud = loaded.cloud()
         with stored.job_writer(job) as out:
-            redrawn = _Rendering(loaded.scene, cloud, scene_id, out).run(stored.job_rows(job))
+            report = self._on_progress if loaded.compiled else self._compiles_first
+            rows = stored.job_rows(job)
+            redrawn = _Rendering(loaded.scene, cloud, scene_id, out, report).run(rows)
+            loaded.compiled = True
+            self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
             committed = out.commit(self._figures(began, redrawn))
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
@@ -183,6 +207,10 @@ class ShardRenderer:
                 what = "its files were set aside by a repair while it was committed here; it will be rendered again"
             log.warning("scene %s, job %d: %s", scene_id, job, what)
         return committed
+
+    def _compiles_first(self, phase: str, done: int, total: int) -> None:
+        """Report progress of a scene's first job, whose first sample takes longest."""
+        self._on_progress(phase if done else COMPILES, done, total)
 
     def _now(self) -> tuple[float, float]:
         return time.monotonic(), time.process_time()
@@ -206,6 +234,7 @@ class ShardRenderer:
             spec = located(stored.spec)  # before another scene is unloaded for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
+            self._on_progress(LOADS, 0, 0)
             gc.collect()  # while an older scene is still partly alive, Dr.Jit finds no kernel in its cache
             self._scenes[scene_id] = _Loaded(stored, self._load(spec))
         return self._scenes[scene_id]
@@ -262,8 +291,11 @@ def visibility_of(
 class _Rendering:
     """One pass over a job's samples: each modification is applied once, and each new view's buffers rendered once."""
 
-    def __init__(self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter) -> None:
+    def __init__(
+        self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter, on_progress: OnProgress
+    ) -> None:
         self._scene = scene
+        self._on_progress = on_progress
         self._cloud = cloud
         self._scene_id = scene_id
         self._out = out
@@ -275,7 +307,7 @@ class _Rendering:
         Photons that another job stores, with the modification, are traced again for this job's new views: their seed
         follows from the modification's key, so that they are equal. That job counts the renders discarded for them.
         """
-        new_views = set(rows.new_views)
+        new_views, done = set(rows.new_views), 0
         for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
             modification, samples = rows.modifications[modification_row], list(group)
             self._scene.apply(modification)
@@ -288,6 +320,8 @@ class _Rendering:
                     self._out.photons(modification_row, photons)
             points = rebuild(self._cloud, modification)
             for sample in samples:
+                self._on_progress(RENDERS_SAMPLES, done, len(rows.samples))
+                done += 1
                 view = rows.views[sample.view_row]
                 if sample.view_row in new_views:
                     visibility = visibility_of(self._scene, view, points, photons)

@@ -57,8 +57,9 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     threading.Thread(target=_end_with_supervisor, daemon=True).start()
     try:
         store = Store(settings.store)
-        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load))
-        return RenderWorker(settings, store, queue.connect(settings.redis_url), pipe).run()
+        worker = RenderWorker(settings, store, queue.connect(settings.redis_url), pipe)
+        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load, on_progress=worker.doing))
+        return worker.run()
     except PhotonfarmError as error:
         _send_line(pipe, str(error))
         return error.exit_code
@@ -97,6 +98,7 @@ class RenderWorker(QueueWorker):
         self._not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
         self._heart = HeartbeatThread(settings, store, pipe)
+        self.doing = self._heart.doing
         self._disk = DiskReserve(store, settings.reserve_bytes)
         self._pace = (
             None
@@ -265,8 +267,7 @@ class RenderWorker(QueueWorker):
                 queue.put_back(self._queue, name)
         elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
             self._tainted = not isinstance(error, PhotonfarmError)
-            with contextlib.suppress(redis.RedisError):
-                self._record(name, f"{type(error).__name__}: {error}")
+            self._record(name, f"{type(error).__name__}: {error}")
 
     def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
         """The error that the next job would meet as well; if the store is gone, whatever error the job had."""
@@ -285,6 +286,13 @@ class RenderWorker(QueueWorker):
         return False
 
     def _record(self, name: str, reason: str) -> None:
+        """Record a failure: in the store for people, and in Redis, so that the job is left alone for a while."""
+        with contextlib.suppress(OSError):
+            queue.keep_failure(self._store, name, reason, worker=self._settings.name, at_s=time.time())
+        with contextlib.suppress(redis.RedisError):
+            self._set_aside_at_last(name, reason)
+
+    def _set_aside_at_last(self, name: str, reason: str) -> None:
         failure = queue.record_failure(self.connection, name, reason)
         if failure.set_aside:
             log.warning(

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 
 import redis
 
+from photonfarm.renderer.jobs.render import RENDERS_GUIDES
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError
@@ -17,6 +18,9 @@ from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.store import Store
 
 STDERR = 2
+
+REPORT_S = 2.0
+"""The seconds between two reports of what the worker is doing."""
 
 
 class HeartbeatThread:
@@ -37,18 +41,25 @@ class HeartbeatThread:
         self.paused: str | None = None
         self.left: Mapping[str, str] = {}  # replaced, never changed
         self._left_reported: Mapping[str, str] = {}
+        self._activity: queue.Activity | None = None  # replaced, never changed
 
     def start(self) -> None:
         """Take over from a child that died, and beat for as long as the process lives."""
         queue.free_job(self._connection, self._settings.name)
         self._beat()
-        threading.Thread(target=self._keep_beating, daemon=True).start()
+        for keep in (self._keep_beating, self._keep_reporting):
+            threading.Thread(target=keep, daemon=True).start()
+
+    def doing(self, phase: str, done: int = 0, total: int = 0) -> None:
+        """Note what the worker is doing; it is reported soon. See `jobs.OnProgress`."""
+        self._activity = queue.Activity(phase, done, total, 0 if phase == RENDERS_GUIDES else done, self._job)
 
     def end(self) -> None:
         """Remove the heartbeat of the worker's child; its supervisor keeps the name."""
         self._ended.set()
         queue.free_job(self._connection, self._settings.name)
         queue.clear_idle_report(self._connection, self._settings.name, {*self.left, *self._left_reported})
+        queue.clear_activity(self._connection, self._settings.name)
 
     @contextlib.contextmanager
     def working(self, name: str) -> Iterator[None]:
@@ -66,7 +77,7 @@ class HeartbeatThread:
             yield
         finally:
             faulthandler.cancel_dump_traceback_later()
-            self._job = None
+            self._job = self._activity = None
             with contextlib.suppress(redis.RedisError):
                 self._connection.delete(queue.ALIVE + name)
 
@@ -75,6 +86,19 @@ class HeartbeatThread:
             with contextlib.suppress(redis.RedisError, QueueError):  # an outage is noticed where the job ends
                 self._beat()
                 queue.serve(self._connection, self._store)
+
+    def _keep_reporting(self) -> None:
+        reported = None
+        while not self._ended.wait(REPORT_S):
+            now = self._activity
+            with contextlib.suppress(redis.RedisError, QueueError):
+                if now is not None:
+                    queue.report_activity(
+                        self._connection, self._settings.name, now, ttl_s=self._settings.heartbeat_ttl_s
+                    )
+                elif reported is not None:
+                    queue.clear_activity(self._connection, self._settings.name)
+                reported = now
 
     def _beat(self) -> None:
         name, ttl_s = self._settings.name, self._settings.heartbeat_ttl_s

@@ -23,8 +23,15 @@ NONE: Mapping[str, float] = {}
 class Stopwatch:
     """Counts the seconds of a run by kind. At any moment exactly one kind is counted, so their sum is the wall time."""
 
-    def __init__(self, clock: Callable[[], float], kind: TimeKind, ahead: float = 0.0) -> None:
-        """Begin to count `kind`, which has `ahead` seconds already."""
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        kind: TimeKind,
+        ahead: float = 0.0,
+        on_turn: Callable[[TimeKind], object] | None = None,
+    ) -> None:
+        """Begin to count `kind`, which has `ahead` seconds already; `on_turn` is told each kind that begins."""
+        self._on_turn = on_turn
         self._clock, self._kind, self._since = clock, kind, clock() - ahead
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
 
@@ -49,6 +56,8 @@ class Stopwatch:
         before, now = self._kind, self._clock()
         self._spent[before] += now - self._since
         self._kind, self._since = kind, now
+        if self._on_turn is not None:
+            self._on_turn(kind)
         return before
 
     @contextmanager

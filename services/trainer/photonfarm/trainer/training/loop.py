@@ -28,7 +28,7 @@ from photonfarm.trainer.runs.metrics_log import MetricsLog
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
-from photonfarm.trainer.runs.wait_times import Stopwatch, samples_per_used, wait_shares
+from photonfarm.trainer.runs.wait_times import Stopwatch, TimeKind, samples_per_used, wait_shares
 from photonfarm.trainer.training.learner import DivergedError, Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
@@ -69,7 +69,8 @@ class Hooks:
     on_record: Callable[[dict[str, Any]], object] | None = None  # gets each record of metrics.jsonl as it is written
     on_draws: Callable[[int, int], object] | None = None  # at the beginning and after each step: draws so far, and
     # samples that have arrived
-    on_images: Show | None = None  # at each validation: step, targets and predictions of the first held-out samples
+    on_phase: Callable[[TimeKind], object] | None = None  # what the time is spent on from now on
+    on_images: Show | None = None  # at each validation, with the first held-out samples
     script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
     group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
     waited: float = 0.0  # seconds that have passed already
@@ -90,7 +91,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
     hooks = hooks or Hooks()
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
-    watch = Stopwatch(hooks.clock, "wait_data", hooks.waited)
+    watch = Stopwatch(hooks.clock, "wait_data", hooks.waited, hooks.on_phase)
     with held(run):
         while not source.ready():
             if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):

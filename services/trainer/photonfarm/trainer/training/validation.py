@@ -15,7 +15,8 @@ from photonfarm.shared.core.records import F32
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 
-Show = Callable[[int, F32, F32], None]
+Show = Callable[[int, tuple[int, ...], F32, F32], None]
+"""A callback with the step, rows of the store, and their targets and predictions."""
 
 WORSE = 0.1
 """The share of the best error by which a validation may be worse: less is noise of a learning rate still high."""
@@ -71,7 +72,7 @@ def validate(
     def predict_and_show(batch: TrainingBatch) -> F32:
         images = predict(batch)
         if show is not None and rows == list(batch.rows):
-            show(step, batch.target.mean(dim=1).cpu().numpy(), images)
+            show(step, batch.rows, batch.target.mean(dim=1).cpu().numpy(), images)
         return images
 
     with np.errstate(invalid="ignore", over="ignore"):  # overflows of a diverged network, which is reported as such

@@ -81,7 +81,14 @@ class SceneStore:
         self._plans = plans.load_all(self.storage, self.name, self._plans)
         return self._plans
 
-    def plan(self, request: Request | TopUp, *, shard_rows: int | None = None, dry_run: bool = False) -> PlanResult:
+    def plan(
+        self,
+        request: Request | TopUp,
+        *,
+        shard_rows: int | None = None,
+        usual_rows: int = SHARD_ROWS,
+        dry_run: bool = False,
+    ) -> PlanResult:
         """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
         Raises SpecError for an invalid request or number of rows, and CorruptError if a plan is missing.
@@ -89,7 +96,7 @@ class SceneStore:
         while True:
             last = {name: max(markers.jobs(self.storage, name), default=-1) for name in (self.name, self.guides.name)}
             found = self.plans()  # after the markers: each one's plan is there by now
-            rows_per_job = self._shard_rows(found, shard_rows)
+            rows_per_job = self._shard_rows(found, shard_rows, usual_rows)
             first_job = found[-1].end_job if found else 0
             for name, job in last.items():
                 if job >= first_job:
@@ -111,11 +118,11 @@ class SceneStore:
                 finally:
                     shutil.rmtree(built, ignore_errors=True)
 
-    def _shard_rows(self, found: list[StoredPlan], wanted: int | None) -> int:
+    def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
             raise SpecError(f"shard_rows = {wanted}: 1 to {MAX_SHARD_ROWS} samples per job are allowed")
         if not found:
-            return wanted or SHARD_ROWS
+            return wanted or usual
         if wanted not in (None, found[0].shard_rows):
             raise SpecError(
                 f"shard_rows = {wanted}: scene {self.scene_id} has {found[0].shard_rows} samples per job, fixed by its "

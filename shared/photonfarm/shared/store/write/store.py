@@ -94,14 +94,23 @@ class Store:
         return self.scene(spec.scene_id)
 
     def plan(
-        self, spec: SceneSpec, request: Request, *, shard_rows: int | None = None, dry_run: bool = False
+        self,
+        spec: SceneSpec,
+        request: Request,
+        *,
+        shard_rows: int | None = None,
+        usual_rows: int = SHARD_ROWS,
+        dry_run: bool = False,
     ) -> PlanResult:
-        """Plan the new samples of a request; `dry_run` only counts. `shard_rows` is fixed by a scene's first plan."""
+        """Plan the new samples of a request; `dry_run` only counts.
+
+        `shard_rows` is fixed by a scene's first plan; if it is None, that has `usual_rows`.
+        """
         if dry_run and not self.has_scene(spec.scene_id):
-            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or SHARD_ROWS)
+            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or usual_rows)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
-        return scene.plan(request, shard_rows=shard_rows, dry_run=dry_run)
+        return scene.plan(request, shard_rows=shard_rows, usual_rows=usual_rows, dry_run=dry_run)
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove temporary files that dead writers left; returns how many."""

@@ -1,0 +1,96 @@
+"""What a trainer is doing now, for people: a small file in the run's folder, and a line now and then."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.files import write_whole
+from photonfarm.trainer.runs.wait_times import TimeKind
+
+PROGRESS = "progress.json"
+FILE_S = 2.0  # between two versions of the file
+LINE_S = 5.0  # between two lines
+SHORT_S = 1.0  # a phase that is over sooner is a part of training
+WINDOW = 30  # the versions over which the pace is taken: a minute
+
+WORDS: dict[TimeKind, str] = {
+    "start": "builds the network",
+    "train": "trains",
+    "validate": "validates",
+    "wait_data": "waits for samples",
+    "wait_read": "reads samples",
+    "save": "writes a checkpoint",
+    "other": "trains",
+}
+
+
+class RunProgress:
+    """Follows a session of training; `phase` and `drawn` are its hooks."""
+
+    def __init__(self, steps: int, batch: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take the last step, and the samples of each step."""
+        self._steps, self._batch, self._clock = steps, batch, clock
+        self._step = self._samples = 0
+        self._phase: tuple[TimeKind, float] = ("wait_data", clock())
+        self._history: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+
+    def phase(self, kind: TimeKind) -> None:
+        """Note what the time is spent on from now on."""
+        if kind != self._phase[0]:
+            self._phase = (kind, self._clock())
+
+    def drawn(self, draws: int, samples: int) -> None:
+        """Note the samples drawn so far, and those that have arrived."""
+        self._step, self._samples = draws // self._batch, samples
+
+    def look(self) -> dict[str, object]:
+        """The present state, as the file holds it."""
+        now, (kind, since) = self._clock(), self._phase
+        self._history.append((now, self._step))
+        (began, first), left = self._history[0], None
+        if self._step > first:
+            left = (self._steps - self._step) * (now - began) / (self._step - first)
+        phase = WORDS[kind] if now - since >= SHORT_S or not self._step else WORDS["train"]
+        return {
+            "step": self._step, "steps": self._steps, "samples": self._samples, "phase": phase,
+            "phase_s": round(now - since, 1), "left_s": left, "at_s": time.time(),
+        }  # fmt: skip
+
+    def line(self) -> str:
+        """The present state in words."""
+        found = self.look()
+        left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
+        since = f" for {found['phase_s']:.0f} s" if found["phase"] != WORDS["train"] else ""
+        return f"step {self._step}/{self._steps}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
+
+
+@contextmanager
+def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
+    """Keep the file up to date until the block ends, and say a line every five seconds."""
+    ended = threading.Event()
+
+    def follow() -> None:
+        said = time.monotonic()
+        while not ended.wait(FILE_S):
+            with suppress(OSError):
+                write_whole(run / PROGRESS, json.dumps(progress.look()))
+            if say is not None and time.monotonic() - said >= LINE_S - FILE_S / 2:
+                said = time.monotonic()
+                say(progress.line())
+
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        with suppress(OSError):
+            (run / PROGRESS).unlink(missing_ok=True)

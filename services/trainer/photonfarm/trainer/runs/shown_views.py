@@ -1,0 +1,42 @@
+"""Pictures of a few held-out views at validations, in the run's folder, so that others can watch them improve."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from photonfarm.shared.core.errors import store_errors
+from photonfarm.shared.core.files import whole_file
+from photonfarm.shared.core.pictures import display
+from photonfarm.shared.core.records import F32
+
+VIEWS = "views"
+SHOWN = 4  # the most views
+MOST = 24  # the most pictures kept; beyond, every second one goes, so that early ones become rare
+_NAME = re.compile(r"step-(\d{8})\.png")
+
+
+def write_views(run: Path, step: int, rows: tuple[int, ...], predictions: F32) -> None:
+    """Write the first predictions, exposed linear radiance (B, H, W, 3), side by side as a display shows them.
+
+    The PNG's text `rows` names the rows of the store that they belong to. Raises StoreError if the disk refuses.
+    """
+    from PIL import Image, PngImagePlugin
+
+    rows, folder = rows[:SHOWN], run / VIEWS
+    about = PngImagePlugin.PngInfo()
+    about.add_text("rows", " ".join(map(str, rows)))
+    strip = np.concatenate([display(image, 1.0) for image in predictions[: len(rows)]], axis=1)
+    with store_errors("write pictures of held-out views", folder):
+        with whole_file(folder / f"step-{step:08d}.png") as part:
+            Image.fromarray(strip).save(part, "PNG", pnginfo=about)
+        _thin_out(folder)
+
+
+def _thin_out(folder: Path) -> None:
+    files = sorted(file for file in folder.iterdir() if _NAME.fullmatch(file.name))
+    if len(files) > MOST:
+        for file in files[1:-1:2]:
+            file.unlink(missing_ok=True)

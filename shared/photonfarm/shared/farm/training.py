@@ -1,0 +1,114 @@
+"""How far a training run is, read from its folder, without torch."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.estimate import stated
+
+METRICS = "metrics.jsonl"
+PROGRESS = "progress.json"
+SETTINGS = "settings.json"
+TRAINS = "trains"
+"""The phase of a trainer while nothing holds it up."""
+
+FRESH_S = 20.0
+"""The age up to which a trainer's own word of what it does is believed; it writes one every two seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingProgress:
+    """How far a run is."""
+
+    run: str  # the name of its folder
+    step: int = 0
+    steps: int = 0  # 0: not known yet
+    phase: str | None = None  # what the trainer does now; None if none is at work
+    left_s: float | None = None  # until the last step, at the pace so far
+    validation: dict[str, Any] | None = None  # the last record of one
+    ended: str | None = None  # why, if the run has ended
+
+    @property
+    def error(self) -> str:
+        """The last held-out error in words; "" before the first validation."""
+        found = self.validation
+        if found is None:
+            return ""
+        return f"held-out error {stated(found['error'], found['standard_error'])} on {found['held_out']} samples"
+
+    @property
+    def note(self) -> str:
+        """What training does, how long that still takes, and its last error, each after a comma."""
+        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
+        doing = self.phase if self.phase != TRAINS else None
+        return "".join(f", {part}" for part in (doing, left, self.error) if part)
+
+
+class RunFolder:
+    """Follows a run's folder: `look` reads only what has been added to its log since the last call."""
+
+    def __init__(self, folder: Path) -> None:
+        """Take a folder, which may not exist yet."""
+        self.folder = folder
+        self.records: list[dict[str, Any]] = []
+        self._read_bytes = 0
+        self._file = 0  # the log's inode: a trainer that resumes replaces the file
+
+    def look(self) -> TrainingProgress:
+        """The present progress."""
+        self._read_log()
+        said = _read_json(self.folder / PROGRESS)
+        if time.time() - said.get("at_s", 0.0) > FRESH_S:
+            said = {}
+        last = self.records[-1] if self.records else {}
+        ended = str(last.get("reason")) if last.get("kind") == "end" and not said else None
+        validation = next((each for each in reversed(self.records) if each.get("kind") == "validation"), None)
+        return TrainingProgress(
+            self.folder.name,
+            max(_number(last.get("step")), _number(said.get("step"))),
+            _number(said.get("steps")) or _number(_read_json(self.folder / SETTINGS).get("max_steps")),
+            said.get("phase"),
+            said.get("left_s"),
+            validation,
+            ended,
+        )
+
+    def _read_log(self) -> None:
+        try:
+            with (self.folder / METRICS).open("rb") as file:
+                about = os.fstat(file.fileno())
+                if about.st_ino != self._file or about.st_size < self._read_bytes:
+                    self.records, self._read_bytes, self._file = [], 0, about.st_ino
+                file.seek(self._read_bytes)
+                added = file.read()
+        except OSError:
+            return
+        whole = added[: added.rfind(b"\n") + 1]
+        self._read_bytes += len(whole)
+        self.records += [record for line in whole.splitlines() if (record := _record(line))]
+
+
+def _record(line: bytes) -> dict[str, Any]:
+    """A record of the log; empty for a line that is none."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        return _record(file.read_bytes())
+    except OSError:
+        return {}
+
+
+def _number(value: Any) -> int:
+    return value if isinstance(value, int) else 0

@@ -116,6 +116,10 @@ def _lead(
             log(f"waiting for scene {scene_id}, {lacks}")
         progress = RunProgress(settings.max_steps, settings.batch)
 
+        def drawn(draws: int, samples: int) -> None:
+            progress.drawn(draws, samples)
+            on_draws(draws, samples)
+
         def show(step: int, rows: tuple[int, ...], targets: F32, predictions: F32) -> None:
             write_views(folder, step, rows, predictions)
             if board:
@@ -130,7 +134,7 @@ def _lead(
                 Hooks(
                     stop=stop,
                     on_record=lambda record: [follow(record) for follow in followers],
-                    on_draws=lambda draws, samples: (on_draws(draws, samples), progress.drawn(draws, samples)),
+                    on_draws=drawn,
                     on_phase=progress.phase,
                     on_images=show,
                     waited=waited,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from photonfarm.shared.cli.options import json_option, redis_option, request_options, store_option
+from photonfarm.shared.cli.options import json_option, names_redis, redis_option, request_options, store_option
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
@@ -132,20 +132,34 @@ def top_up(
 @click.command()
 @store_option
 @redis_option
+@click.option("--run", "runs", type=click.Path(path_type=Path), multiple=True,
+              help="With --watch: folder of a training run; may be repeated.")  # fmt: skip
+@click.option("--watch", is_flag=True, help="Keep showing it, with rates and time left, until Ctrl-C.")
 @json_option
-def status(store: str | Path, redis_url: str, as_json: bool) -> None:
-    """Show what is planned, committed, queued and failed."""
+def status(store: str | Path, redis_url: str, runs: tuple[Path, ...], watch: bool, as_json: bool) -> None:
+    """Show what is planned, committed, queued and failed.
+
+    Where `photonfarm up` is at work on the store here, its queue is shown, unless --redis names another.
+    """
     from photonfarm.shared.cli import show_status
+    from photonfarm.shared.farm.running_farm import running_farm
     from photonfarm.shared.farm.status import check_read, queue_of
     from photonfarm.shared.store import Store, store_status
 
-    opened = Store(store)
-    scenes = store_status(opened)
+    opened, named = Store(store), names_redis()
+    if watch:
+        from photonfarm.shared.cli.show_watch import keep_watching
+        from photonfarm.shared.farm.watch import FarmWatch
+
+        keep_watching(FarmWatch(opened, redis_url, runs, named_redis=named))
+        return
+    scenes, running = store_status(opened), running_farm(opened)
+    url = redis_url if named or running is None else running.redis_url
     if as_json:
-        show_status.document(scenes, queue_of(opened, redis_url), store)
+        show_status.document(scenes, queue_of(opened, url, expects_redis=named), store, running)
     else:
         show_status.scenes(scenes)  # before Redis is asked, which may not answer
-        show_status.queue(queue_of(opened, redis_url), scenes, store)
+        show_status.queue(queue_of(opened, url, expects_redis=named), scenes, store, running)
     check_read(scenes)
 
 

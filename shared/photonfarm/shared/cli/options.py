@@ -62,6 +62,11 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
     return with_password_of(Path(file), url)
 
 
+def names_redis() -> bool:
+    """Whether the user of the current command has named its Redis, in any way."""
+    return click.get_current_context().get_parameter_source("redis_url") is not ParameterSource.DEFAULT
+
+
 def _refuse_password(url: str) -> None:
     from photonfarm.shared.queue import has_password
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,19 +10,29 @@ from typing import Any
 import click
 
 from photonfarm.shared.cli.show import print_json, print_table
+from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.farm.running_farm import RunningFarm
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, lost_plan, unread_markers
-from photonfarm.shared.queue import QueueStatus, repeating_command
+from photonfarm.shared.farm.waits import idle
+from photonfarm.shared.queue import FailureCause, repeating_command
 from photonfarm.shared.store import SceneStatus
 
-IDLE_SHOWN = 10
-"""The most idle workers whose reasons are printed."""
 
-
-def document(scenes: Sequence[SceneStatus], found: StoreQueue | NoQueue, store: str | Path) -> None:
+def document(
+    scenes: Sequence[SceneStatus], found: StoreQueue | NoQueue, store: str | Path, running: RunningFarm | None
+) -> None:
     """Print a store's scenes and its queue as JSON, or why nothing is known of the queue."""
     document = None if isinstance(found, NoQueue) else _queue_document(found, store)
     reason = found.reason if isinstance(found, NoQueue) else None
-    print_json({"scenes": [asdict(scene) for scene in scenes], "queue": document, "no_queue": reason})
+    print_json(
+        {
+            "scenes": [asdict(scene) for scene in scenes],
+            "queue": document,
+            "no_queue": reason,
+            "kept_failures": _failures_document(found.kept, store),
+            "up": None if running is None else asdict(running),
+        }
+    )
 
 
 def scenes(found: Sequence[SceneStatus]) -> None:
@@ -52,35 +62,48 @@ def _guided(scene: SceneStatus) -> str:
     return "none" if scene.views_guided is None else f"{scene.views_guided}/{scene.views_planned} views"
 
 
-def queue(found: StoreQueue | NoQueue, scenes: Sequence[SceneStatus], store: str | Path) -> None:
+def queue(
+    found: StoreQueue | NoQueue, scenes: Sequence[SceneStatus], store: str | Path, running: RunningFarm | None
+) -> None:
     """Print what the queue of a store with these scenes holds, or why nothing is known of it."""
+    if running is not None:
+        click.echo("`photonfarm up` is at work here" + (f"; watch it at {running.web}" if running.web else ""))
+    missing = sum(scene.samples_planned - scene.samples_complete for scene in scenes)
     if isinstance(found, NoQueue):
-        click.echo(f"queue: {found.reason}")
-        return
+        click.echo(f"queue: {_without_redis(missing) if found.expected else found.reason}")
+    else:
+        _known_queue(found, scenes, store, missing)
+    _failures("failed before", found.kept, store)
+
+
+def _without_redis(missing: int) -> str:
+    """What a store without a queue means to someone who has named no Redis."""
+    if not missing:
+        return "none is needed: all that is planned is there"
+    return f"no farm is at work here; `photonfarm up` goes on with the {missing} samples that are missing"
+
+
+def _known_queue(found: StoreQueue, scenes: Sequence[SceneStatus], store: str | Path, missing: int) -> None:
     status, causes = found.status, found.causes
     failed, aside = sum(len(cause.jobs) for cause in causes), sum(cause.set_aside for cause in causes)
+    core_s, complete = sum(scene.core_s for scene in scenes), sum(scene.samples_complete for scene in scenes)
+    left = missing * core_s / complete / status.workers if missing and complete and status.workers else None
     click.echo(
         f"queue: {status.queued} queued, {status.running} running, {status.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
+        + (f"; about {in_words(left)} left for {missing} samples" if left else "")
     )
-    for line in _idle_lines(status, {scene.scene_id: scene.name for scene in scenes}):
+    for name, activity in sorted(status.activities.items()):
+        click.echo(f"  worker {name} {activity}")
+    for line in idle(status, {scene.scene_id: scene.name for scene in scenes}):
         click.echo(f"  {line}")
+    _failures("", causes, store)
+
+
+def _failures(when: str, causes: Sequence[FailureCause], store: str | Path) -> None:
     for cause in causes:
-        click.echo(f"  {len(cause.jobs)} × {cause.cause}")
+        click.echo(f"  {len(cause.jobs)} {when} × {cause.cause}" if when else f"  {len(cause.jobs)} × {cause.cause}")
         click.echo(f"      to repeat one: {repeating_command(store, cause.example)}")
-
-
-def _idle_lines(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:
-    """Why scenes of the store are not rendered, by the workers' reports, which strangers may have written."""
-    for scene_id, reasons in found.idle_reports.left.items():
-        if scene_id in names:
-            reason = next(iter(reasons.values()))
-            yield f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
-    paused = found.idle_reports.paused
-    for worker, reason in list(paused.items())[:IDLE_SHOWN]:
-        yield f"worker {worker} takes no jobs: {reason}"
-    if len(paused) > IDLE_SHOWN:
-        yield f"and {len(paused) - IDLE_SHOWN} workers more"
 
 
 def _queue_document(found: StoreQueue, store: str | Path) -> dict[str, Any]:
@@ -91,16 +114,21 @@ def _queue_document(found: StoreQueue, store: str | Path) -> dict[str, Any]:
         "workers": status.workers,
         "left": status.idle_reports.left,
         "paused": status.idle_reports.paused,
-        "failures": [
-            {
-                "cause": cause.cause,
-                "failed": len(cause.jobs),
-                "set_aside": cause.set_aside,
-                "jobs": [
-                    {"name": name, **asdict(failure), "command": repeating_command(store, name)}
-                    for name, failure in cause.jobs.items()
-                ],
-            }
-            for cause in found.causes
-        ],
+        "doing": {name: asdict(activity) for name, activity in status.activities.items()},
+        "failures": _failures_document(found.causes, store),
     }
+
+
+def _failures_document(causes: Sequence[FailureCause], store: str | Path) -> list[dict[str, Any]]:
+    return [
+        {
+            "cause": cause.cause,
+            "failed": len(cause.jobs),
+            "set_aside": cause.set_aside,
+            "jobs": [
+                {"name": name, **asdict(failure), "command": repeating_command(store, name)}
+                for name, failure in cause.jobs.items()
+            ],
+        }
+        for cause in causes
+    ]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError
-from photonfarm.shared.farm.job_size import WORKERS, rows_per_job
+from photonfarm.shared.farm.job_size import WORKERS
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec
@@ -56,12 +56,10 @@ def submit(
     opened = Store(store, create=True)
     scene = opened.add(named.spec)
     scene.guides.check(named.spec.guides)
-    usual = rows_per_job(named.spec, request, workers)
-    scene.plan(
-        Request(), shard_rows=shard_rows, usual_rows=usual, dry_run=True
-    )  # what is refused leaves no wish for guides behind
+    rows: dict[str, Any] = {"shard_rows": shard_rows, "usual_rows": rows_per_job(named.spec, request, workers)}
+    scene.plan(Request(), **rows, dry_run=True)  # what is refused leaves no wish for guides behind
     scene.guides.want(named.spec.guides)
-    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual)
+    planned = opened.plan(named.spec, request, **rows)
     queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 

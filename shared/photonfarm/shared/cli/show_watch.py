@@ -1,0 +1,94 @@
+"""`photonfarm status --watch`: the farm, redrawn in place on a terminal, and as plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.farm.status import NoQueue
+from photonfarm.shared.farm.waits import failed
+from photonfarm.shared.farm.watch import FarmView, FarmWatch, SceneView
+
+LOOK_S = 2.0
+PLAIN_S = 5.0  # where there is no terminal
+
+
+def keep_watching(watch: FarmWatch) -> None:
+    """Show the farm until Ctrl-C. Raises StoreError if the store is gone."""
+    console = Console(highlight=False)
+    try:
+        if not console.is_terminal:
+            while True:
+                console.print("\n".join(lines(watch.look())), soft_wrap=True, markup=False)
+                time.sleep(PLAIN_S)
+        with Live(console=console, auto_refresh=False) as live:
+            while True:
+                live.update(_drawn(watch.look()), refresh=True)
+                time.sleep(LOOK_S)
+    except KeyboardInterrupt:
+        return
+
+
+def _drawn(view: FarmView) -> Group:
+    """The farm as a terminal shows it."""
+    table = Table("scene", "id", "samples", "in hand", "rate", "left", "core time", "size", box=None, pad_edge=False)
+    for scene in view.scenes:
+        table.add_row(
+            Text(scene.name), scene.scene_id[:8], _counted(scene), str(scene.in_hand), _rate(scene), _left(scene),
+            f"{scene.core_s:.0f} s", f"{scene.size_bytes / 1e6:.1f} MB",
+        )  # fmt: skip
+    return Group(Text(time.strftime("%H:%M:%S")), table, *(Text(line) for line in _below(view)))
+
+
+def lines(view: FarmView) -> Iterator[str]:
+    """The farm as plain lines."""
+    now = time.strftime("%H:%M:%S")
+    for scene in view.scenes:
+        if scene.error:
+            yield f"{now}  {scene.name} {scene.scene_id[:8]}: cannot be read: {scene.error}"
+            continue
+        in_hand = f" (+{scene.in_hand} in hand)" if scene.in_hand else ""
+        pace = f"{_rate(scene)}, {_left(scene)} left" if scene.missing else "all there"
+        yield f"{now}  {scene.name} {scene.scene_id[:8]}: samples {_counted(scene)}{in_hand}, {pace}"
+    yield from _below(view)
+
+
+def _below(view: FarmView) -> Iterator[str]:
+    """What workers and trainers do, and what waits for what."""
+    if isinstance(view.queue, NoQueue):
+        yield "  no farm is at work here" if view.queue.expected else f"  {view.queue.reason}"
+    else:
+        status = view.queue.status
+        yield f"  {status.queued} jobs queued, {status.running} running, {status.workers} workers"
+    for name, activity in sorted(view.activities.items()):
+        yield f"  worker {name} {activity}"
+    for training in view.trainings:
+        steps = f"{training.step}/{training.steps}" if training.steps else str(training.step)
+        yield f"  {training.run}: step {steps}{training.note}" + (
+            f", ended ({training.ended})" if training.ended else ""
+        )
+    yield from (f"  {wait}" for wait in view.waits)
+    yield from (f"  before: {failed(cause)}" for cause in view.queue.kept)
+
+
+def _counted(scene: SceneView) -> str:
+    further = f", passes {scene.passes[0]}/{scene.passes[1]}" if scene.passes[1] else ""
+    return f"{scene.samples[0]}/{scene.samples[1]}{further}"
+
+
+def _rate(scene: SceneView) -> str:
+    if scene.rate is None:
+        return "no pace yet" if scene.missing else ""
+    return f"{scene.rate:.1f} samples/s" if scene.rate >= 1 else f"{60 * scene.rate:.1f} samples/min"
+
+
+def _left(scene: SceneView) -> str:
+    if not scene.missing:
+        return ""
+    return "?" if scene.left_s is None else in_words(scene.left_s)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError
-from photonfarm.shared.farm.job_size import WORKERS
+from photonfarm.shared.farm.job_size import WORKERS, rows_per_job
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec

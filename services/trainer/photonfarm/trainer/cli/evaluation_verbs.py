@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args
@@ -104,7 +103,9 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    with _progress() as on_progress:
+    from photonfarm.trainer.cli.show_progress import measuring_progress
+
+    with measuring_progress() as on_progress:
         found = compare(store, loaded, on_progress=on_progress, **how)
     pictures = write(found, loaded)
     click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
@@ -125,40 +126,13 @@ def report(
     from the scene to the image; with references, the worst cases of the first run are found and shown.
     """
     how = _how(**asked)
+    from photonfarm.trainer.cli.show_progress import measuring_progress
     from photonfarm.trainer.report import write_report
 
-    with _progress() as on_progress:
+    with measuring_progress() as on_progress:
         figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(figures["verdict"], err=True)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress callback: a bar for each predictor on a terminal, else a line; both on stderr."""
-    from rich import markup
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _line
-        return
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(name: str, done: int, total: int) -> None:
-            if name not in tasks:
-                tasks[name] = bars.add_task(markup.escape(name), total=total)
-            bars.update(tasks[name], completed=done)
-
-        yield show
-
-
-def _line(name: str, done: int, total: int) -> None:
-    if done == total:
-        click.echo(f"{name}: {total} samples", err=True)
 
 
 @click.command()

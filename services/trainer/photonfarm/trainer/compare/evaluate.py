@@ -59,7 +59,10 @@ It gets the first predictor's images (H, W, 3), and the references that some row
 """
 
 MeasureProgress = Callable[[str, int, int], object]
-"""A callback with a predictor's name, the number of samples it was measured on so far, and of all samples."""
+"""A callback with a predictor's name, the number of samples it was measured on so far, and of all samples.
+
+Other parts of the work are told by their name, 0 and 0.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,6 +182,7 @@ def compare(
     network = load_inception(inception, str(place)) if found and not without_inception else None
     test = _Test(store, samples, found, shown, network, str(place), on_progress or (lambda *_: None))
     ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    test.on_progress("networks are loaded and timed", 0, 0)
     leading, *others = test.timed([*runs, *ready])
     first_of_all = test.measured(leading)
     if choose:
@@ -302,6 +306,8 @@ class _Test:
                 lambda done: self.on_progress(predictor.name, done, len(rows)),
             )
             held_out = measure(watched, batches(feed, rows, size))
+        if self.references:
+            self.on_progress(f"{predictor.name} is compared with the references", 0, 0)
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
         return _Measured(timed, held_out, metrics, watched.images)
 

@@ -53,6 +53,8 @@ def write_report(
         store, loaded, denoisers, references=references, inception=inception, most=most,
         device=device, on_progress=on_progress, timed=timed,
     )  # fmt: skip
+    if on_progress:
+        on_progress("plots and pages are drawn", 0, 0)
     drawn, views, verdict = plots(contents), shown_views(contents), Verdict.of(contents)
     text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)
     with store_errors("write the report", out):

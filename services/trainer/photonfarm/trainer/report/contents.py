@@ -101,11 +101,13 @@ def gathered(
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), timed=timed)
+    tell = on_progress or (lambda *_: None)
+    close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), tell, timed=timed)
     evaluation = evaluate.compare(
         store, runs, denoisers, references=references, inception=inception, most=most, device=device,
         on_progress=on_progress, choose=close_look,
     )  # fmt: skip
+    tell("the mean colour and the untrained network are measured", 0, 0)
     costs = close_look.costs
     found = table_of(card.spec)
     names = short_names(list(runs))
@@ -171,8 +173,16 @@ class _CloseLook:
     """
 
     def __init__(
-        self, store: str | Path, scene_id: str, kept: Sequence[int], points: int | None, *, timed: bool
+        self,
+        store: str | Path,
+        scene_id: str,
+        kept: Sequence[int],
+        points: int | None,
+        on_progress: MeasureProgress,
+        *,
+        timed: bool,
     ) -> None:
+        self._on_progress = on_progress
         self._store, self._scene_id, self._kept, self._points, self._timed = store, scene_id, kept, points, timed
         self.costs: FrameCosts | None = None
         self.untimed = "it was not asked for"
@@ -181,11 +191,13 @@ class _CloseLook:
 
     def __call__(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
         if self._timed:
+            self._on_progress("the renderer times frames", 0, 0)
             rows = list(references or images)
             try:
                 self.costs = frame_costs(self._store, self._scene_id, rows, self._kept, self._points)
             except BackendError as error:
                 self.untimed = str(error)
+        self._on_progress("the worst cases are looked for", 0, 0)
         self.machine = Machine.here()
         self.worst = worst_cases(self._views(images, references))
         return [case.row for case in self.worst]

@@ -1,0 +1,79 @@
+"""What `evaluate` and `report` say of how far they are: bars on a terminal, a line every five seconds elsewhere."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+from rich import markup
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from photonfarm.shared.core.durations import in_words
+
+LINE_S = 5.0
+
+OnProgress = Callable[[str, int, int], None]
+
+
+@contextmanager
+def measuring_progress() -> Iterator[OnProgress]:
+    """Yield a callback with what is done, how many of its samples are done, and of how many; 0: it has no parts."""
+    console = Console(stderr=True)
+    with _bars(console) if console.is_terminal else _lines() as show:
+        yield show
+
+
+@contextmanager
+def _bars(console: Console) -> Iterator[OnProgress]:
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+        measured: set[str] = set()
+
+        def show(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                for part in [each for each in tasks if each not in measured]:
+                    bars.remove_task(tasks.pop(part))
+                tasks[name] = bars.add_task(markup.escape(name), total=total or None)
+            if total:
+                measured.add(name)
+            bars.update(tasks[name], completed=done)
+
+        yield show
+
+
+@contextmanager
+def _lines() -> Iterator[OnProgress]:
+    now: tuple[str, int, int, float] = ("starts", 0, 0, time.monotonic())  # the last callback, and since when
+    ended = threading.Event()
+
+    def show(name: str, done: int, total: int) -> None:
+        nonlocal now
+        now = (name, done, total, now[3] if name == now[0] else time.monotonic())
+        if total and done == total:
+            click.echo(f"{name}: {total} samples", err=True)
+
+    def repeat() -> None:
+        while not ended.wait(LINE_S):
+            click.echo(_line(*now), err=True)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _line(name: str, done: int, total: int, since_s: float) -> str:
+    spent = time.monotonic() - since_s
+    if not total:
+        return f"{name}, for {spent:.0f} s"
+    left = f", {in_words(spent / done * (total - done))} left" if done else ""
+    return f"{name}: {done}/{total} samples{left}"

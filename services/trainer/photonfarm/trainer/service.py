@@ -121,7 +121,7 @@ def _lead(
             on_draws(draws, samples)
 
         def show(step: int, rows: tuple[int, ...], targets: F32, predictions: F32) -> None:
-            write_views(folder, step, rows, predictions)
+            write_views(folder, source.spec.scene_id, step, rows, predictions)
             if board:
                 board.pictures(step, targets, predictions)
 

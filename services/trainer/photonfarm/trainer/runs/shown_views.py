@@ -18,15 +18,16 @@ MOST = 24  # the most pictures kept; beyond, every second one goes, so that earl
 _NAME = re.compile(r"step-(\d{8})\.png")
 
 
-def write_views(run: Path, step: int, rows: tuple[int, ...], predictions: F32) -> None:
+def write_views(run: Path, scene_id: str, step: int, rows: tuple[int, ...], predictions: F32) -> None:
     """Write the first predictions, exposed linear radiance (B, H, W, 3), side by side as a display shows them.
 
-    The PNG's text `rows` names the rows of the store that they belong to. Raises StoreError if the disk refuses.
+    The PNG's texts `scene` and `rows` name what they belong to in the store. Raises StoreError if the disk refuses.
     """
     from PIL import Image, PngImagePlugin
 
     rows, folder = rows[:SHOWN], run / VIEWS
     about = PngImagePlugin.PngInfo()
+    about.add_text("scene", scene_id)
     about.add_text("rows", " ".join(map(str, rows)))
     strip = np.concatenate([display(image, 1.0) for image in predictions[: len(rows)]], axis=1)
     with store_errors("write pictures of held-out views", folder):

@@ -1,0 +1,195 @@
+"""What the pages say of a farm: its progress, its trainings and its samples, as JSON documents and files.
+
+Looks at the farm are shared by all browsers, and each is kept for a hundred times as long as it took: so whoever looks,
+and however large the store is, looking takes about a hundredth of a core.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from photonfarm.shared.farm.status import NoQueue
+from photonfarm.shared.farm.watch import FarmView, FarmWatch
+from photonfarm.shared.store import Store
+from photonfarm.web.samples import NotThereError, SceneSamples
+
+LEAST_S = 2.0
+"""The least seconds between two looks."""
+
+SHARE = 0.01
+"""The most of a core that looks take, on average."""
+
+CURVE_POINTS = 300
+"""The most points of a curve."""
+
+STEP = re.compile(r"step-([0-9]{8})\.png")
+
+T = TypeVar("T")
+
+
+class Kept(Generic[T]):
+    """A value that is made anew now and then, so that making it takes at most SHARE of the time."""
+
+    def __init__(self, make: Callable[[], T], *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take the function that makes it."""
+        self._make, self._clock = make, clock
+        self._lock = threading.Lock()
+        self._due = 0.0
+        self._value: T | None = None
+
+    def get(self) -> T:
+        """The value, made anew if that is due; raises what making it raises."""
+        with self._lock:
+            began = self._clock()
+            if self._value is None or began >= self._due:
+                self._value = self._make()
+                ended = self._clock()
+                self._due = ended + max(LEAST_S, (ended - began) / SHARE)
+            return self._value
+
+
+class FarmPages:
+    """A store, its queue and its trainings, for the pages."""
+
+    def __init__(self, place: str | Path, watch: FarmWatch) -> None:
+        """Take the store's place, and how the farm is looked at."""
+        self._place, self._watch = place, watch
+        self._store = Store(place)
+        self._view: Kept[FarmView] = Kept(watch.look)
+        self._samples: dict[str, SceneSamples] = {}
+        self._walls: dict[str, Kept[list[int]]] = {}
+        self._lock = threading.Lock()
+
+    def state(self) -> dict[str, Any]:
+        """How far the farm is."""
+        view = self._view.get()
+        queue = None if isinstance(view.queue, NoQueue) else view.queue.status
+        return {
+            "store": self._store.storage.where,
+            "up": view.running is not None,
+            "scenes": [asdict(scene) | {"missing": scene.missing} for scene in view.scenes],
+            "queue": queue and {"queued": queue.queued, "running": queue.running, "workers": queue.workers},
+            "workers": [{"name": name, **asdict(each)} for name, each in sorted(view.activities.items())],
+            "waits": view.waits,
+            "failures": _failures(view),
+            "trainings": [asdict(training) | {"note": training.note} for training in view.trainings],
+        }
+
+    # --------------------------------------------------------------------------------------------------------- samples
+
+    def samples(self, scene_id: str) -> SceneSamples:
+        """The samples of a scene; raises NotThereError for one that is not in the store."""
+        with self._lock:
+            if scene_id not in self._samples:
+                if scene_id not in self._store.scene_ids():
+                    raise NotThereError(f"the store has no scene {scene_id}")
+                self._samples[scene_id] = found = SceneSamples(self._place, scene_id)
+                self._walls[scene_id] = Kept(found.look)
+            return self._samples[scene_id]
+
+    def wall(self, scene_id: str) -> dict[str, Any]:
+        """The samples that landed last, and the maps of noise and cost."""
+        found = self.samples(scene_id)
+        rows = self._walls[scene_id].get()
+        return {"rows": rows, "map": found.mapped(self._cost_of(scene_id))}
+
+    def about(self, scene_id: str, row: int) -> dict[str, Any]:
+        """One sample in figures."""
+        return self.samples(scene_id).about(row) | {"core_s": self._cost_of(scene_id)(row)}
+
+    def _cost_of(self, scene_id: str) -> Callable[[int], float | None]:
+        """A function that gives the core-seconds of a sample in a row: its share of its job's."""
+        self._view.get()
+        costs, plans = self._watch.costs(scene_id), self._store.scene(scene_id).plans()
+
+        def cost(row: int) -> float | None:
+            found = costs.get(row // plans[0].shard_rows)
+            return None if found is None else found.core_s / plans[0].shard_rows
+
+        return cost
+
+    # ------------------------------------------------------------------------------------------------------------ runs
+
+    def curves(self) -> list[dict[str, Any]]:
+        """The curves of all runs: held-out error and loss by step and by seconds."""
+        self._view.get()
+        return [
+            {
+                "run": run.folder.name,
+                "validations": _thinned(
+                    [
+                        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
+                        for r in list(run.records)
+                        if r.get("kind") == "validation"
+                    ]
+                ),
+                "losses": _thinned([[r["step"], _seconds(r), r["loss"]] for r in list(run.records) if _has_loss(r)]),
+                "steps": self._steps(run.folder),
+                **_shown(run.folder, self._steps(run.folder)),
+            }
+            for run in self._watch.runs
+        ]
+
+    def prediction(self, run: int, step: int) -> bytes:
+        """The picture of a run's predictions at a validation; raises NotThereError."""
+        runs = self._watch.runs
+        if run >= len(runs):
+            raise NotThereError(f"there is no run {run}")
+        try:
+            return (runs[run].folder / "views" / f"step-{step:08d}.png").read_bytes()
+        except OSError as error:
+            raise NotThereError(f"run {run} has no picture of step {step}") from error
+
+    @staticmethod
+    def _steps(folder: Path) -> list[int]:
+        """The validations that have pictures."""
+        try:
+            return sorted(
+                int(found[1]) for file in (folder / "views").iterdir() if (found := STEP.fullmatch(file.name))
+            )
+        except OSError:
+            return []
+        return sorted(int(found[1]) for name in names if (found := STEP.fullmatch(name)))
+
+
+def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
+    """The scene and the rows that a run's pictures show, as the last of them says."""
+    from PIL import Image
+
+    try:
+        with Image.open(folder / "views" / f"step-{steps[-1]:08d}.png") as picture:
+            text = picture.text
+        return {"scene_id": str(text["scene"]), "rows": [int(row) for row in text["rows"].split()]}
+    except (OSError, IndexError, AttributeError, KeyError, ValueError):
+        return {"scene_id": None, "rows": []}
+
+
+def _failures(view: FarmView) -> list[dict[str, Any]]:
+    now = [] if isinstance(view.queue, NoQueue) else view.queue.causes
+    return [
+        {"cause": cause.cause, "jobs": len(cause.jobs), "now": is_now}
+        for causes, is_now in ((now, True), (view.queue.kept, False))
+        for cause in causes
+    ]
+
+
+def _seconds(record: dict[str, Any]) -> float:
+    """How long a run had been at it when it wrote a record."""
+    return float(sum(record.get("seconds", {}).values()))
+
+
+def _has_loss(record: dict[str, Any]) -> bool:
+    return record.get("kind") == "train" and isinstance(record.get("loss"), float)
+
+
+def _thinned(points: list[list[Any]]) -> list[list[Any]]:
+    """At most CURVE_POINTS of the points, evenly, with the first and the last one."""
+    if len(points) <= CURVE_POINTS:
+        return points
+    return [points[i * (len(points) - 1) // (CURVE_POINTS - 1)] for i in range(CURVE_POINTS)]

@@ -1,0 +1,96 @@
+"""Pictures and points of samples, as browsers take them. For display only.
+
+Shape letters: H W image, N points.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.shared.core import pictures
+from photonfarm.shared.core.pictures import Picture
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.sample_costs import FLOOR
+
+POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("seen", "u1")])
+"""A point as the script reads it: 16 bytes."""
+
+NOISY = 1.0
+"""The relative noise that is drawn brightest."""
+
+_COLOURS = np.array([[13, 8, 40], [86, 20, 110], [187, 55, 84], [249, 142, 9], [252, 255, 164]], np.float64)
+"""Stops of the colour scale of maps, from little to much."""
+
+NORMALS = ("normal", "mean_normal", "beyond_normal")
+REFLECTANCES = ("albedo", "specular", "throughput", "beyond_albedo")
+
+
+def encoded(picture: Picture, kind: Literal["PNG", "JPEG"] = "PNG") -> bytes:
+    """A picture as a file's bytes: PNG is exact, and JPEG takes a tenth of the time."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    image = Image.fromarray(picture)
+    if kind == "JPEG":
+        image.save(stream, "JPEG", quality=88)
+    else:
+        image.save(stream, "PNG", compress_level=3)
+    return stream.getvalue()
+
+
+def of_array(name: str, values: F32, exposure: float) -> Picture:
+    """A buffer or guide, (H, W) or (H, W, 3), by its name: normals, reflectances, distances, α, else radiance."""
+    if name in NORMALS:
+        return pictures.of_normal(values)
+    if name in REFLECTANCES:
+        return pictures.of_albedo(values)
+    if name == "roughness":
+        return np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
+    return pictures.of_depth(values) if values.ndim == 2 else pictures.display(values, exposure)
+
+
+def noise(halves: F32) -> F32:
+    """Relative noise of the mean of A and B at each pixel, (H, W): a standard deviation over local brightness.
+
+    Both are means over 3 × 3 pixels; (A − B)²/4 is the variance of (A + B)/2 in expectation.
+    """
+    a, b = halves.astype(np.float64)
+    variance, bright = _smoothed(((a - b) ** 2 / 4).mean(axis=2)), _smoothed(((a + b) / 2).mean(axis=2))
+    return (np.sqrt(variance) / (bright + FLOOR * max(bright.mean(), 1e-12))).astype(np.float32)
+
+
+def of_noise(halves: F32) -> Picture:
+    """The noise map as a picture: dark without noise, bright where the noise is as large as the light."""
+    place = np.clip(noise(halves) / NOISY, 0, 1) * (len(_COLOURS) - 1)
+    stops = np.arange(len(_COLOURS))
+    return np.stack([np.interp(place, stops, _COLOURS[:, i]) for i in range(3)], axis=2).round().astype(np.uint8)
+
+
+def packed(position: F32, colour: Picture, seen: NDArray[np.bool_]) -> bytes:
+    """Points (N, 3) with colours (N, 3) and whether the view sees them (N,), as bytes."""
+    points = np.zeros(len(position), POINT)
+    points["position"], points["colour"], points["seen"] = position, colour, seen
+    return points.tobytes()
+
+
+def point_colours(albedo: F32, emission: F32) -> Picture:
+    """The colours (N, 3) of points: their reflectance, and white-hot where they emit."""
+    return pictures.of_albedo(np.clip(albedo + emission, 0, 1)[None])[0]
+
+
+def photon_colours(power: F32) -> Picture:
+    """The colours (N, 3) of photons: their power's, the brightest hundredth at full brightness."""
+    bright = np.percentile(power.max(axis=1), 99) if len(power) else 1.0
+    return pictures.display(power[None], 1 / max(float(bright), 1e-12))[0]
+
+
+def _smoothed(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean over 3 × 3 pixels, edges repeated."""
+    wide = np.pad(image, 1, mode="edge")
+    rows = wide[:-2] + wide[1:-1] + wide[2:]
+    mean: NDArray[np.float64] = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9
+    return mean

@@ -1,0 +1,152 @@
+"""The server of the pages: GET and HEAD of what the table of routes has, and nothing else.
+
+It serves one machine's user, so it listens on this machine alone unless told otherwise, and answers only to names of
+its own, so that no other site's page can ask it (by a name that leads here).
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.web.farm_pages import FarmPages
+from photonfarm.web.samples import NotThereError
+
+STATIC = Path(__file__).parent / "static"
+KINDS = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+}
+IDLE_S = 30.0
+"""How long a browser may leave a connection idle."""
+
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+PNG, JPEG, JSON, BYTES = "image/png", "image/jpeg", "application/json", "application/octet-stream"
+_SCENE, _ROW = "([0-9a-f]{32})", "([0-9]{1,12})"
+
+Answer = tuple[str, bytes]  # its type and its content
+
+log = logging.getLogger(__name__)
+
+
+def routes(pages: FarmPages) -> list[tuple[re.Pattern[str], bool, Callable[..., Answer]]]:
+    """What is served: patterns of paths, whether an answer stays the same, and functions of the patterns' groups."""
+
+    def document(make: Callable[..., Any]) -> Callable[..., Answer]:
+        return lambda *groups: (JSON, json.dumps(make(*groups), allow_nan=False, default=str).encode())
+
+    def file(path: Path) -> Callable[[], Answer]:
+        return lambda: (KINDS[path.suffix], path.read_bytes())
+
+    table: list[tuple[str, bool, Callable[..., Answer]]] = [
+        ("/", False, file(STATIC / "index.html")),
+        *((f"/{path.name}", False, file(path)) for path in sorted(STATIC.iterdir()) if path.suffix in KINDS),
+        ("/api/state", False, document(pages.state)),
+        ("/api/curves", False, document(pages.curves)),
+        (f"/api/wall/{_SCENE}", False, document(pages.wall)),
+        (f"/api/sample/{_SCENE}/{_ROW}", False, document(lambda scene, row: pages.about(scene, int(row)))),
+        (f"/sample/{_SCENE}/{_ROW}/thumbnail.jpg", True, lambda s, row: (JPEG, pages.samples(s).thumbnail(int(row)))),
+        (f"/sample/{_SCENE}/{_ROW}/points", True, lambda s, row: (BYTES, pages.samples(s).points(int(row)))),
+        (f"/sample/{_SCENE}/{_ROW}/photons", True, lambda s, row: (BYTES, pages.samples(s).photons(int(row)))),
+        (f"/sample/{_SCENE}/{_ROW}/reference.png", False,
+         lambda s, row: (PNG, pages.samples(s).picture(int(row), "reference"))),
+        (f"/sample/{_SCENE}/{_ROW}/([a-z_]{{1,20}}).png", True,
+         lambda s, row, name: (PNG, pages.samples(s).picture(int(row), name))),
+        ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
+    ]  # fmt: skip
+    return [(re.compile(pattern.replace(".", r"\.") if "(" not in pattern else pattern), stays, make)
+            for pattern, stays, make in table]  # fmt: skip
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "photonfarm", ""
+    timeout = IDLE_S
+
+    def do_GET(self) -> None:
+        """Answer with what the path names."""
+        if not self._is_asked_by_name():
+            self._refuse(HTTPStatus.FORBIDDEN, "this server answers only to its own name")
+            return
+        try:
+            path = urlsplit(self.path).path
+        except ValueError:
+            path = ""
+        for pattern, stays, make in self.server.routes:
+            if found := pattern.fullmatch(path):
+                self._answer(make, found.groups(), stays)
+                return
+        self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    do_HEAD = do_GET  # noqa: N815 - the library asks for these names
+
+    def _answer(self, make: Callable[..., Answer], groups: tuple[str, ...], stays: bool) -> None:
+        try:
+            kind, content = make(*groups)
+        except (NotThereError, IndexError) as error:
+            self._refuse(HTTPStatus.NOT_FOUND, str(error))
+        except (PhotonfarmError, OSError) as error:
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
+        except Exception:
+            log.exception("%s failed", self.path)
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, "this failed here; the server's log says why")
+        else:
+            self._send(HTTPStatus.OK, kind, content, "private, max-age=86400" if stays else "no-store")
+
+    def _refuse(self, status: HTTPStatus, sentence: str) -> None:
+        self._send(status, JSON, json.dumps({"error": sentence}).encode(), "no-store")
+
+    def _send(self, status: HTTPStatus, kind: str, content: bytes, keep: str) -> None:
+        self.send_response(status)
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", keep)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    def _is_asked_by_name(self) -> bool:
+        name = self.headers.get("Host", "")
+        bare = name.rpartition(":")[0] if re.search(r":[0-9]+$", name) else name
+        return bare.lower() in self.server.names
+
+    def log_message(self, template: str, *values: Any) -> None:
+        """Log a request, for those who debug."""
+        log.debug(template, *values)
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves the pages of a farm until `shutdown`."""
+
+    daemon_threads = True
+
+    def __init__(self, pages: FarmPages, host: str, port: int, names: tuple[str, ...] = ()) -> None:
+        """Listen; raises OSError if that is impossible. It answers to `names` besides its host's and this machine's."""
+        self.routes = routes(pages)
+        self.names = {*LOCAL_NAMES, host.lower(), *(name.lower() for name in names)}
+        super().__init__((host, port), _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
+        """Log a connection that broke off."""
+        log.debug("a connection broke off", exc_info=True)

@@ -130,8 +130,8 @@ class FarmPages:
                     ]
                 ),
                 "losses": _thinned([[r["step"], _seconds(r), r["loss"]] for r in list(run.records) if _has_loss(r)]),
-                "steps": self._steps(run.folder),
-                **_shown(run.folder, self._steps(run.folder)),
+                "steps": _steps(run.folder),
+                **_shown(run.folder, _steps(run.folder)),
             }
             for run in self._watch.runs
         ]
@@ -146,16 +146,14 @@ class FarmPages:
         except OSError as error:
             raise NotThereError(f"run {run} has no picture of step {step}") from error
 
-    @staticmethod
-    def _steps(folder: Path) -> list[int]:
-        """The validations that have pictures."""
-        try:
-            return sorted(
-                int(found[1]) for file in (folder / "views").iterdir() if (found := STEP.fullmatch(file.name))
-            )
-        except OSError:
-            return []
-        return sorted(int(found[1]) for name in names if (found := STEP.fullmatch(name)))
+
+def _steps(folder: Path) -> list[int]:
+    """The validations of a run that have pictures."""
+    try:
+        names = [file.name for file in (folder / "views").iterdir()]
+    except OSError:
+        return []
+    return sorted(int(found[1]) for name in names if (found := STEP.fullmatch(name)))
 
 
 def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:

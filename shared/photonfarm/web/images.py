@@ -22,7 +22,7 @@ POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("seen", "u1")])
 NOISY = 1.0
 """The relative noise that is drawn brightest."""
 
-_COLOURS = np.array([[13, 8, 40], [86, 20, 110], [187, 55, 84], [249, 142, 9], [252, 255, 164]], np.float64)
+_COLOURS = np.array([[59, 28, 107], [138, 39, 120], [217, 81, 78], [252, 166, 54], [247, 232, 122]], np.float64)
 """Stops of the colour scale of maps, from little to much."""
 
 NORMALS = ("normal", "mean_normal", "beyond_normal")

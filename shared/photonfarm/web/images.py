@@ -16,8 +16,8 @@ from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.sample_costs import FLOOR
 
-POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("seen", "u1")])
-"""A point as the script reads it: 16 bytes."""
+POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("seen", "u1"), ("normal", "i1", 3), ("rest", "u1")])
+"""A point as the script reads it: 20 bytes; normals are 127 long."""
 
 NOISY = 1.0
 """The relative noise that is drawn brightest."""
@@ -70,10 +70,11 @@ def of_noise(halves: F32) -> Picture:
     return np.stack([np.interp(place, stops, _COLOURS[:, i]) for i in range(3)], axis=2).round().astype(np.uint8)
 
 
-def packed(position: F32, colour: Picture, seen: NDArray[np.bool_]) -> bytes:
-    """Points (N, 3) with colours (N, 3) and whether the view sees them (N,), as bytes."""
+def packed(position: F32, normal: F32, colour: Picture, seen: NDArray[np.bool_]) -> bytes:
+    """Points (N, 3) with normals and colours (N, 3), and whether the view sees them (N,), as bytes."""
     points = np.zeros(len(position), POINT)
     points["position"], points["colour"], points["seen"] = position, colour, seen
+    points["normal"] = np.round(127 * normal)
     return points.tobytes()
 
 

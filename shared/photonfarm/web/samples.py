@@ -24,7 +24,7 @@ WALL = 24
 AT_ONCE = 8
 """The most samples that a look adds to the wall: a fast farm makes more than anybody can see."""
 
-MAPPED = 2000
+MAPPED = 400
 """The most samples on the maps of noise and cost."""
 
 OPENED = 4
@@ -62,7 +62,15 @@ class SceneSamples:
             if len(new) > at_once:
                 new = new[np.linspace(0, len(new) - 1, at_once).astype(np.int64)]
             self._wall = deque([*kept, *new.tolist()], maxlen=WALL)
+            self._fill_maps()
             return list(reversed(self._wall))
+
+    def _fill_maps(self) -> None:
+        """Measure the noise of a few samples more, spread over all that are there, until the maps are full."""
+        rows = self._reader.rows
+        spread = rows[np.linspace(0, len(rows) - 1, min(len(rows), MAPPED)).astype(np.int64)]
+        for row in [row for row in spread.tolist() if row not in self._noise][:AT_ONCE]:
+            self._noted_noise(self._reader.read(row))
 
     # -------------------------------------------------------------------------------------------------------- pictures
 
@@ -101,7 +109,7 @@ class SceneSamples:
         sample, base = self._open(row), self._base_cloud()
         position, present = rebuild(base, sample.modification)
         colour = images.point_colours(base.albedo, base.emission)
-        return images.packed(position[present], colour[present], sample.visibility.points[present])
+        return images.packed(position[present], base.normal[present], colour[present], sample.visibility.points[present])
 
     def photons(self, row: int) -> bytes:
         """The photons of a sample's configuration, as `images.packed` has them; none for a scene without photons."""
@@ -110,7 +118,7 @@ class SceneSamples:
         sample, photons = self._open(row), self._reader.read_photons(row)
         there = photons.bounce >= 0
         colour = images.photon_colours(photons.power[there])
-        return images.packed(photons.position[there], colour, sample.visibility.photons[there])
+        return images.packed(photons.position[there], photons.normal[there], colour, sample.visibility.photons[there])
 
     # ------------------------------------------------------------------------------------------------------- in figures
 

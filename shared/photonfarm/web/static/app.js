@@ -68,7 +68,7 @@ function progress(state) {
       h("b", {}, `${count(run.step)} of ${count(run.steps)}`), ` steps`)),
     track(run.step, run.steps),
     h("div", { class: "figure" }, (run.ended ? `ended (${run.ended})` : run.phase ?? "not at work") + run.note)));
-  const shown = rates[current]?.length > 1 ? [spark(rates[current], "samples per second"),
+  const shown = rates[current]?.some((rate) => rate) ? [spark(rates[current], "samples per second"),
     h("p", { class: "note" }, "Throughput since this page was opened.")] : [];
   return card("half", "Progress", null, ...(scenes.length ? scenes : [h("p", { class: "note" }, "No scene is planned yet; ",
     "`photonfarm submit` or `photonfarm up` plans one.")]), ...trainings, ...shown);
@@ -76,7 +76,7 @@ function progress(state) {
 
 function workers(state) {
   const queue = state.queue ? `${state.queue.workers} workers, ${state.queue.queued} jobs queued, ${state.queue.running} running`
-    : "no farm is at work that this page could ask";
+    : "no farm is at work here; `photonfarm up`, or `photonfarm work` beside a Redis, goes on with what is missing";
   const list = state.workers.map((worker) => h("div", { class: "worker" }, h("span", {}, worker.name),
     worker.total ? track(worker.done, worker.total) : h("span", { class: "figure" }, "…"),
     h("span", { class: "figure" }, worker.total ? `${worker.done}/${worker.total}` : ""),
@@ -120,20 +120,21 @@ function maps(scene, found) {
     const [low, high] = [values[Math.floor(.02 * (values.length - 1))], values[Math.ceil(.98 * (values.length - 1))]];
     return h("div", {}, map(dots, found.axes, low, high, title, open), h("div", { class: "scale" }, `${short(low)}${unit}`, h("i"), `${short(high)}${unit}`));
   };
-  return [card("third", "Noise", "by where the camera stands", one("noise by camera position", 3, ""),
+  return [card("half", "Noise", "by where the camera stands", one("noise by camera position", 3, ""),
     h("p", { class: "note" }, "Standard deviation of the mean of A and B over local brightness. Each dot is a sample; a click opens it.")),
-  card("third", "Cost", "by where the camera stands", one("core-seconds by camera position", 4, " s"),
+  card("half", "Cost", "by where the camera stands", one("core-seconds by camera position", 4, " s"),
     h("p", { class: "note" }, "Core-seconds of a sample: an equal share of its job's."))];
 }
 
 function training(runs) {
-  const drawn = runs.map((run, place) => ({ place, points: run.validations.map(([step, , error, deviation]) => [step, error, deviation]) }));
-  if (!drawn.some(({ points }) => points.length)) return card("third", "Training", null, h("p", { class: "note" }, "No validation yet."));
+  const by = (axis) => runs.map((run, place) => ({ place, points: run.validations.map((each) => [each[axis], each[2], each[3]]) }));
+  if (!runs.some((run) => run.validations.length)) return card("half", "Training", null, h("p", { class: "note" }, "No validation yet."));
   const legend = runs.map((run, place) => {
     const last = run.validations.at(-1);
     return h("span", { class: `run-${place % 6}` }, last ? `${run.run}: ${last[2].toFixed(5)} at step ${count(last[0])}` : run.run);
   });
-  return card("third", "Training", "held-out error, noise removed", curves(drawn, "step"), h("div", { class: "legend" }, ...legend));
+  return card("half", "Training", "held-out error, noise removed; shaded: its standard error", curves(by(0), "step"),
+    curves(by(1), "seconds, with waiting"), h("div", { class: "legend" }, ...legend));
 }
 
 const chosen = {}; // the step of each run that is shown; none: the last one
@@ -152,7 +153,6 @@ function predictions(runs) {
     const references = h("div", { class: "pair" }, ...run.rows.map((row) => h("a", { href: `#/sample/${run.scene_id}/${row}` },
       h("img", { class: "whole", src: `sample/${run.scene_id}/${row}/reference.png`, alt: `reference of row ${row}`, title: `row ${row}` }))));
     references.style.setProperty("--columns", run.rows.length);
-    references.style.gap = "0";
     return card("half", `Predictions of ${run.run}`, "of views that training never sees",
       references, h("p", { class: "note" }, "Above: the mean of all passes of these views. Below: what the network makes of them."), picture,
       h("div", { class: "controls" }, h("input", { type: "range", min: 0, max: last, value: at, "aria-label": "step", oninput: (event) => {
@@ -177,8 +177,8 @@ async function farm() {
   const signature = JSON.stringify(runs.map((run) => [run.run, run.steps, run.rows]));
   if (held?.signature !== signature) held = { signature, cards: predictions(runs).filter(Boolean) };
   if (document.activeElement?.closest?.("form")) return state; // somebody is typing
-  main.replaceChildren(progress(state), workers(state), ...(current ? [drawWall(current, found.rows)] : []), ...held.cards,
-    ...(current ? maps(current, found.map) : []), training(runs));
+  main.replaceChildren(progress(state), workers(state), ...(current ? [drawWall(current, found.rows)] : []),
+    ...(runs.length ? [training(runs)] : []), ...held.cards, ...(current ? maps(current, found.map) : []));
   return state;
 }
 
@@ -215,12 +215,13 @@ async function sample(scene, row) {
         view.draw();
       } }), name)),
       h("label", {}, h("input", { type: "checkbox", onchange: (event) => { view.onlySeen = event.target.checked; view.draw(); } }), "only what the view sees"),
+      h("label", {}, h("input", { type: "checkbox", checked: true, onchange: (event) => { view.through = event.target.checked; view.draw(); } }), "walls from behind are left out"),
       h("button", { onclick: () => view.seeAsCamera() }, "as the camera"), h("button", { onclick: () => view.seeAll() }, "all of it")),
     h("p", { class: "note" }, "Drag turns, the wheel or two fingers zoom, Shift and drag slide. What the view does not see is dimmed.")),
     card("third", "Figures", null, h("table", {}, ...facts.map(([name, value]) => h("tr", {}, h("td", {}, name), h("td", {}, value))))));
   const view = new PointView(canvas, about);
-  view.load("points", `${base}/points`);
-  view.load("photons", `${base}/photons`);
+  await Promise.all(["points", "photons"].map((name) => view.load(name, `${base}/${name}`)));
+  view.seeAll();
 }
 
 // ------------------------------------------------------------------------------------------------------------ the loop

@@ -77,7 +77,7 @@ export function map(dots, axes, low, high, title, open) {
   const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
   const scale = (size - 2 * edge) / Math.max(x1 - x0, y1 - y0, 1e-6);
   const wide = (x1 - x0) * scale + 2 * edge, tall = (y1 - y0) * scale + 2 * edge;
-  const plot = s("svg", { viewBox: `0 0 ${wide.toFixed(0)} ${tall.toFixed(0)}`, class: "plot", role: "img", "aria-label": title });
+  const plot = s("svg", { viewBox: `0 0 ${wide.toFixed(0)} ${tall.toFixed(0)}`, class: "plot map", role: "img", "aria-label": title });
   plot.append(s("text", { x: wide / 2, y: tall - 4, "text-anchor": "middle" }, `${axes[0]}: ${short(x0)} … ${short(x1)}`),
     s("text", { x: 12, y: tall / 2, "text-anchor": "middle", transform: `rotate(-90 12 ${tall / 2})` }, `${axes[1]}: ${short(y0)} … ${short(y1)}`));
   for (const [row, x, y, value] of dots) {
@@ -93,9 +93,9 @@ export function map(dots, axes, low, high, title, open) {
 // A small line of values over time, from 0.
 export function spark(values, label) {
   const wide = 300, high = 46;
-  const plot = s("svg", { viewBox: `0 0 ${wide} ${high}`, class: "plot", role: "img", "aria-label": label });
+  const plot = s("svg", { viewBox: `0 0 ${wide} ${high}`, preserveAspectRatio: "none", class: "plot spark", role: "img", "aria-label": label });
   const most = Math.max(...values, 1e-9);
   const path = values.map((value, i) => `${i ? "L" : "M"}${((i / Math.max(values.length - 1, 1)) * wide).toFixed(1)} ${(high - 3 - (value / most) * (high - 8)).toFixed(1)}`);
-  plot.append(s("path", { class: "run run-0", d: path.join("") }));
+  plot.append(s("path", { class: "run run-0", d: path.join(""), "vector-effect": "non-scaling-stroke" }));
   return plot;
 }

@@ -1,16 +1,24 @@
 // Points in 3-D that a mouse or a finger turns, drawn by hand into an image: some ten thousand points need no more,
 // and it works on every machine, also where a browser has no graphics card to itself.
 
-const SIZE = 16; // bytes of a point: position as three float32, colour and whether it is seen as four uint8
+// The bytes of a point: position as three float32; colour, and whether it is seen, as four uint8; normal as three int8.
+const SIZE = 20, FLOATS = SIZE / 4, COLOUR = 12, SEEN = 15, NORMAL = 16;
 
 const sub = (a, b) => a.map((value, i) => value - b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
 
+// The middle 98 % of places along each axis: single points far away do not count.
+function extent({ place, count }) {
+  const sorted = [0, 1, 2].map((axis) => Float32Array.from({ length: count }, (_, i) => place[FLOATS * i + axis]).sort());
+  const at = (share) => sorted.map((values) => values[Math.floor(share * (count - 1))] ?? 0);
+  return [at(.01), at(.99)];
+}
+
 export class PointView {
   constructor(canvas, about) {
-    Object.assign(this, { canvas, about, clouds: {}, shown: { points: true, photons: true }, onlySeen: false, waiting: false });
+    Object.assign(this, { canvas, about, clouds: {}, shown: { points: true, photons: true }, onlySeen: false, through: true, waiting: false });
     this.up = about.up;
     // two axes across, so that yaw turns about `up`
     this.ahead = unit(cross(this.up, Math.abs(this.up[0]) > .5 ? [0, 1, 0] : [1, 0, 0]));
@@ -22,7 +30,11 @@ export class PointView {
 
   async load(name, address) {
     const bytes = await (await fetch(address)).arrayBuffer();
-    this.clouds[name] = { place: new Float32Array(bytes), colour: new Uint8Array(bytes), count: bytes.byteLength / SIZE };
+    const cloud = { place: new Float32Array(bytes), colour: new Uint8Array(bytes), normal: new Int8Array(bytes), count: bytes.byteLength / SIZE };
+    [cloud.low, cloud.high] = extent(cloud);
+    // some points lie on surfaces around all of it: so large, they nearly touch
+    cloud.radius = (name === "points" ? .4 : .1) * Math.hypot(...sub(cloud.high, cloud.low)) / Math.sqrt(cloud.count || 1);
+    this.clouds[name] = cloud;
     this.draw();
   }
 
@@ -38,15 +50,11 @@ export class PointView {
   seeAll() {
     const cloud = this.clouds.points ?? this.clouds.photons;
     if (!cloud?.count) return;
-    const low = [0, 0, 0].fill(Infinity), high = [0, 0, 0].fill(-Infinity);
-    for (let i = 0; i < cloud.count; i++)
-      for (let axis = 0; axis < 3; axis++) {
-        low[axis] = Math.min(low[axis], cloud.place[4 * i + axis]);
-        high[axis] = Math.max(high[axis], cloud.place[4 * i + axis]);
-      }
+    const { low, high } = cloud;
     this.middle = low.map((value, i) => (value + high[i]) / 2);
-    this.distance = 1.25 * Math.hypot(...sub(high, low));
-    this.pitch = .5;
+    this.distance = 1.2 * Math.hypot(...sub(high, low));
+    this.yaw += .7;
+    this.pitch = .6;
     this.draw();
   }
 
@@ -99,7 +107,7 @@ export class PointView {
   axes() {
     const level = Math.cos(this.pitch);
     const back = [0, 1, 2].map((i) => level * (Math.cos(this.yaw) * this.ahead[i] + Math.sin(this.yaw) * this.side[i]) + Math.sin(this.pitch) * this.up[i]);
-    const right = unit(cross(this.up, back)), down = cross(right, back).map((value) => value);
+    const right = unit(cross(this.up, back)), down = cross(right, back);
     return { back, right, down, eye: this.middle.map((value, i) => value + this.distance * back[i]) };
   }
 
@@ -119,29 +127,32 @@ export class PointView {
     pixels.fill(0xff130e0b);
     const axes = this.axes(), focal = .5 * wide / Math.tan((this.about.fov_deg * Math.PI) / 360);
     for (const name of ["points", "photons"])
-      if (this.shown[name] && this.clouds[name]) this.splat(this.clouds[name], name, { pixels, near, wide, high, focal, ratio, ...axes });
+      if (this.shown[name] && this.clouds[name]) this.splat(this.clouds[name], { pixels, near, wide, high, focal, ratio, ...axes });
     context.putImageData(image, 0, 0);
     this.paintCamera(context, { wide, high, focal, ...axes });
   }
 
-  splat({ place, colour, count }, name, { pixels, near, wide, high, focal, ratio, eye, right, down, back }) {
-    const least = this.distance * .02, base = name === "points" ? .0085 : .004;
+  splat({ place, colour, normal, count, radius }, { pixels, near, wide, high, focal, ratio, eye, right, down, back }) {
+    const least = this.distance * .02;
     for (let i = 0; i < count; i++) {
-      const seen = colour[16 * i + 15];
+      const at = SIZE * i, seen = colour[at + SEEN];
       if (this.onlySeen && !seen) continue;
-      const x = place[4 * i] - eye[0], y = place[4 * i + 1] - eye[1], z = place[4 * i + 2] - eye[2];
+      const x = place[FLOATS * i] - eye[0], y = place[FLOATS * i + 1] - eye[1], z = place[FLOATS * i + 2] - eye[2];
+      if (this.through && x * normal[at + NORMAL] + y * normal[at + NORMAL + 1] + z * normal[at + NORMAL + 2] > 0) continue;
       const depth = -(x * back[0] + y * back[1] + z * back[2]);
       if (depth < least) continue;
       const across = wide / 2 + (focal * (x * right[0] + y * right[1] + z * right[2])) / depth;
       const below = high / 2 + (focal * (x * down[0] + y * down[1] + z * down[2])) / depth;
-      const half = Math.min(6, Math.max(.8 * ratio, (focal * base * this.distance) / depth / 2));
-      const x0 = Math.max(0, Math.round(across - half)), x1 = Math.min(wide - 1, Math.round(across + half) - 1);
-      const y0 = Math.max(0, Math.round(below - half)), y1 = Math.min(high - 1, Math.round(below + half) - 1);
-      const dim = seen || this.onlySeen ? 1 : .55;
-      const value = 0xff000000 | ((colour[16 * i + 14] * dim) << 16) | ((colour[16 * i + 13] * dim) << 8) | (colour[16 * i + 12] * dim);
-      for (let row = y0; row <= y1; row++)
-        for (let at = row * wide + x0; at <= row * wide + x1; at++)
-          if (depth < near[at]) { near[at] = depth; pixels[at] = value; }
+      const r = Math.min(12 * ratio, Math.max(.8 * ratio, (focal * radius) / depth));
+      const x0 = Math.max(0, Math.ceil(across - r)), x1 = Math.min(wide - 1, Math.floor(across + r));
+      const y0 = Math.max(0, Math.ceil(below - r)), y1 = Math.min(high - 1, Math.floor(below + r));
+      const dim = seen || this.onlySeen ? 1 : .5;
+      const value = 0xff000000 | ((colour[at + COLOUR + 2] * dim) << 16) | ((colour[at + COLOUR + 1] * dim) << 8) | (colour[at + COLOUR] * dim);
+      for (let row = y0; row <= y1; row++) {
+        const over = r * r - (row - below) ** 2;
+        for (let column = x0, pixel = row * wide + x0; column <= x1; column++, pixel++)
+          if (depth < near[pixel] && (column - across) ** 2 <= over) { near[pixel] = depth; pixels[pixel] = value; }
+      }
     }
   }
 

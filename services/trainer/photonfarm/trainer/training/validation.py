@@ -18,6 +18,9 @@ from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, meas
 Show = Callable[[int, tuple[int, ...], F32, F32], None]
 """A callback with the step, rows of the store, and their targets and predictions."""
 
+SHOWN = 4
+"""The least samples of a validation that are shown, if it has so many."""
+
 WORSE = 0.1
 """The share of the best error by which a validation may be worse: less is noise of a learning rate still high."""
 
@@ -55,7 +58,7 @@ class Validation:
 def validate(
     predict: Predictor, step: int, found: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
 ) -> Validation:
-    """Measure a network over held-out samples; `show` gets targets and predictions of the first batch.
+    """Measure a network over held-out samples; `show` gets targets and predictions of the first `SHOWN` or more.
 
     The linear loss weights all light alike. A network with another loss is compared by the error of light up to white:
     that loss gives less weight to lamps in view, which make up most of the error of all light.
@@ -63,20 +66,24 @@ def validate(
     Raises IncompleteError if there is no sample.
     """
     rows: list[int] = []
+    shown: list[tuple[tuple[int, ...], F32, F32]] = []
 
     def noted() -> Iterator[TrainingBatch]:
         for batch in found:
             rows.extend(batch.rows)
             yield batch
 
-    def predict_and_show(batch: TrainingBatch) -> F32:
+    def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
-        if show is not None and rows == list(batch.rows):
-            show(step, batch.rows, batch.target.mean(dim=1).cpu().numpy(), images)
+        if show is not None and len(shown) * len(batch.rows) < SHOWN:
+            shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images
 
     with np.errstate(invalid="ignore", over="ignore"):  # overflows of a diverged network, which is reported as such
-        held_out = measure(predict_and_show, noted())
+        held_out = measure(predict_and_keep, noted())
+    if show is not None:
+        targets, predictions = (np.concatenate(each) for each in list(zip(*shown, strict=True))[1:])
+        show(step, tuple(row for each, *_ in shown for row in each), targets, predictions)
     return Validation(step, tuple(rows), held_out, ALL_LIGHT if loss == "linear" else UP_TO_WHITE)
 
 

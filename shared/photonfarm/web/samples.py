@@ -109,7 +109,9 @@ class SceneSamples:
         sample, base = self._open(row), self._base_cloud()
         position, present = rebuild(base, sample.modification)
         colour = images.point_colours(base.albedo, base.emission)
-        return images.packed(position[present], base.normal[present], colour[present], sample.visibility.points[present])
+        return images.packed(
+            position[present], base.normal[present], colour[present], sample.visibility.points[present]
+        )
 
     def photons(self, row: int) -> bytes:
         """The photons of a sample's configuration, as `images.packed` has them; none for a scene without photons."""

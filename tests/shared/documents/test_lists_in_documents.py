@@ -20,6 +20,7 @@ DISTRIBUTIONS = {
     "## shared": "shared/photonfarm/shared",
     "## photonfarm.data": "shared/photonfarm/data",
     "## photonfarm.export": "shared/photonfarm/export",
+    "## photonfarm.web": "shared/photonfarm/web",
     "## services/renderer": "services/renderer/photonfarm/renderer",
     "## services/trainer": "services/trainer/photonfarm/trainer",
     "## bench": "bench",

@@ -136,7 +136,9 @@ def top_up(
               help="With --watch: folder of a training run; may be repeated.")  # fmt: skip
 @click.option("--watch", is_flag=True, help="Keep showing it, with rates and time left, until Ctrl-C.")
 @json_option
-def status(store: str | Path, redis_url: str, runs: tuple[Path, ...], watch: bool, as_json: bool) -> None:
+def status(
+    store: str | Path, redis_url: str, runs: tuple[Path, ...] = (), watch: bool = False, as_json: bool = False
+) -> None:
     """Show what is planned, committed, queued and failed.
 
     Where `photonfarm up` is at work on the store here, its queue is shown, unless --redis names another.
@@ -156,10 +158,10 @@ def status(store: str | Path, redis_url: str, runs: tuple[Path, ...], watch: boo
     scenes, running = store_status(opened), running_farm(opened)
     url = redis_url if named or running is None else running.redis_url
     if as_json:
-        show_status.document(scenes, queue_of(opened, url, expects_redis=named), store, running)
+        show_status.document(scenes, queue_of(opened, url), store, running)
     else:
         show_status.scenes(scenes)  # before Redis is asked, which may not answer
-        show_status.queue(queue_of(opened, url, expects_redis=named), scenes, store, running)
+        show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named)
     check_read(scenes)
 
 

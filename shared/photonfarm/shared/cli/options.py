@@ -64,7 +64,8 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
 
 def names_redis() -> bool:
     """Whether the user of the current command has named its Redis, in any way."""
-    return click.get_current_context().get_parameter_source("redis_url") is not ParameterSource.DEFAULT
+    context = click.get_current_context(silent=True)
+    return context is None or context.get_parameter_source("redis_url") is not ParameterSource.DEFAULT
 
 
 def _refuse_password(url: str) -> None:

@@ -63,14 +63,22 @@ def _guided(scene: SceneStatus) -> str:
 
 
 def queue(
-    found: StoreQueue | NoQueue, scenes: Sequence[SceneStatus], store: str | Path, running: RunningFarm | None
+    found: StoreQueue | NoQueue,
+    scenes: Sequence[SceneStatus],
+    store: str | Path,
+    running: RunningFarm | None,
+    *,
+    named_redis: bool,
 ) -> None:
-    """Print what the queue of a store with these scenes holds, or why nothing is known of it."""
+    """Print what the queue of a store with these scenes holds, or why nothing is known of it.
+
+    Unless a user has `named_redis`, a store without one is nothing to worry about.
+    """
     if running is not None:
         click.echo("`photonfarm up` is at work here" + (f"; watch it at {running.web}" if running.web else ""))
     missing = sum(scene.samples_planned - scene.samples_complete for scene in scenes)
     if isinstance(found, NoQueue):
-        click.echo(f"queue: {_without_redis(missing) if found.expected else found.reason}")
+        click.echo(f"queue: {found.reason if named_redis else _without_redis(missing)}")
     else:
         _known_queue(found, scenes, store, missing)
     _failures("failed before", found.kept, store)

@@ -62,7 +62,7 @@ def lines(view: FarmView) -> Iterator[str]:
 def _below(view: FarmView) -> Iterator[str]:
     """What workers and trainers do, and what waits for what."""
     if isinstance(view.queue, NoQueue):
-        yield "  no farm is at work here" if view.queue.expected else f"  {view.queue.reason}"
+        yield "  no farm is at work here" if not view.named_redis else f"  {view.queue.reason}"
     else:
         status = view.queue.status
         yield f"  {status.queued} jobs queued, {status.running} running, {status.workers} workers"

@@ -58,8 +58,12 @@ def running_farm(store: Store) -> RunningFarm | None:
     return found
 
 
+def _folder() -> Path:
+    return Path(tempfile.gettempdir(), f"photonfarm-{os.getuid()}-farms")
+
+
 def _file(store: Store) -> Path:
-    return Path(tempfile.gettempdir(), f"photonfarm-{os.getuid()}-farms", f"{store.store_id}.json")
+    return _folder() / f"{store.store_id}.json"
 
 
 def _is_ours(folder: Path) -> bool:

@@ -30,20 +30,16 @@ class NoQueue:
 
     reason: str
     kept: list[FailureCause] = field(default_factory=list)
-    expected: bool = False  # there need be no Redis: `photonfarm up` brings its own, and does not run here now
 
 
-def queue_of(store: Store, redis_url: str, *, expects_redis: bool = True) -> StoreQueue | NoQueue:
-    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone.
-
-    Without `expects_redis`, nobody has named the Redis, and a store without one is nothing to worry about.
-    """
+def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
+    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone."""
     try:
         with queue.connect(redis_url, only_s=ANSWER_S) as connection:
             queue.check_served(connection, store)
             found = queue.queue_status(connection)
     except QueueError as error:
-        return NoQueue(str(error), queue.causes(_kept(store)), expected=not expects_redis)
+        return NoQueue(str(error), queue.causes(_kept(store)))
     failed = {name: failure for name, failure in found.failed.items() if is_missing(store, name)}
     kept = {name: failure for name, failure in _kept(store).items() if name not in failed}
     return StoreQueue(found, queue.causes(failed), queue.causes(kept))

@@ -63,6 +63,7 @@ class FarmView:
     queue: StoreQueue | NoQueue
     trainings: list[TrainingProgress]
     running: RunningFarm | None  # a `photonfarm up` of this machine that is at work on the store
+    named_redis: bool  # the user has named it; else none need be there, as `photonfarm up` brings its own
     waits: list[str]  # what waits for what, in sentences
 
     @property
@@ -118,7 +119,7 @@ class FarmWatch:
         """The farm now. Raises StoreError if the store is gone."""
         running = running_farm(self._store)
         url = self._redis_url if self._named_redis or running is None else running.redis_url
-        queue = queue_of(self._store, url, expects_redis=self._named_redis)
+        queue = queue_of(self._store, url)
         if not self._runs and running is not None and running.run:
             self._runs.append(RunFolder(Path(running.run)))
         activities = [] if isinstance(queue, NoQueue) else list(queue.status.activities.values())
@@ -128,7 +129,9 @@ class FarmWatch:
         trainings = [run.look() for run in self._runs]
         names = {scene.scene_id: scene.name for scene in scenes}
         why = list(waits(queue, names, sum(scene.missing for scene in scenes), trainings))
-        return FarmView(sorted(scenes, key=lambda scene: scene.scene_id), queue, trainings, running, why)
+        return FarmView(
+            sorted(scenes, key=lambda scene: scene.scene_id), queue, trainings, running, self._named_redis, why
+        )
 
     def _look_at(self, scene: SceneStore, activities: Sequence[Activity], workers: int) -> SceneView:
         seen = self._seen.setdefault(scene.scene_id, _Seen())

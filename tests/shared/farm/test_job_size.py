@@ -1,0 +1,62 @@
+"""How many samples a job has: seconds of work, and several jobs for every worker."""
+
+import pytest
+import store_samples as samples
+
+from photonfarm.shared.farm import job_size, submission
+from photonfarm.shared.farm.job_size import rows_per_job, sample_seconds
+from photonfarm.shared.plan.request import SHARD_ROWS, Request
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.shared.store import Store
+
+
+def spec_of(side: int, half_spp: int) -> SceneSpec:
+    return samples.small_spec(film={"width": side, "height": side}, transport={"half_spp": half_spp})
+
+
+def test_thirty_two_costly_samples_give_every_worker_several_jobs() -> None:
+    spec = spec_of(256, 64)
+    assert sample_seconds(spec) > job_size.MOST_S
+    assert rows_per_job(spec, Request(modifications=32), workers=2) == 1
+
+
+def test_jobs_of_a_large_plan_take_some_seconds() -> None:
+    for side, half_spp in ((64, 4), (128, 8), (256, 16), (512, 64)):
+        spec = spec_of(side, half_spp)
+        rows = rows_per_job(spec, Request(modifications=100_000), workers=8)
+        assert rows == 1 or rows * sample_seconds(spec) <= 1.5 * job_size.MOST_S
+        assert rows in (1, SHARD_ROWS) or rows * sample_seconds(spec) >= job_size.LEAST_S
+
+
+def test_cheap_samples_of_a_small_plan_do_not_make_tiny_jobs() -> None:
+    spec = spec_of(8, 1)
+    assert rows_per_job(spec, Request(modifications=32), workers=8) * sample_seconds(spec) >= 0.9 * job_size.LEAST_S
+
+
+def test_a_configuration_is_not_split_over_jobs_if_one_holds_it() -> None:
+    request = Request(modifications=1000, views_per_modification=3, passes=2)
+    assert rows_per_job(spec_of(64, 4), request, workers=2) % 6 == 0
+
+
+def test_the_first_plan_fixes_the_size_and_a_later_one_asks_for_no_other(store: Store) -> None:
+    spec = spec_of(256, 64)
+    named = NamedSpec("small", spec, None)
+    submission.submit(named, store.root, None, Request(modifications=4), workers=2)
+    scene = Store(store.root).scene(spec.scene_id)
+    assert scene.plans()[0].shard_rows == 1
+    submission.submit(named, store.root, None, Request(modifications=9), workers=64)
+    assert [plan.shard_rows for plan in scene.plans()] == [1, 1]
+
+
+@pytest.mark.parametrize("shard_rows", [1, 5, 32])
+def test_what_a_user_asks_for_comes_first_and_names_the_same_samples(store: Store, shard_rows: int) -> None:
+    named = NamedSpec("small", spec_of(8, 1), None)
+    request = Request(modifications=7, views_per_modification=2)
+    submission.submit(named, store.root, None, request, shard_rows=shard_rows)
+    (plan,) = Store(store.root).scene(named.spec.scene_id).plans()
+    assert plan.shard_rows == shard_rows
+    other = Store(f"{store.root}-2", create=True)
+    (usual,) = other.scene(other.plan(named.spec, request).scene_id).plans()
+    keys = [each.rows.sample_key[each.rows.sample_pass >= 0].tolist() for each in (plan, usual)]
+    assert keys[0] == keys[1]

@@ -196,6 +196,7 @@ async function sample(scene, row) {
       h("figcaption", {}, name === "reference" ? `mean of ${about.passes} passes` : words(name)));
     return figure;
   });
+  const said = h("p", { class: "note" });
   const canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": "points and photons in three dimensions; arrow keys turn them" });
   const facts = [
     ["row", about.row], ["key", about.key], ["pass", `${about.pass} of ${about.passes}`],
@@ -217,10 +218,14 @@ async function sample(scene, row) {
       h("label", {}, h("input", { type: "checkbox", onchange: (event) => { view.onlySeen = event.target.checked; view.draw(); } }), "only what the view sees"),
       h("label", {}, h("input", { type: "checkbox", checked: true, onchange: (event) => { view.through = event.target.checked; view.draw(); } }), "walls from behind are left out"),
       h("button", { onclick: () => view.seeAsCamera() }, "as the camera"), h("button", { onclick: () => view.seeAll() }, "all of it")),
-    h("p", { class: "note" }, "Drag turns, the wheel or two fingers zoom, Shift and drag slide. What the view does not see is dimmed.")),
+    said, h("p", { class: "note" }, "Drag turns, the wheel or two fingers zoom, Shift and drag slide. What the view does not see is dimmed.")),
     card("third", "Figures", null, h("table", {}, ...facts.map(([name, value]) => h("tr", {}, h("td", {}, name), h("td", {}, value))))));
   const view = new PointView(canvas, about);
-  await Promise.all(["points", "photons"].map((name) => view.load(name, `${base}/${name}`)));
+  try {
+    await Promise.all(["points", "photons"].map((name) => view.load(name, `${base}/${name}`)));
+  } catch (error) {
+    said.textContent = error.message;
+  }
   view.seeAll();
 }
 

@@ -29,7 +29,9 @@ export class PointView {
   }
 
   async load(name, address) {
-    const bytes = await (await fetch(address)).arrayBuffer();
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    const bytes = await answer.arrayBuffer();
     const cloud = { place: new Float32Array(bytes), colour: new Uint8Array(bytes), normal: new Int8Array(bytes), count: bytes.byteLength / SIZE };
     [cloud.low, cloud.high] = extent(cloud);
     // some points lie on surfaces around all of it: so large, they nearly touch

@@ -237,6 +237,21 @@ def test_the_marker_tells_what_the_job_cost_and_which_versions_rendered_it(
     assert {"mitsuba", "drjit", "numpy", "zarr"} <= figures["versions"].keys()
 
 
+def test_a_job_tells_its_phases_and_each_sample_and_only_the_first_compiles(
+    scene: SceneStore, store: Store, recorded: type
+) -> None:
+    told: list[tuple[str, int, int]] = []
+    renderer = ShardRenderer(store, worker="test", load=recorded.load, on_progress=lambda *said: told.append(said))
+    for job in (0, 1):
+        told.clear()
+        renderer.render(scene.scene_id, job)
+        count = len(scene.job_rows(job).samples)
+        first = render.COMPILES if job == 0 else render.RENDERS_SAMPLES
+        loads = [(render.LOADS, 0, 0)] if job == 0 else []
+        steps = [(first if done == 0 else render.RENDERS_SAMPLES, done, count) for done in range(count)]
+        assert told == [*loads, *steps, (render.COMMITS, count, count)]
+
+
 def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded: type) -> None:
     renderer = ShardRenderer(store, worker="test", load=recorded.load)
     ids = [

@@ -4,11 +4,14 @@ import json
 import re
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker import heartbeat
 from photonfarm.renderer.worker.heartbeat import HeartbeatThread
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
@@ -100,6 +103,9 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
         names[0]: (3, True),
         names[1]: (1, False),
     }
+    kept = queue.kept_failures(Store(root), lambda _: True)
+    assert {name: failure.times for name, failure in kept.items()} == {names[0]: 1, names[1]: 1}
+    assert kept[names[1]].reason == failed[names[1]].reason
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 
@@ -204,6 +210,33 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
     status.callback(tmp_path / "store", redis_server.url, as_json=False)
     assert "takes no jobs" not in capsys.readouterr().out
     queue.bury(connection, "ada")
+
+
+def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
+    scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(heartbeat, "REPORT_S", 0.02)
+    connection = connect(redis_server.url)
+    settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
+    heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
+    heart.start()
+    name = job_name(scene.scene_id, 0)
+    with heart.working(name):
+        heart.doing("renders samples", 3, 8)
+        wanted = {"ada": queue.Activity("renders samples", 3, 8, 3, name)}
+        assert _once(lambda: queue_status(connection).activities == wanted)
+        heart.doing(jobs.RENDERS_GUIDES, 5, 8)
+        assert _once(lambda: queue_status(connection).activities["ada"].samples == 0)
+    assert _once(lambda: not queue_status(connection).activities)
+    heart.end()
+    queue.bury(connection, "ada")
+
+
+def _once(look: Callable[[], bool], seconds: float = 10.0) -> bool:
+    end = time.monotonic() + seconds
+    while not (found := look()) and time.monotonic() < end:
+        time.sleep(0.02)
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------- the wrong store

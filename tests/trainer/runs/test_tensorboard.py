@@ -32,7 +32,10 @@ def trained(source: Any, settings: Any, run: Path, then: Callable[[dict[str, Any
             source,
             settings,
             run,
-            Hooks(on_record=lambda record: [board.record(record), then(record)], on_images=board.pictures),
+            Hooks(
+                on_record=lambda record: [board.record(record), then(record)],
+                on_images=lambda step, _rows, *shown: board.pictures(step, *shown),
+            ),
         )
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.text import Text
 
 from photonfarm.shared.core.durations import in_words
 from photonfarm.shared.farm.up import FarmProgress
@@ -35,29 +37,32 @@ class FarmTalk:
         """A function that moves the bars, or prints a line now and then, and the last one in any case."""
         last_line = started = time.monotonic()
         told: set[str] = set()
-        with _bars(self._console) as bars:
-            samples = bars.add_task("samples", total=None)
-            passes = bars.add_task("further passes", total=None, visible=False)
-            training = bars.add_task("training steps", total=steps, visible=steps > 0)
-            workers = bars.add_task("", total=None, visible=False)
+        bars, below = _bars(), Text()
+        samples = bars.add_task("samples", total=None)
+        passes = bars.add_task("further passes", total=None, visible=False)
+        training = bars.add_task("training steps", total=steps, visible=steps > 0)
 
-            def show(found: FarmProgress, last: bool) -> None:
-                nonlocal last_line
-                for bar, (committed, planned) in ((samples, found.samples), (passes, found.passes)):
-                    first = (samples if found.samples[0] < found.samples[1] else passes) == bar
-                    done = min(committed + found.in_hand * first, planned)
-                    bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
-                bars.update(training, completed=found.step, description=f"training steps{found.note}")
-                bars.update(workers, description=found.doing, visible=bool(found.doing))
-                for wait in found.waits:
-                    if (kind := _NUMBER.sub("…", wait)) not in told:
-                        told.add(kind)
-                        self.say(wait)
-                now = time.monotonic()
-                if not self._console.is_terminal and (now - last_line >= PLAIN_LINE_S or last):
-                    last_line = now
-                    self.say(f"{now - started:4.0f} s  {progress_line(found, bars.tasks[samples].time_remaining)}")
+        def show(found: FarmProgress, last: bool) -> None:
+            nonlocal last_line
+            first = samples if found.samples[0] < found.samples[1] else passes  # what is in hand is of these
+            for bar, (committed, planned) in ((samples, found.samples), (passes, found.passes)):
+                done = min(committed + found.in_hand * (bar == first), planned)
+                bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
+            bars.update(training, completed=found.step)
+            below.plain = "\n".join(
+                filter(None, (found.doing.replace("; ", "\n"), f"training{found.note}" * bool(found.note)))
+            )
+            for wait in found.waits:
+                if (kind := _NUMBER.sub("…", wait)) not in told:
+                    told.add(kind)
+                    self.say(wait)
+            now = time.monotonic()
+            if not self._console.is_terminal and (now - last_line >= PLAIN_LINE_S or last):
+                last_line = now
+                self.say(f"{now - started:4.0f} s  {progress_line(found, bars.tasks[samples].time_remaining)}")
 
+        shown = Live(Group(bars, below), console=self._console) if self._console.is_terminal else nullcontext()
+        with shown:
             yield show
 
 
@@ -72,7 +77,7 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
     return f"samples {samples}/{planned}{in_hand}{left}{words}{training}{why}"
 
 
-def _bars(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+def _bars() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    return Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=PACE_S)
+    return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S)

@@ -54,7 +54,7 @@ def lines(view: FarmView) -> Iterator[str]:
             yield f"{now}  {scene.name} {scene.scene_id[:8]}: cannot be read: {scene.error}"
             continue
         in_hand = f" (+{scene.in_hand} in hand)" if scene.in_hand else ""
-        pace = f"{_rate(scene)}, {_left(scene)} left" if scene.missing else "all there"
+        pace = ", ".join(filter(None, (_rate(scene), _left(scene)))) if scene.missing else "all there"
         yield f"{now}  {scene.name} {scene.scene_id[:8]}: samples {_counted(scene)}{in_hand}, {pace}"
     yield from _below(view)
 
@@ -84,11 +84,9 @@ def _counted(scene: SceneView) -> str:
 
 def _rate(scene: SceneView) -> str:
     if scene.rate is None:
-        return "no pace yet" if scene.missing else ""
+        return ""
     return f"{scene.rate:.1f} samples/s" if scene.rate >= 1 else f"{60 * scene.rate:.1f} samples/min"
 
 
 def _left(scene: SceneView) -> str:
-    if not scene.missing:
-        return ""
-    return "?" if scene.left_s is None else in_words(scene.left_s)
+    return "" if scene.left_s is None else f"{in_words(scene.left_s)} left"

@@ -255,10 +255,12 @@ class _Farm:
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
         named = {self.scene.scene_id: self.scene.spec.name}
+        activities = status.activities if status else {}
+        missing = found.planned_samples - found.committed_samples
         return FarmProgress(
             samples, passes, trained.step, self.steps, trained.note,
-            sum(each.samples for each in status.activities.values()) if status else 0,
-            "; ".join(f"{name} {each}" for name, each in sorted(status.activities.items())) if status else "",
+            min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
+            "; ".join(f"{name} {each}" for name, each in sorted(activities.items())),
             tuple(waits(self._queue, named, 0)),
         )  # fmt: skip
 

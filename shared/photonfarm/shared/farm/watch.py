@@ -141,6 +141,7 @@ class FarmWatch:
         for job in sorted(committed - seen.jobs.keys()):
             _add(scene, job, seen)
         in_hand = sum(each.samples for each in activities if _is_of(each, scene.scene_id))
+        in_hand = min(in_hand, progress.planned_samples - progress.committed_samples)  # a report may be seconds old
         done = progress.committed_samples + in_hand
         rate = self._pace(seen, done)
         missing = progress.planned_samples - done

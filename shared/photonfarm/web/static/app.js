@@ -35,6 +35,12 @@ const perTime = (rate) => (rate >= 1 ? `${rate.toFixed(1)} samples/s` : `${(60 *
 const count = (number) => number.toLocaleString("en");
 const words = (name) => ({ a: "A", b: "B", mean: "mean of A and B" })[name] ?? name.replaceAll("_", " ");
 
+// A place on the page: filled anew only if something else belongs there, so that what is in use stays as it is.
+const places = Object.fromEntries(["progress", "workers", "wall", "training", "predictions", "maps"].map((name) => [name, h("div", { class: "place" })]));
+function fill(where, ...nodes) {
+  if (nodes.length !== where.children.length || nodes.some((node, i) => node !== where.children[i])) where.replaceChildren(...nodes);
+}
+
 function track(done, total, hand = 0) {
   const [bar, rest] = [h("i"), h("i", { class: "hand" })];
   bar.style.width = `${(100 * done) / (total || 1)}%`;
@@ -89,6 +95,7 @@ function workers(state) {
     list.length || waits.length || failures.length ? null : h("p", { class: "note" }, "Nothing waits for anything."));
 }
 
+const nothing = h("p", { class: "note" }, "None has landed yet.");
 let wall = null; // the section of what landed last, kept so that only what is new is drawn
 
 function drawWall(scene, rows) {
@@ -104,10 +111,10 @@ function drawWall(scene, rows) {
   for (const [row, element] of wall.rows) if (!rows.includes(row)) { element.remove(); wall.rows.delete(row); }
   for (const row of rows) {
     if (!wall.rows.has(row))
-      wall.rows.set(row, h("a", { href: `#/sample/${scene}/${row}`, class: first ? "" : "new" },
+      wall.rows.set(row, h("a", { href: `#/sample/${scene}/${row}`, class: first ? "" : "new", onanimationend: (event) => event.currentTarget.classList.remove("new") },
         h("img", { src: `sample/${scene}/${row}/thumbnail.jpg`, alt: `sample in row ${row}`, width: 128, height: 128 }), h("span", {}, row)));
   }
-  wall.grid.replaceChildren(...(rows.length ? rows.map((row) => wall.rows.get(row)) : [h("p", { class: "note" }, "None has landed yet.")]));
+  fill(wall.grid, ...(rows.length ? rows.map((row) => wall.rows.get(row)) : [nothing]));
   return wall.section;
 }
 
@@ -169,16 +176,20 @@ async function farm() {
   const scenes = state.scenes.filter((scene) => !scene.error);
   const asked = location.hash.match(/^#\/scene\/([0-9a-f]{32})$/)?.[1];
   current = scenes.find((scene) => scene.scene_id === asked)?.scene_id ?? scenes.find((scene) => scene.missing)?.scene_id ?? scenes[0]?.scene_id ?? null;
-  for (const scene of scenes) (rates[scene.scene_id] ??= []).push(scene.missing ? scene.rate ?? 0 : 0);
+  for (const scene of scenes) if (scene.rate !== null || !scene.missing) (rates[scene.scene_id] ??= []).push(scene.rate ?? 0);
   for (const values of Object.values(rates)) if (values.length > 600) values.shift();
   nav.replaceChildren(...(scenes.length > 1 ? scenes.map((scene) => h("a", { href: `#/scene/${scene.scene_id}`,
     "aria-current": scene.scene_id === current ? "page" : false }, scene.name)) : []));
   const found = current ? await ask(`api/wall/${current}`) : { rows: [], map: { axes: [], samples: [] } };
   const signature = JSON.stringify(runs.map((run) => [run.run, run.steps, run.rows]));
   if (held?.signature !== signature) held = { signature, cards: predictions(runs).filter(Boolean) };
-  if (document.activeElement?.closest?.("form")) return state; // somebody is typing
-  main.replaceChildren(progress(state), workers(state), ...(current ? [drawWall(current, found.rows)] : []),
-    ...(runs.length ? [training(runs)] : []), ...held.cards, ...(current ? maps(current, found.map) : []));
+  fill(places.progress, progress(state));
+  fill(places.workers, workers(state));
+  fill(places.wall, ...(current ? [drawWall(current, found.rows)] : []));
+  fill(places.training, ...(runs.length ? [training(runs)] : []));
+  fill(places.predictions, ...held.cards);
+  fill(places.maps, ...(current ? maps(current, found.map) : []));
+  fill(main, ...Object.values(places));
   return state;
 }
 

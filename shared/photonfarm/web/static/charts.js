@@ -37,7 +37,7 @@ export function curves(runs, label) {
   let low = Math.min(...all.map(([, y]) => y)), up = Math.max(...all.map(([, y]) => y));
   low /= 1.15; up *= 1.15;
   const X = (x) => left + (x / most) * (wide - left - right);
-  const Y = (y) => top + (Math.log(up / Math.max(y, low)) / Math.log(up / low)) * (high - top - bottom);
+  const Y = (y) => top + (Math.log(up / Math.min(Math.max(y, low), up)) / Math.log(up / low)) * (high - top - bottom);
   for (const tick of ticks(0, most, 6)) {
     plot.append(s("line", { class: "grid", x1: X(tick), x2: X(tick), y1: top, y2: high - bottom }),
       s("text", { x: X(tick), y: high - bottom + 16, "text-anchor": "middle" }, short(tick)));

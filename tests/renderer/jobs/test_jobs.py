@@ -246,10 +246,10 @@ def test_a_job_tells_its_phases_and_each_sample_and_only_the_first_compiles(
         told.clear()
         renderer.render(scene.scene_id, job)
         count = len(scene.job_rows(job).samples)
-        first = render.COMPILES if job == 0 else render.RENDERS_SAMPLES
-        loads = [(render.LOADS, 0, 0)] if job == 0 else []
-        steps = [(first if done == 0 else render.RENDERS_SAMPLES, done, count) for done in range(count)]
-        assert told == [*loads, *steps, (render.COMMITS, count, count)]
+        first = jobs.COMPILES if job == 0 else jobs.RENDERS_SAMPLES
+        loads = [(jobs.LOADS, 0, 0)] if job == 0 else []
+        steps = [(first if done == 0 else jobs.RENDERS_SAMPLES, done, count) for done in range(count)]
+        assert told == [*loads, *steps, (jobs.COMMITS, count, count)]
 
 
 def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded: type) -> None:

@@ -36,9 +36,15 @@ T = TypeVar("T")
 class Kept(Generic[T]):
     """A value that is made anew now and then, so that making it takes at most SHARE of the time."""
 
-    def __init__(self, make: Callable[[], T], *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Take the function that makes it."""
-        self._make, self._clock = make, clock
+    def __init__(
+        self,
+        make: Callable[[], T],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        work: Callable[[], float] = time.thread_time,
+    ) -> None:
+        """Take the function that makes it; `work` counts the seconds of a core that this takes."""
+        self._make, self._clock, self._work = make, clock, work
         self._lock = threading.Lock()
         self._due = 0.0
         self._value: T | None = None
@@ -46,11 +52,10 @@ class Kept(Generic[T]):
     def get(self) -> T:
         """The value, made anew if that is due; raises what making it raises."""
         with self._lock:
-            began = self._clock()
-            if self._value is None or began >= self._due:
+            if self._value is None or self._clock() >= self._due:
+                began = self._work()
                 self._value = self._make()
-                ended = self._clock()
-                self._due = ended + max(LEAST_S, (ended - began) / SHARE)
+                self._due = self._clock() + max(LEAST_S, (self._work() - began) / SHARE)
             return self._value
 
 

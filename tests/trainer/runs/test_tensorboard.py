@@ -55,7 +55,7 @@ def test_a_run_shows_its_records_and_pictures(make_source, tiny, run, monkeypatc
     pictures = events.Images("held out/target above prediction")
     assert [picture.step for picture in pictures] == [r["step"] for r in told]
     shown = np.asarray(Image.open(io.BytesIO(pictures[-1].encoded_image_string)))
-    assert shown.shape == (32, 3 * 16, 3)
+    assert shown.shape == (32, 4 * 16, 3)
 
 
 def test_what_was_shown_after_the_checkpoint_is_taken_back_when_the_run_goes_on(make_source, tiny, run) -> None:

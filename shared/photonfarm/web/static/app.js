@@ -77,12 +77,12 @@ function progress(state) {
   const shown = rates[current]?.some((rate) => rate) ? [spark(rates[current], "samples per second"),
     h("p", { class: "note" }, "Throughput since this page was opened.")] : [];
   return card("half", "Progress", null, ...(scenes.length ? scenes : [h("p", { class: "note" }, "No scene is planned yet; ",
-    "`photonfarm submit` or `photonfarm up` plans one.")]), ...trainings, ...shown);
+    "“photonfarm submit” or “photonfarm up” plans one.")]), ...trainings, ...shown);
 }
 
 function workers(state) {
   const queue = state.queue ? `${state.queue.workers} workers, ${state.queue.queued} jobs queued, ${state.queue.running} running`
-    : "no farm is at work here; `photonfarm up`, or `photonfarm work` beside a Redis, goes on with what is missing";
+    : "No farm is at work here. “photonfarm up”, or “photonfarm work” beside a Redis, goes on with what is missing.";
   const list = state.workers.map((worker) => h("div", { class: "worker" }, h("span", {}, worker.name),
     worker.total ? track(worker.done, worker.total) : h("span", { class: "figure" }, "…"),
     h("span", { class: "figure" }, worker.total ? `${worker.done}/${worker.total}` : ""),
@@ -210,7 +210,7 @@ async function sample(scene, row) {
   const said = h("p", { class: "note" });
   const canvas = h("canvas", { tabindex: 0, role: "img", "aria-label": "points and photons in three dimensions; arrow keys turn them" });
   const facts = [
-    ["row", about.row], ["key", about.key], ["pass", `${about.pass} of ${about.passes}`],
+    ["row", about.row], ["key", about.key], ["pass", `${about.pass}, of ${about.passes}`],
     ["samples per pixel", about.spp], ["noise", about.noise === null ? "the image is black" : `${(100 * about.noise).toFixed(1)} % of local brightness`],
     ["cost", about.core_s === null ? "not known" : `${about.core_s.toFixed(2)} core-seconds, its share of its job`],
     ["camera", numbers(about.origin)], ["looks at", numbers(about.target)], ["exposure", about.exposure],

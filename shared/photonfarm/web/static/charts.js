@@ -23,7 +23,7 @@ function ticks(low, high, count) {
 function logTicks(low, high) {
   const found = [];
   for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++)
-    for (const digit of [1, 2, 5]) if (digit * 10 ** power >= low && digit * 10 ** power <= high) found.push(digit * 10 ** power);
+    for (const digit of high > 300 * low ? [1] : [1, 2, 5]) if (digit * 10 ** power >= low && digit * 10 ** power <= high) found.push(digit * 10 ** power);
   return found;
 }
 
@@ -34,8 +34,9 @@ export function curves(runs, label) {
   const all = runs.flatMap((run) => run.points).filter(([, y]) => y > 0);
   if (!all.length) return plot;
   const most = Math.max(1, ...all.map(([x]) => x));
-  let low = Math.min(...all.map(([, y]) => y)), up = Math.max(...all.map(([, y]) => y));
-  low /= 1.15; up *= 1.15;
+  const ys = all.map(([, y]) => y).sort((a, b) => a - b);
+  // a run that went astray once, and went back, would leave no room for the rest: its peak is cut off
+  const low = ys[0] / 1.15, up = Math.min(ys.at(-1), 40 * ys[ys.length >> 1]) * 1.15;
   const X = (x) => left + (x / most) * (wide - left - right);
   const Y = (y) => top + (Math.log(up / Math.min(Math.max(y, low), up)) / Math.log(up / low)) * (high - top - bottom);
   for (const tick of ticks(0, most, 6)) {

@@ -54,7 +54,7 @@ export class PointView {
     if (!cloud?.count) return;
     const { low, high } = cloud;
     this.middle = low.map((value, i) => (value + high[i]) / 2);
-    this.distance = 1.2 * Math.hypot(...sub(high, low));
+    this.distance = .58 * Math.hypot(...sub(high, low)) / Math.tan((this.about.fov_deg * Math.PI) / 360);
     this.yaw += .7;
     this.pitch = .6;
     this.draw();

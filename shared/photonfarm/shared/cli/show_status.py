@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from photonfarm.shared.cli.show import print_json, print_table
-from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.running_farm import RunningFarm
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, lost_plan, unread_markers
 from photonfarm.shared.farm.waits import idle

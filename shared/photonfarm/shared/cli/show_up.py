@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.up import FarmProgress
 
 PLAIN_LINE_S = 5.0  # between progress lines where there is no terminal for bars

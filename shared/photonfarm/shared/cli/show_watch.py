@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.status import NoQueue
 from photonfarm.shared.farm.waits import failed
 from photonfarm.shared.farm.watch import FarmView, FarmWatch, SceneView

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.durations import in_words
 from photonfarm.shared.core.estimate import stated
+from photonfarm.shared.core.waiting import in_words
 
 METRICS = "metrics.jsonl"
 PROGRESS = "progress.json"

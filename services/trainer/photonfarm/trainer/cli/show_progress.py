@@ -13,7 +13,7 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from photonfarm.shared.core.durations import in_words
+from photonfarm.shared.core.waiting import in_words
 
 LINE_S = 5.0
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from photonfarm.shared.core.durations import in_words
 from photonfarm.shared.core.files import write_whole
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.trainer.runs.wait_times import TimeKind
 
 PROGRESS = "progress.json"

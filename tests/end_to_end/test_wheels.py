@@ -53,11 +53,13 @@ def test_the_installed_packages_are_those_of_the_wheels(python: Path, tmp_path: 
 
 def test_every_verb_and_the_ready_specs_are_there(python: Path, tmp_path: Path) -> None:
     listed = run(python, tmp_path, "-m", "photonfarm.shared.cli", "--help")
-    for verb in ("submit", "up", "work", "preview", "render", "train", "evaluate", "report", "store", "export"):
+    for verb in ("submit", "up", "work", "preview", "render", "train", "evaluate", "report", "store", "export", "web"):
         assert f"\n  {verb} " in listed
         run(python, tmp_path, "-m", "photonfarm.shared.cli", verb, "--help")
     assert "cornell" in run(python, tmp_path, "-m", "photonfarm.shared.cli", "scene", "show", "cornell")
     assert (python.parent / "photonfarm").is_file()
+    script = "from photonfarm.web.server import STATIC; print((STATIC / 'app.js').is_file())"
+    assert run(python, tmp_path, "-c", script).split() == ["True"]
 
 
 def test_an_installed_farm_plans_and_renders_a_sample(python: Path, tmp_path: Path) -> None:

@@ -4,7 +4,10 @@ import http.client
 import io
 import json
 import re
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,7 +22,9 @@ import pytest
 import store_samples as samples
 from PIL import Image, PngImagePlugin
 
+from photonfarm.shared.cli.main import main
 from photonfarm.shared.core import pictures
+from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.watch import FarmWatch
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import relative_variance
@@ -338,3 +343,30 @@ def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneSt
             )
             page.wait_for(f"{look} !== {json.dumps(before)}")
         assert page.errors == []
+
+
+# ------------------------------------------------------------------------------------------------------------ the verb
+
+
+def test_the_verb_takes_a_free_port_where_its_own_is_taken_and_ends_on_ctrl_c(scene: SceneStore) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        words = ["web", "--store", str(scene.folder.parent.parent), "--port", str(taken.getsockname()[1])]
+        command = [sys.executable, "-m", "photonfarm.shared.cli", *words]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
+            assert serving.stdout is not None
+            address = re.fullmatch(r"http://localhost:(\d+)/\n", serving.stdout.readline())
+            assert address
+            assert int(address[1]) != taken.getsockname()[1]
+            connection = http.client.HTTPConnection("127.0.0.1", int(address[1]), timeout=20)
+            connection.request("GET", "/api/state")
+            assert connection.getresponse().status == 200
+            connection.close()
+            serving.send_signal(signal.SIGINT)
+            assert serving.wait(10) == 0
+
+
+def test_the_verb_says_that_there_is_no_store(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["web", "--store", str(tmp_path / "none")])
+    assert ended.value.code == StoreError.exit_code
+    assert list(tmp_path.iterdir()) == []

@@ -228,6 +228,10 @@ def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
         heart.doing(jobs.RENDERS_GUIDES, 5, 8)
         assert _once(lambda: queue_status(connection).activities["ada"].samples == 0)
     assert _once(lambda: not queue_status(connection).activities)
+    heart.paused = "the disk is full"  # told at once, long before the next heartbeat
+    assert _once(lambda: queue_status(connection).idle_reports.paused == {"ada": "the disk is full"})
+    heart.paused = None
+    assert _once(lambda: not queue_status(connection).idle_reports.paused)
     heart.end()
     queue.bury(connection, "ada")
 

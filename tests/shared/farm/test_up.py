@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ import store_samples as samples
 from photonfarm.shared.cli.show_up import progress_line
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.farm import up
+from photonfarm.shared.farm.status import StoreQueue
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.queue import Activity, IdleReports, QueueStatus
 from photonfarm.shared.store import Store
 
 
@@ -29,6 +32,22 @@ def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path
     samples.commit(scene, 2, samples.outputs(scene, 2))
     assert (farm.look().samples, farm.look().passes) == ((4, 6), (4, 6))
     assert progress_line(farm.look()) == "samples 4/6  further passes 4/6  steps 0/10"
+
+
+def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tmp_path: Path) -> None:
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=6), shard_rows=4).scene_id)
+    doing = {"ada": Activity("renders samples", 3, 4, 3), "bob": Activity("loads the scene")}
+    status = QueueStatus(1, 2, 2, {}, IdleReports({}, {}), doing)
+    working = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(status, [])).look()
+    assert progress_line(working, 90.0) == (
+        "samples 0/6 (+3 in hand), 90 s left  (ada renders samples 3/4; bob loads the scene)"
+    )
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    seconds_later = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(status, [])).look()
+    assert (seconds_later.samples, seconds_later.in_hand) == ((4, 6), 2), "no more than are missing"
+    full = replace(status, idle_reports=IdleReports({"ada": "the disk is full"}, {}), activities={})
+    waiting = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(full, [])).look()
+    assert progress_line(waiting) == "samples 4/6  (worker ada takes no jobs: the disk is full)"
 
 
 def test_the_log_of_another_run_is_not_counted_where_nothing_is_trained(store: Store, tmp_path: Path) -> None:

@@ -88,10 +88,13 @@ class HeartbeatThread:
                 queue.serve(self._connection, self._store)
 
     def _keep_reporting(self) -> None:
-        reported = None
+        """Report what the worker does every few seconds, and why it is idle as soon as that changes."""
+        reported, idle = None, (self.paused, self.left)
         while not self._ended.wait(REPORT_S):
-            now = self._activity
+            now, before, idle = self._activity, idle, (self.paused, self.left)
             with contextlib.suppress(redis.RedisError, QueueError):
+                if idle != before:
+                    self._beat()
                 if now is not None:
                     queue.report_activity(
                         self._connection, self._settings.name, now, ttl_s=self._settings.heartbeat_ttl_s

@@ -73,8 +73,7 @@ def routes(pages: FarmPages) -> list[tuple[re.Pattern[str], bool, Callable[..., 
          lambda s, row, name: (PNG, pages.samples(s).picture(int(row), name))),
         ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
     ]  # fmt: skip
-    return [(re.compile(pattern.replace(".", r"\.") if "(" not in pattern else pattern), stays, make)
-            for pattern, stays, make in table]  # fmt: skip
+    return [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -139,6 +139,18 @@ def test_a_failure_that_redis_knows_is_not_told_twice(
     assert (len(found.causes), found.kept) == (1, [])
 
 
+def test_a_redis_that_fails_on_the_way_ends_no_watch(
+    scene: SceneStore, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise redis.TimeoutError("Timeout reading from socket")
+
+    monkeypatch.setattr("photonfarm.shared.farm.status.queue_of", fail)
+    view = FarmWatch(store, "unix:///none").look()
+    assert isinstance(view.queue, NoQueue)
+    assert view.scenes[0].samples == (0, 8)
+
+
 # ---------------------------------------------------------------------------------------------------- without a Redis
 
 

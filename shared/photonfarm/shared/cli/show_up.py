@@ -49,9 +49,8 @@ class FarmTalk:
                 done = min(committed + found.in_hand * (bar == first), planned)
                 bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
             bars.update(training, completed=found.step)
-            below.plain = "\n".join(
-                filter(None, (found.doing.replace("; ", "\n"), f"training{found.note}" * bool(found.note)))
-            )
+            note = f"training{found.note}" if found.note else ""
+            below.plain = "\n".join(filter(None, (*found.doing.split("; "), note)))
             for wait in found.waits:
                 if (kind := _NUMBER.sub("…", wait)) not in told:
                     told.add(kind)

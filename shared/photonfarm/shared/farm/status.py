@@ -6,6 +6,8 @@ import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import redis
+
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError, store_errors
 from photonfarm.shared.queue import Failure, FailureCause, QueueStatus, RenderArguments
@@ -43,6 +45,14 @@ def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
     failed = {name: failure for name, failure in found.failed.items() if is_missing(store, name)}
     kept = {name: failure for name, failure in _kept(store).items() if name not in failed}
     return StoreQueue(found, queue.causes(failed), queue.causes(kept))
+
+
+def queue_now(store: Store, redis_url: str) -> StoreQueue | NoQueue:
+    """As `queue_of`, for those who look again soon: a Redis that fails on the way is one of which nothing is known."""
+    try:
+        return queue_of(store, redis_url)
+    except redis.RedisError as error:
+        return NoQueue(f"Redis failed: {error}")
 
 
 def _kept(store: Store) -> dict[str, Failure]:

@@ -21,7 +21,7 @@ from photonfarm.shared.core.processes import free_port, tied
 from photonfarm.shared.farm.hold_out_check import check_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import WEB_PORT, announced
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_of
+from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress
 from photonfarm.shared.farm.waits import waits
@@ -129,7 +129,7 @@ def run_farm(
         running = stack.enter_context(_processes(verbs, environment, run, talk))
         preview = ["preview", spec, "--out", str(out / "preview.html")]
         try:
-            farm = _Farm(scene, run, train_steps, partial(queue_of, opened, redis.url))
+            farm = _Farm(scene, run, train_steps, partial(queue_now, opened, redis.url))
             _watch(running, farm, redis, talk)
             if train_steps:
                 beside: list[str] = []

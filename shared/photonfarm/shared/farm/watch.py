@@ -13,7 +13,7 @@ from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.running_farm import RunningFarm, running_farm
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_of
+from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress
 from photonfarm.shared.farm.waits import waits
 from photonfarm.shared.queue import Activity, RenderArguments
@@ -119,7 +119,7 @@ class FarmWatch:
         """The farm now. Raises StoreError if the store is gone."""
         running = running_farm(self._store)
         url = self._redis_url if self._named_redis or running is None else running.redis_url
-        queue = queue_of(self._store, url)
+        queue = queue_now(self._store, url)
         if not self._runs and running is not None and running.run:
             self._runs.append(RunFolder(Path(running.run)))
         activities = [] if isinstance(queue, NoQueue) else list(queue.status.activities.values())

@@ -133,7 +133,7 @@ def top_up(
 @store_option
 @redis_option
 @click.option("--run", "runs", type=click.Path(path_type=Path), multiple=True,
-              help="With --watch: folder of a training run; may be repeated.")  # fmt: skip
+              help="Folder of a training run; may be repeated.  [default: that of an `up` at work here]")  # fmt: skip
 @click.option("--watch", is_flag=True, help="Keep showing it, with rates and time left, until Ctrl-C.")
 @json_option
 def status(
@@ -146,6 +146,7 @@ def status(
     from photonfarm.shared.cli import show_status
     from photonfarm.shared.farm.running_farm import running_farm
     from photonfarm.shared.farm.status import check_read, queue_of
+    from photonfarm.shared.farm.training import RunFolder
     from photonfarm.shared.store import Store, store_status
 
     opened, named = Store(store), names_redis()
@@ -157,11 +158,14 @@ def status(
         return
     scenes, running = store_status(opened), running_farm(opened)
     url = redis_url if named or running is None else running.redis_url
+    folders = runs or ((Path(running.run),) if running and running.run else ())
+    trainings = [RunFolder(folder).look() for folder in folders]
     if as_json:
-        show_status.document(scenes, queue_of(opened, url), store, running)
+        show_status.document(scenes, queue_of(opened, url), store, running, trainings)
     else:
         show_status.scenes(scenes)  # before Redis is asked, which may not answer
         show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named)
+        show_status.trainings(trainings)
     check_read(scenes)
 
 

@@ -13,15 +13,20 @@ from photonfarm.shared.cli.show import print_json, print_table
 from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.running_farm import RunningFarm
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, lost_plan, unread_markers
+from photonfarm.shared.farm.training import TrainingProgress
 from photonfarm.shared.farm.waits import idle
 from photonfarm.shared.queue import FailureCause, repeating_command
 from photonfarm.shared.store import SceneStatus
 
 
 def document(
-    scenes: Sequence[SceneStatus], found: StoreQueue | NoQueue, store: str | Path, running: RunningFarm | None
+    scenes: Sequence[SceneStatus],
+    found: StoreQueue | NoQueue,
+    store: str | Path,
+    running: RunningFarm | None,
+    trainings: Sequence[TrainingProgress],
 ) -> None:
-    """Print a store's scenes and its queue as JSON, or why nothing is known of the queue."""
+    """Print a store's scenes, its queue, or why nothing is known of it, and trainings as JSON."""
     document = None if isinstance(found, NoQueue) else _queue_document(found, store)
     reason = found.reason if isinstance(found, NoQueue) else None
     print_json(
@@ -30,6 +35,7 @@ def document(
             "queue": document,
             "no_queue": reason,
             "kept_failures": _failures_document(found.kept, store),
+            "trainings": [asdict(training) for training in trainings],
             "up": None if running is None else asdict(running),
         }
     )
@@ -106,6 +112,12 @@ def _known_queue(found: StoreQueue, scenes: Sequence[SceneStatus], store: str | 
     for line in idle(status, {scene.scene_id: scene.name for scene in scenes}):
         click.echo(f"  {line}")
     _failures("", causes, store)
+
+
+def trainings(found: Sequence[TrainingProgress]) -> None:
+    """Print how far trainings are."""
+    for training in found:
+        click.echo(training.line)
 
 
 def _failures(when: str, causes: Sequence[FailureCause], store: str | Path) -> None:

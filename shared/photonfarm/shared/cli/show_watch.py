@@ -68,11 +68,7 @@ def _below(view: FarmView) -> Iterator[str]:
         yield f"  {status.queued} jobs queued, {status.running} running, {status.workers} workers"
     for name, activity in sorted(view.activities.items()):
         yield f"  worker {name} {activity}"
-    for training in view.trainings:
-        steps = f"{training.step}/{training.steps}" if training.steps else str(training.step)
-        yield f"  {training.run}: step {steps}{training.note}" + (
-            f", ended ({training.ended})" if training.ended else ""
-        )
+    yield from (f"  {training.line}" for training in view.trainings)
     yield from (f"  {wait}" for wait in view.waits)
     yield from (f"  before: {failed(cause)}" for cause in view.queue.kept)
 

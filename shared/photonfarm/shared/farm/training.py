@@ -49,6 +49,13 @@ class TrainingProgress:
         doing = self.phase if self.phase != TRAINS else None
         return "".join(f", {part}" for part in (doing, left, self.error) if part)
 
+    @property
+    def line(self) -> str:
+        """All of it in words."""
+        steps = f"{self.step}/{self.steps}" if self.steps else str(self.step)
+        ended = f", ended ({self.ended})" if self.ended else ""
+        return f"training {self.run}: step {steps}{self.note}{ended}"
+
 
 class RunFolder:
     """Follows a run's folder: `look` reads only what has been added to its log since the last call."""

@@ -54,8 +54,13 @@ def lines(view: FarmView) -> Iterator[str]:
             yield f"{now}  {scene.name} {scene.scene_id[:8]}: cannot be read: {scene.error}"
             continue
         in_hand = f" (+{scene.in_hand} in hand)" if scene.in_hand else ""
-        pace = ", ".join(filter(None, (_rate(scene), _left(scene)))) if scene.missing else "all there"
-        yield f"{now}  {scene.name} {scene.scene_id[:8]}: samples {_counted(scene)}{in_hand}, {pace}"
+        parts = (
+            f"samples {_counted(scene)}{in_hand}",
+            _rate(scene),
+            _left(scene),
+            "" if scene.missing else "all there",
+        )
+        yield f"{now}  {scene.name} {scene.scene_id[:8]}: {', '.join(filter(None, parts))}"
     yield from _below(view)
 
 

@@ -19,7 +19,7 @@ from photonfarm.export.rows import ranges, spans
 from photonfarm.export.settings import ExportRequest, ExportSettings
 from photonfarm.export.snapshot import Snapshot, Values, constants
 from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.shared.core.telling import waiting
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.declarations import VERSION

@@ -20,7 +20,7 @@ from photonfarm.shared.core.exr import write_layers
 from photonfarm.shared.core.files import whole_file
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.shared.core.telling import waiting
 from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.view import View

@@ -101,7 +101,7 @@ def gathered(
     first = runs[0]
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), timed=timed)
+    close_look = _CloseLook(store, first, kept, points_used(runs), timed=timed)
     evaluation = evaluate.compare(
         store, runs, denoisers, references=references, inception=inception, most=most, device=device,
         on_progress=on_progress, choose=close_look,
@@ -171,9 +171,9 @@ class _CloseLook:
     """
 
     def __init__(
-        self, store: str | Path, scene_id: str, kept: Sequence[int], points: int | None, *, timed: bool
+        self, store: str | Path, run: TrainedRun, kept: Sequence[int], points: int | None, *, timed: bool
     ) -> None:
-        self._store, self._scene_id, self._kept, self._points, self._timed = store, scene_id, kept, points, timed
+        self._store, self._run, self._kept, self._points, self._timed = store, run, kept, points, timed
         self.costs: FrameCosts | None = None
         self.untimed = "it was not asked for"
         self.worst: list[WorstCase] = []
@@ -183,7 +183,7 @@ class _CloseLook:
         if self._timed:
             rows = list(references or images)
             try:
-                self.costs = frame_costs(self._store, self._scene_id, rows, self._kept, self._points)
+                self.costs = frame_costs(self._store, self._run, rows, self._kept, self._points)
             except BackendError as error:
                 self.untimed = str(error)
         self.machine = Machine.here()
@@ -192,7 +192,7 @@ class _CloseLook:
 
     def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
         """The views that have references, with the first network's images of them."""
-        source = StoreSource(self._store, self._scene_id)
+        source = StoreSource(self._store, self._run.scene_id)
         source.refresh()
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []

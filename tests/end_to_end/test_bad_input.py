@@ -159,7 +159,8 @@ def test_up_refuses_settings_that_its_workers_would_refuse_before_it_writes_anyt
 
 def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(here, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
+    ball = '<shape type="sphere" id="Ball"><emitter type="area"/></shape>'
+    (tmp_path / "mine/ball.xml").write_text(f'<scene version="3.0.0">{ball}</scene>')
     (tmp_path / "mine/ball.toml").write_text(
         'name = "ball"\nscene.file = "ball.xml"\n'
         "[view]\norigin = { min = [0, 0, 3], max = [1, 1, 4] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"

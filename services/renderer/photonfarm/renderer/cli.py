@@ -276,6 +276,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 @click.argument("spec")
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
 @json_option
+@ended_by_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     """Measure where SPEC's cameras may stand: in the open, by rays, and in no movable group's box.
 
@@ -357,6 +358,7 @@ def render(scene: str, store: str | Path, row: int, pass_number: int | None, out
 @click.command()
 @click.argument("spec")
 @json_option
+@ended_by_ctrl_c()
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.renderer.check import shapes
@@ -377,6 +379,7 @@ def scene_shapes(spec: str, as_json: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
               help="The page.")  # fmt: skip
 @json_option
+@ended_by_ctrl_c()
 def scene_check(spec: str, out: Path, as_json: bool) -> None:
     """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
 

@@ -1,6 +1,8 @@
 """Every fault that a user can cause gives one sentence on stderr and its exit code, and nothing stored is lost."""
 
+import contextlib
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,9 +15,9 @@ import pytest
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.farm.hold_out_check import check_hold_out
+from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
 from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.hold_out import rows_held_out
+from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.shared.store import Store
@@ -122,7 +124,7 @@ def test_wrong_usage_is_exit_code_2(here) -> None:
 @pytest.mark.parametrize(
     ("options", "side"),
     [
-        (("room", "--modifications", "2"), "2 configurations planned none"),
+        (("room", "--modifications", "2", "--hold-out", "0.125"), "2 configurations planned none"),
         (("room", "--modifications", "2", "--hold-out", "0.999"), "2 configurations planned all"),
         (("cornell", "--modifications", "3", "--views", "2", "--hold-out", "0.99"), "6 views planned all"),
     ],
@@ -157,7 +159,8 @@ def test_up_refuses_settings_that_its_workers_would_refuse_before_it_writes_anyt
 
 def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(here, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
+    ball = '<shape type="sphere" id="Ball"><emitter type="area"/></shape>'
+    (tmp_path / "mine/ball.xml").write_text(f'<scene version="3.0.0">{ball}</scene>')
     (tmp_path / "mine/ball.toml").write_text(
         'name = "ball"\nscene.file = "ball.xml"\n'
         "[view]\norigin = { min = [0, 0, 3], max = [1, 1, 4] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"
@@ -175,6 +178,27 @@ def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp
     check_hold_out(load_spec("room"), tmp_path / "store", 0.125, wanted)
     with pytest.raises(SpecError):
         check_hold_out(load_spec("room"), tmp_path / "none", 0.125, wanted)
+
+
+@pytest.mark.parametrize("spec", ["room", "cornell"])
+@pytest.mark.parametrize("count", range(2, 14))
+def test_up_holds_out_enough_of_a_small_plan(tmp_path: Path, spec: str, count: int) -> None:
+    loaded, wanted = load_spec(spec), Request(modifications=count)
+    share = chosen_hold_out(loaded, tmp_path / "none", wanted)
+    check_hold_out(loaded, tmp_path / "none", share, wanted)
+    with contextlib.suppress(SpecError):
+        check_hold_out(loaded, tmp_path / "none", HOLD_OUT, wanted)
+        assert share == HOLD_OUT, "the default stays where it does"
+
+
+def test_numbers_that_a_refused_hold_out_names_are_enough(tmp_path: Path) -> None:
+    with pytest.raises(SpecError) as refused:
+        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=9))
+    share, count = re.findall(r"--hold-out (\S+) .* --modifications (\d+)", str(refused.value))[0]
+    check_hold_out(load_spec("room"), tmp_path / "none", float(share), Request(modifications=9))
+    check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count)))
+    with pytest.raises(SpecError):
+        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count) - 1))
 
 
 @pytest.mark.parametrize("spec", ["room", "cornell"])

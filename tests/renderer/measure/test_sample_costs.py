@@ -99,8 +99,7 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     assert [spp for *_, spp in rendered] == [2, 8] * (WARM_UPS + 3)
     seeds = [seed for _, one, other, _ in rendered for seed in (one, other)]
     assert len(set(seeds)) == len(seeds)
-    views = WARM_UPS + 3
-    assert told == [f"view {n} of {views}" for n in range(1, views + 1)]
+    assert told == [f"measuring what samples of room cost here, in 3 views after {WARM_UPS} that do not count"]
 
 
 def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:
@@ -172,13 +171,13 @@ def run(spec: Path | str, *options: str) -> Result:
 
 
 def test_the_verb_measures_once_and_answers_from_what_is_kept(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measuring, "LOG_SECONDS", float("inf"))  # kernels may take long to compile
     first = run(tiny, "--frames", "2", "--json")
     assert first.exit_code == 0, first.output
     costs = SampleCosts.read(first.stdout)
     assert costs.scene_id == load_spec(tiny).scene_id
-    assert first.stderr == f"measuring what samples of room cost here, in 2 views after {WARM_UPS} that do not count\n"
-    monkeypatch.setattr(measuring, "sample_costs", lambda *_: SOME)
+    said = f"measuring what samples of room cost here, in 2 views after {WARM_UPS} that do not count"
+    assert first.stderr.splitlines()[:2] == ["loading room", said]
+    monkeypatch.setattr(measuring, "costs_within", lambda _, frames, *__: (SOME, frames))
     monkeypatch.setattr(LoadedScene, "load", lambda *_: None)
     again = run(tiny, "--frames", "2", "--json")
     assert (again.stdout, again.stderr) == (first.stdout, "")
@@ -190,18 +189,18 @@ def test_the_verb_measures_once_and_answers_from_what_is_kept(tiny: Path, monkey
 
 
 def test_a_measurement_that_is_kept_but_damaged_is_made_again(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measuring, "sample_costs", lambda *_: SOME)
+    monkeypatch.setattr(measuring, "costs_within", lambda _, frames, *__: (SOME, frames))
     monkeypatch.setattr(LoadedScene, "load", lambda *_: None)
     run(tiny)
     (file,) = (tiny.parent / "cache/photonfarm/costs").iterdir()
     whole = file.read_text()
     file.write_text(whole[:-9])
-    assert "measuring" in run(tiny).stderr
+    assert "loading" in run(tiny).stderr
     assert file.read_text() == whole
 
 
 def test_a_folder_that_cannot_be_written_costs_but_a_line(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measuring, "sample_costs", lambda *_: SOME)
+    monkeypatch.setattr(measuring, "costs_within", lambda _, frames, *__: (SOME, frames))
     monkeypatch.setattr(LoadedScene, "load", lambda *_: None)
     (tiny.parent / "cache").write_text("no folder")
     result = run(tiny, "--json")

@@ -162,7 +162,7 @@ def test_equal_configurations_are_counted_once(tmp_path: Path) -> None:
 def test_cost_and_time_follow_from_what_the_verb_measured(tmp_path: Path, verb: Verb) -> None:
     asked = verb()
     found = rehearsed(tmp_path, tmp_path / "none", passes=3)
-    assert asked.read_text() == f"-m photonfarm.shared.cli scene cost --json -- {tmp_path / 'spec.json'}\n"
+    assert asked.read_text() == f"-m photonfarm.shared.cli scene cost --json --seconds 20 -- {tmp_path / 'spec.json'}\n"
     assert found.costs == COSTS
     assert found.core_s == pytest.approx(6 * 0.5 + 12 * 0.25 + 36 * (0.125 + 8 * 0.0625))
     assert found.wall_s == pytest.approx(found.core_s / 4)
@@ -254,7 +254,7 @@ def test_nothing_is_measured_where_it_is_not_wanted_or_the_request_is_wrong(
 
 def test_a_verb_of_this_machine_that_is_not_there_is_named() -> None:
     with pytest.raises(BackendError, match=r"photonfarm scene cost|not installed"):
-        costs_by_renderer("no-such-spec")
+        costs_by_renderer("no-such-spec", 20.0)
 
 
 # -------------------------------------------------------------------------------------------------------- as printed

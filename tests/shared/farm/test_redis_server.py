@@ -120,3 +120,31 @@ def test_what_listens_but_is_no_redis_is_a_queue_error() -> None:
         url = f"redis://127.0.0.1:{server.getsockname()[1]}/0?socket_timeout=0.2"
         with pytest.raises(QueueError):
             connect(url)
+
+
+def test_a_folder_may_have_blanks_quotes_and_umlauts_in_its_path(tmp_path: Path) -> None:
+    with EmbeddedRedis(tmp_path / "my 'own' Küche \"x\"" / "redis") as server:
+        connect(server.url).set("key", "value")
+    assert list((tmp_path / "my 'own' Küche \"x\"" / "redis").rglob("*.aof"))
+
+
+def test_a_redis_of_ones_own_is_one_process_and_ends_with_it(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "photonfarm.shared.cli", "redis", "--port", str(port)]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as server:
+        url, end = f"redis://127.0.0.1:{port}/0", time.monotonic() + 20
+        while True:
+            try:
+                connection = connect(url)
+                break
+            except QueueError:
+                assert time.monotonic() < end
+                time.sleep(0.05)
+        assert connection.info("server")["process_id"] == server.pid
+        server.terminate()
+        assert server.wait(10) == 0
+    with pytest.raises(QueueError):
+        connect(url)
+    assert list(tmp_path.iterdir()) == []

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec
+from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec, scene_folder
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>
@@ -59,9 +59,9 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
     ("described", "named"),
     [
         (ball(shapes=["Bal"]), r"ball\.shapes: 'Bal' .*; nearest: Ball"),
-        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r"0\.box: .* y"),
-        (ball(removal_probability=1.5), r"objects\.0\.removal_probability = 1\.5"),
-        (ball(removal_probability=-0.1), r"objects\.0\.removal_probability = -0\.1"),
+        (ball(box={"min": [0, 1, 0], "max": [0, 0, 0]}), r'objects "ball"\.box: .* y'),
+        (ball(removal_probability=1.5), r'objects "ball"\.removal_probability = 1\.5'),
+        (ball(removal_probability=-0.1), r'objects "ball"\.removal_probability = -0\.1'),
         (changed(scene={"file": "none/scene.xml"}), r"scene\.file = 'none/scene\.xml'"),
         (changed(scene={}), "scene: .*file.*builtin"),
         (changed(scene={"builtin": "castle"}), r"scene\.builtin = 'castle': .*'cornell' or 'room'"),
@@ -71,7 +71,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(flm={}), "flm: .*nearest: film"),
         (changed(objects=tomllib.loads(SPEC)["objects"] * 2), "'ball'"),
         ({k: v for k, v in changed().items() if k != "view"}, "view: "),
-        (ball(at=[0, float("nan"), 0]), r"objects\.0\.at\.1 = nan"),
+        (ball(at=[0, float("nan"), 0]), r'objects "ball"\.at\.1 = nan'),
     ],
 )
 def test_an_invalid_spec_is_refused_with_key_and_value(scenes: Path, described: dict[str, Any], named: str) -> None:
@@ -157,7 +157,7 @@ def test_a_light_is_shapes_or_a_rectangle_and_not_both(scenes: Path) -> None:
     assert parse_spec(changed(lights=[lit]), where="spec").lights[0].removal_probability == 0
     dark = {**light, "rectangle": {"size": [1, 1], "radiance": [0, 0, 0]}}
     floor = {**light, "shapes": ["Floor"]}
-    for refused, named in ((light, r"lights\.0"), (floor, r"lamp\.shapes"), (dark, "radiance")):
+    for refused, named in ((light, 'lights "lamp"'), (floor, r"lamp\.shapes"), (dark, "radiance")):
         with pytest.raises(SpecError, match=named):
             parse_spec(changed(lights=[refused]), where="spec")
 
@@ -179,3 +179,16 @@ def test_a_file_that_is_no_json_is_told_in_a_short_line_and_so_is_a_long_value()
     for line in (said, str(refused.value)):
         assert len(line) < 400
         assert "\n" not in line
+
+
+def test_the_folder_of_a_scene_file_is_found_also_beside_and_above_the_spec(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PHOTONFARM_SCENES", raising=False)
+    (tmp_path / "specs").mkdir()
+    (tmp_path / "ball.xml").write_text('<scene version="3.0.0"><shape type="sphere" id="Ball"/></scene>')
+    text = SPEC.replace(tomllib.loads(SPEC)["scene"]["file"], "../ball.xml")
+    (tmp_path / "specs/a.toml").write_text(text.partition("[[objects]]")[0] + "[view]" + text.partition("[view]")[2])
+    name = str(tmp_path / "specs/a.toml")
+    assert scene_folder(name, load_spec(name)) == tmp_path / "specs"
+    assert scene_folder("room", load_spec("room")) is None

@@ -22,7 +22,7 @@ def test_without_a_name_it_is_cuda_where_there_is_one() -> None:
 
 
 def test_a_name_that_is_no_device_of_ours_is_refused_with_those_that_are() -> None:
-    with pytest.raises(SpecError, match="auto, cpu or cuda"):
+    with pytest.raises(SpecError, match="auto, cpu, cuda or cuda:N"):
         usable_device("meta")
 
 

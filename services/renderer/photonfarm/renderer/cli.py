@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from functools import partial
@@ -12,6 +13,8 @@ from typing import Any
 import click
 
 from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+from photonfarm.shared.core.waiting import waiting
 
 
 @click.command()
@@ -23,7 +26,7 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     from photonfarm.renderer.tools.doctor import examine
     from photonfarm.shared.cli import show
 
-    sys.exit(show.findings(examine(store, redis_url), as_json))
+    sys.exit(show.findings(examine(store, redis_url, partial(click.echo, err=True)), as_json))
 
 
 def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
@@ -96,11 +99,14 @@ def work(
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
 def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
     """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
+    if out.suffix not in (".html", ".htm"):
+        raise click.BadParameter(f"{str(out)!r}: the sheet is a page; name it like preview.html", param_hint="--out")
     from photonfarm.renderer.tools.preview import write_contact_sheet
     from photonfarm.shared.scene.spec_loading import load_spec
+    from photonfarm.shared.store.read.other_scenes import scene_of
     from photonfarm.shared.store.read.reader import SceneReader
 
-    write_contact_sheet(SceneReader(store, load_spec(spec).scene_id), count, out)
+    write_contact_sheet(SceneReader(store, scene_of(store, spec, load_spec(spec))), count, out)
     click.echo(out)
 
 
@@ -119,6 +125,7 @@ def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
 )
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Instead: once around the scene.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="buffers.npz", show_default=True)
+@ended_by_ctrl_c()
 def buffers(
     store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
 ) -> None:  # fmt: skip
@@ -131,7 +138,9 @@ def buffers(
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")
-    frames = write_buffers(store, scene, modification, orbit or CameraPath.load(path or Path()), out)
+    along = orbit or CameraPath.load(path or Path())
+    with waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
+        frames = write_buffers(store, scene, modification, along, out)
     click.echo(f"{out}: {frames} frames")
 
 
@@ -147,6 +156,7 @@ def buffers(
 @click.option("--points", type=click.IntRange(1), metavar="P",
               help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
+@ended_by_ctrl_c()
 def measure_frames(
     store: str | Path,
     scene: str,
@@ -166,7 +176,8 @@ def measure_frames(
     backend.load(threads=1)
     from photonfarm.renderer.measure.frame_costs import write_frame_costs
 
-    costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
+    with waiting(partial(click.echo, err=True), f"timing {timed} frames"):
+        costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
     parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
     click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()))
     click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
@@ -179,12 +190,13 @@ def measure_frames(
     type=click.IntRange(1, 86400),
     default=60,
     show_default=True,
-    help="CPU time of the measurement, loading and compiling apart; a kept measurement is reused if it took at least "
-    "as long.",
+    help="Processor time for all of it, with loading and compiling; a kept measurement is reused if it was given at "
+    "least as long.",
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
+@ended_by_ctrl_c()
 def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer.scene import backend
@@ -210,9 +222,12 @@ def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool)
 @click.argument("spec")
 @click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
               help="Random configurations to measure, a view of each, after some that do not count.")  # fmt: skip
+@click.option("--seconds", type=click.FloatRange(0, min_open=True),
+              help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @json_option
-def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
+@ended_by_ctrl_c()
+def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
     """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are.
 
     Half a minute for a small room, minutes for a large one. `configuration` is taken by each configuration, `view` by
@@ -226,7 +241,8 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
     from photonfarm.renderer.measure.sample_costs import find_or_measure
 
     log = partial(click.echo, err=True)
-    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, log=log)
+    limit = math.inf if seconds is None else seconds
+    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, log=log, seconds=limit)
     click.echo(costs.json() if as_json else costs.line())
 
 
@@ -237,6 +253,7 @@ def scene_cost(spec: str, frames: int, again: bool, as_json: bool) -> None:
 @click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
               help="Random configurations to render, a view of each.")  # fmt: skip
 @json_option
+@ended_by_ctrl_c()
 def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
     """Propose an exposure for SPEC, from a quick render of random views; nothing is written.
 
@@ -250,7 +267,8 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     from photonfarm.renderer.measure.exposure import propose
 
     log = partial(click.echo, err=True)
-    found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
+    with waiting(log, f"proposing an exposure for {loaded.name}"):
+        found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 
@@ -258,6 +276,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 @click.argument("spec")
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
 @json_option
+@ended_by_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     """Measure where SPEC's cameras may stand: in the open, by rays, and in no movable group's box.
 
@@ -287,6 +306,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 @click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
               help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
+@ended_by_ctrl_c()
 def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
     """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
     from photonfarm.renderer.scene import backend
@@ -338,6 +358,7 @@ def render(scene: str, store: str | Path, row: int, pass_number: int | None, out
 @click.command()
 @click.argument("spec")
 @json_option
+@ended_by_ctrl_c()
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.renderer.check import shapes
@@ -358,6 +379,7 @@ def scene_shapes(spec: str, as_json: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
               help="The page.")  # fmt: skip
 @json_option
+@ended_by_ctrl_c()
 def scene_check(spec: str, out: Path, as_json: bool) -> None:
     """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
 

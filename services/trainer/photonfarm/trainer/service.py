@@ -15,16 +15,20 @@ from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.scene.spec_loading import load_spec, scene_folder
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
-from photonfarm.trainer.runs.run_folder import held
+from photonfarm.shared.store.read.other_scenes import other_scenes
+from photonfarm.shared.store.write.scene_store import held as scenes_held
+from photonfarm.trainer.runs.run_folder import held, note_scene_folder
 from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
 from photonfarm.trainer.runs.shown_views import write_views
+from photonfarm.trainer.runs.user_code import named_in_errors
 
 if TYPE_CHECKING:
     from photonfarm.shared.core.records import F32
+    from photonfarm.shared.scene.spec import SceneSpec
     from photonfarm.trainer.runs.distributed import TrainingGroup
 
 T = TypeVar("T")
@@ -71,11 +75,15 @@ def run(
             return
         with leading(group):
             log(f"training on {described(device, settings.network.precision)}")
-            scene_id = load_spec(spec).scene_id if spec else scene_id
-            _lead(scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
+            loaded = load_spec(spec) if spec else None
+            scene_id = loaded.scene_id if loaded else scene_id
+            beside = scene_folder(spec, loaded) if spec and loaded else None
+            _lead(loaded, beside, scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
 
 
 def _lead(
+    spec: SceneSpec | None,
+    beside: Path | None,
     scene_id: str | None,
     store: str | Path,
     folder: Path,
@@ -98,6 +106,7 @@ def _lead(
         )
     scene_id = scene_id or begun_on
     with _sign_of_life(folder), event_files(folder) as board:
+        note_scene_folder(folder, beside)
         began = time.monotonic()
         if is_vacant(store):
             log(f"waiting for a store and a scene in {store}")
@@ -111,9 +120,7 @@ def _lead(
             return
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
-            there = scene_id in Store(store).scene_ids()
-            lacks = "of which nothing is rendered yet" if there else f"which {store} does not hold yet"
-            log(f"waiting for scene {scene_id}, {lacks}")
+            log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
         progress = RunProgress(settings.max_steps, settings.batch)
 
         def drawn(draws: int, samples: int) -> None:
@@ -146,6 +153,14 @@ def _lead(
         raise IncompleteError(
             f"{store}: nothing of scene {scene_id} has been rendered in {settings.max_seconds:g} s; nothing was trained"
         )
+
+
+def _lacks(store: Store, scene_id: str, spec: SceneSpec | None) -> str:
+    """What of a scene is waited for, in words."""
+    if store.has_scene(scene_id):
+        return "of which nothing is rendered yet"
+    others = other_scenes(store, spec) if spec else scenes_held(store.storage)
+    return f"which {store.storage.where} does not hold yet; {others}"
 
 
 def check(folder: Path) -> None:
@@ -181,7 +196,8 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
         f"width {network.width}" + (f", {points} points" if kind_of(network.architecture).needs.points else "")
     )
-    return f"{head}\n{table(summary(scene, network))}"
+    with named_in_errors(architecture=network.architecture):
+        return f"{head}\n{table(summary(scene, network))}"
 
 
 def search(
@@ -208,7 +224,8 @@ def search(
     scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
     if scene_id is None or is_vacant(store) or not Store(store).has_scene(scene_id):
         wanted = f" {spec}" if spec else ""
-        raise SpecError(f"{store}: holds no scene{wanted}; a grid compares runs over samples that are there")
+        there = f" ({scenes_held(Store(store).storage)})" if not is_vacant(store) else ""
+        raise SpecError(f"{store}: holds no scene{wanted}{there}; a grid compares runs over samples that are there")
     with stop_on_signals() as stop, _sign_of_life(folder):
         axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
         if settings.schedule == "cosine":

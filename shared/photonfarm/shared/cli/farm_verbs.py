@@ -169,25 +169,44 @@ def status(
     check_read(scenes)
 
 
+@click.command("redis")
+@click.option("--port", type=click.IntRange(1, 65535), default=6379, show_default=True, help="Of this machine alone.")
+def redis_server(port: int) -> None:
+    """Run a Redis for the queue on this machine, until it is ended: the server that `up` embeds.
+
+    It lets in users of this machine, without a password, and keeps nothing: the queue is filled again from the store.
+    """
+    from photonfarm.shared.farm.redis_server import become_redis
+
+    become_redis(port)
+
+
 @click.command()
 @click.argument("spec")
 @request_options
 @store_option
 @click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
-@click.option("--run", type=click.Path(path_type=Path), default="run", show_default=True, help="The trainer's folder.")
+@click.option(
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="run",
+    show_default=True,
+    help="The trainer's folder.",
+)
 @click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
 @click.option(
     "--hold-out",
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
-    default=HOLD_OUT,
-    show_default=True,
-    help="Share of the configurations never trained on; a small plan needs a large one.",
+    default=None,
+    help="Share of the configurations never trained on.  "
+    f"[default: the run's; of a new one {HOLD_OUT}, or just enough for one configuration of a small plan]",
 )
 @click.option("--reference-views", type=click.IntRange(0), default=0, show_default=True,
               help="Held-out views that get references, for the report; 0: none.")  # fmt: skip
 @click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
               help="Samples per pixel of each reference.")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), default="out", show_default=True, help="Preview and report.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True,
+              help="Preview and report.")  # fmt: skip
 @click.option("--web/--no-web", default=True, show_default=True, help="Serve pages that show it, on this machine.")
 def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
@@ -200,8 +219,9 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     try:
         _check_arguments(["work", "--until-complete"], "photonfarm-renderer")
         if options["train_steps"]:
-            trainer = {name: options[name] for name in ("run", "train_steps", "hold_out")}
-            _check_arguments(trainer_arguments(spec, **trainer), "photonfarm-trainer", "--train-steps 0 renders only")
+            trainer = {name: options[name] for name in ("run", "train_steps")}
+            arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
+            _check_arguments(arguments, "photonfarm-trainer", "--train-steps 0 renders only")
         run_farm(spec, store, request, FarmTalk(), **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)

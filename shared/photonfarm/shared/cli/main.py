@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ from photonfarm.shared.cli.settings import file_defaults
 from photonfarm.shared.cli.verbs import Umbrella, options_by_command
 from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError
 
+STOPPED = 130
+"""The exit code after Ctrl-C, as shells give it."""
+
 CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
 
 
@@ -31,8 +35,7 @@ def umbrella(ctx: click.Context, config: Path) -> None:
 
     Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
     to stdout, all other messages go to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5
-    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 130 `up` or `export` after Ctrl-C, 1
-    anything else.
+    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 130 Ctrl-C, 1 anything else.
     """
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():
@@ -55,13 +58,21 @@ def _told_to_child_processes(config: Path) -> Iterator[None]:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line; an error of ours becomes one sentence and its exit code."""
+    """Run the command line; an error of ours, and Ctrl-C, become one sentence and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # for terminals that lack × and …
     try:
-        umbrella(args, prog_name="photonfarm")
+        sys.exit(umbrella.main(args, prog_name="photonfarm", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.Abort:
+        _fail("stopped by Ctrl-C; what is stored stays", STOPPED)
     except PhotonfarmError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:  # a file that a user named, and no code closer to it knew more
-        _fail(f"{error.filename or 'a file'}: {error.strerror or error}", StoreError.exit_code)
+        _fail(f"{error.filename or 'a file, or the output'}: {error.strerror or error}", StoreError.exit_code)
     except Exception as error:
         if not _is_of_redis(error):
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -26,12 +27,31 @@ class StorePlace(click.Path):
         """The Path or the URL; fails for a URL that is not that of a bucket."""
         from photonfarm.shared.store.io.storage import SCHEMES, is_url
 
+        if re.match(r"(s3|gs|az):/?[^/]", str(value)):
+            self.fail(f"{value!r} is no URL of a bucket; write {str(value)[:2]}://BUCKET/PREFIX.", param, ctx)
         if not is_url(value):
             return super().convert(value, param, ctx)
         scheme, _, bucket = value.partition("://")
         if scheme not in SCHEMES or not bucket.strip("/"):
             self.fail(f"{value!r} is neither a folder nor {'://…, '.join(SCHEMES)}://… with a bucket.", param, ctx)
         return value
+
+
+class WholeNumber(click.IntRange):
+    """A whole number in a range, also written like 1e3 or 10_000."""
+
+    name = "integer"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number; fails for text that is none, and for a fraction."""
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            return super().convert(value, param, ctx)  # which says so
+        if not number.is_integer():
+            self.fail(f"{value!r} is not a whole number.", param, ctx)
+        exact = isinstance(value, str) and value.strip().isdigit()  # more digits than a float has
+        return super().convert(int(value if exact else number), param, ctx)
 
 
 def store_option(command: Command) -> Command:
@@ -95,12 +115,12 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(request=Request.of(**asked), **options)
 
     options = (
-        click.option("--modifications", type=click.IntRange(1), default=128, show_default=True,
+        click.option("--modifications", type=WholeNumber(1), default=128, show_default=True,
                      help="Random configurations; a static scene has one, of which modifications × views are planned."),
-        click.option("--views", type=click.IntRange(1), default=2, show_default=True, help="Views per configuration."),
-        click.option("--passes", type=click.IntRange(1), default=1, show_default=True, help="Noisy passes per view."),
-        click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
-        click.option("--shard-rows", type=click.IntRange(1, 4096), default=None,
+        click.option("--views", type=WholeNumber(1), default=2, show_default=True, help="Views per configuration."),
+        click.option("--passes", type=WholeNumber(1), default=1, show_default=True, help="Noisy passes per view."),
+        click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
+        click.option("--shard-rows", type=WholeNumber(1, 4096), default=None,
                      help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
                      "most 32, and several jobs for every worker]"),
     )  # fmt: skip

@@ -26,7 +26,9 @@ def file_defaults(path: Path, options: Options) -> dict[str, Any]:
     """
     try:
         tables = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SpecError(f"{path}: is not a readable TOML file: {error}") from error
     defaults: dict[str, Any] = {verb: {} for verb in options if "." not in verb}
     common = tables.pop(EVERY_VERB, {})

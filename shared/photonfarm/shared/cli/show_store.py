@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.shared.cli.show import print_json
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.waiting import SILENCE_S
 from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
@@ -29,7 +31,7 @@ def progress() -> Iterator[CheckProgress]:
     """A progress callback for a check: a bar on a terminal, else a line per scene; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _line
+        yield _lines()
         return
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[read]}"), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True) as bars:
@@ -43,9 +45,18 @@ def progress() -> Iterator[CheckProgress]:
         yield show
 
 
-def _line(scene: str, done: int, total: int, size_bytes: int) -> None:
-    if done == total:
-        click.echo(f"{scene}: {total} jobs read, {size_bytes / 1e6:,.1f} MB", err=True)
+def _lines() -> CheckProgress:
+    """A line for each scene, and one every few seconds before that."""
+    said = time.monotonic()
+
+    def line(scene: str, done: int, total: int, size_bytes: int) -> None:
+        nonlocal said
+        if done == total or time.monotonic() - said > SILENCE_S * 0.8:
+            said = time.monotonic()
+            of = "" if done == total else f" of {total}"
+            click.echo(f"{scene}: {done}{of} jobs read, {size_bytes / 1e6:,.1f} MB", err=True)
+
+    return line
 
 
 # ---------------------------------------------------------------------------------------------------------------- check

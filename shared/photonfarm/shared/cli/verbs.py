@@ -7,6 +7,7 @@ installed becomes a group without a command.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -25,7 +26,23 @@ def _installed() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-class Umbrella(click.Group):
+class Suggesting(click.Group):
+    """A group that answers an unknown verb with those that resemble it, also with `store check` to `check`."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The verb with its name and the arguments behind it; raises UsageError for an unknown one."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and not ctx.resilient_parsing:
+            near = difflib.get_close_matches(name, self.list_commands(ctx))
+            near += [known.replace(".", " ") for known in sorted(_installed()) if known.endswith(f".{name}")]
+            hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+            raise click.UsageError(f"No such command {name!r}.{hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+class Umbrella(Suggesting):
     """A group whose verbs are those of the services that are installed."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
@@ -43,7 +60,7 @@ class Umbrella(click.Group):
         return Extended(cmd_name, command, below) if below else command
 
 
-class Extended(click.Group):
+class Extended(Suggesting):
     """A verb with subcommands of other distributions below it."""
 
     def __init__(self, name: str, own: click.Command | None, below: dict[str, EntryPoint]) -> None:

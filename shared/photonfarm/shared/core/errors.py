@@ -9,7 +9,7 @@
     └── IncompleteError            exit 7   work that ended before it was done, samples that are not complete
         └── DivergedError          exit 8   training whose loss is no longer finite (in the trainer's `learner`)
 
-Exit 0 is success, 2 is wrong usage of a command (given by click), 130 is Ctrl-C in `photonfarm up` and `export`.
+Exit 0 is success, 2 is wrong usage of a command (given by click), 130 is Ctrl-C.
 A message names the key, the value and the rule.
 """
 

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
-from typing import Annotated
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 Probability = Annotated[float, Field(ge=0, le=1)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)]
+
+
+def _named(name: str) -> str:
+    """The name; refuses what could not be a part of a file's name, or of a command line, everywhere."""
+    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
+        return name
+    asked = re.sub(r"[^A-Za-z0-9_.-]+", "-", unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode())
+    instead = f", such as {asked.strip('-_.')[:64]!r}" if asked.strip("-_.") else ""
+    raise ValueError(
+        f"{name!r} is no name: up to 64 letters a to z without accents, digits, and - _ . are allowed, a letter or "
+        f"digit first{instead}"
+    )
+
+
+Name = Annotated[str, AfterValidator(_named)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -24,23 +40,87 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-def sentences(error: ValidationError, known: Iterable[str] = ()) -> Iterator[str]:
-    """One sentence for each fault that a model found: its key, the value and the rule; `known` are the allowed keys."""
+def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None) -> Iterator[str]:
+    """One sentence for each fault that a model found: its key, the value and the rule.
+
+    `known` are the allowed keys. Entries of lists are called by their names in the document `of`, where they have one.
+    """
     for fault in error.errors():
-        key = ".".join(map(str, fault["loc"]))
-        rule = fault["msg"].removeprefix("Value error, ")
+        key = _key(fault["loc"], of)
+        rule = _RULES[fault["type"]].format(**fault.get("ctx", {})) if fault["type"] in _RULES else fault["msg"]
+        rule = rule.removeprefix("Value error, ")
         if not key:  # of the whole
             yield rule
-        elif fault["type"] in ("value_error", "missing"):
+        elif fault["type"] == "value_error":
             yield f"{key}: {rule}"
+        elif fault["type"] == "missing":
+            yield f"{key}: is missing, and required"
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {nearest(str(fault['loc'][-1]), known)}"
         else:
             yield f"{key} = {_shortened(repr(fault['input']))}: {rule}"
 
 
+_RULES = {
+    "bool_parsing": "true or false is required",
+    "bool_type": "true or false is required",
+    "dict_type": "a table is required",
+    "float_parsing": "a number is required",
+    "finite_number": "a finite number is required",
+    "float_type": "a number is required",
+    "greater_than": "above {gt} is required",
+    "greater_than_equal": "{ge} or more is required",
+    "int_from_float": "a whole number is required",
+    "int_parsing": "a whole number is required",
+    "int_type": "a whole number is required",
+    "less_than": "below {lt} is required",
+    "less_than_equal": "{le} or less is required",
+    "model_type": "a table is required",
+    "multiple_of": "a multiple of {multiple_of} is required",
+    "string_type": "text is required",
+    "tuple_type": "a list is required",
+}
+"""The rules that wrong types break, for people; by pydantic's kinds of faults."""
+
+
+def _key(place: tuple[int | str, ...], document: Any) -> str:
+    """A place in a document in words: `objects.0.box` is `objects "table".box` where that entry has this name."""
+    words = ""
+    for part in place:
+        try:
+            document = document[part]
+        except (LookupError, TypeError):
+            document = None
+        name = document.get("name") if isinstance(part, int) and isinstance(document, Mapping) else None
+        words += f' "{name}"' if isinstance(name, str) else f".{part}"
+    return words.removeprefix(".")
+
+
 def _shortened(text: str) -> str:
     return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
+
+
+Changes = dict[str, tuple[Any, Any]]
+"""Changed values by key: the old and the new one."""
+
+
+def differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
+    """The values that differ, (then, now), by key; a key within another one as OUTER.INNER, an entry by its name."""
+    found: Changes = {}
+    for key in {**before, **now}:
+        then, value = _by_name(before.get(key)), _by_name(now.get(key))
+        if isinstance(then, Mapping) and isinstance(value, Mapping):
+            found |= differing(then, value, f"{inside}{key}.")
+        elif then != value:
+            found[f"{inside}{key}"] = (then, value)
+    return found
+
+
+def _by_name(value: Any) -> Any:
+    """A list of tables that all have names as one table of them; anything else as it is."""
+    if isinstance(value, list) and value and all(isinstance(each, Mapping) and "name" in each for each in value):
+        return {each["name"]: each for each in value}
+    return value
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

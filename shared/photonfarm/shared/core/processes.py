@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -23,6 +26,23 @@ os.execv(sys.argv[2], sys.argv[2:])
 def tied(command: Sequence[str]) -> list[str]:
     """The command, wrapped so that on Linux it gets SIGTERM when this process ends; the main thread must start it."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
+
+
+@contextmanager
+def ended_by_ctrl_c() -> Iterator[None]:
+    """Let Ctrl-C end this process at once, also inside native code, until which Python's own handler would wait.
+
+    For work that keeps nothing before its end; anywhere but in the main thread it changes nothing.
+    """
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def usable_cores() -> int:

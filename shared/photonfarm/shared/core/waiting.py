@@ -1,4 +1,4 @@
-"""Something to read while something takes long, and spans of time in words."""
+"""Lines that say what long work does and how far it is, at least every few seconds; spans of time in words."""
 
 from __future__ import annotations
 
@@ -6,27 +6,68 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import TracebackType
+from typing import Self
 
-EVERY_S = 4.0
+SILENCE_S = 5.0
+"""The longest time without a line."""
+
+Log = Callable[[str], object]
+"""A function that takes a line."""
+
+
+class WorkLog:
+    """A context manager: `begin` says what is done from now on, and a thread says it again, with the time it takes."""
+
+    def __init__(self, log: Log, silence_s: float = SILENCE_S) -> None:
+        """Take where the lines go, and the longest silence between them."""
+        self._log, self._silence_s = log, silence_s
+        self._what, self._begun = "", time.monotonic()
+        self._how_far: Callable[[], str] | None = None
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._repeat, daemon=True)
+
+    def __enter__(self) -> Self:
+        """Begin to watch for silence."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Say no more."""
+        self._ended.set()
+        self._thread.join()
+
+    def begin(self, what: str, how_far: Callable[[], str] | None = None) -> None:
+        """Say what is done now; `how_far` says how far that is, whenever it is said again."""
+        self._what, self._how_far, self._begun = what, how_far, time.monotonic()
+        self._log(what)
+
+    def _repeat(self) -> None:
+        said = self._begun
+        while not self._ended.wait(self._silence_s / 10):
+            said, now = max(said, self._begun), time.monotonic()
+            if now - said >= self._silence_s * 0.85 and self._what:
+                said = now
+                far = f", {self._how_far()}" if self._how_far else ""
+                self._log(f"{self._what}: {now - self._begun:.0f} s so far{far}")
 
 
 @contextmanager
-def waiting(log: Callable[[str], None], what: str, every_s: float = EVERY_S) -> Iterator[None]:
+def waiting(log: Log, what: str, silence_s: float = SILENCE_S) -> Iterator[None]:
     """Say what is done, and every few seconds for how long it has been, until the block ends."""
-    began, done = time.monotonic(), threading.Event()
-
-    def say() -> None:
-        while not done.wait(every_s):
-            log(f"{what}: {time.monotonic() - began:.0f} s so far")
-
-    log(what)
-    teller = threading.Thread(target=say, daemon=True)
-    teller.start()
-    try:
+    with WorkLog(log, silence_s) as work:
+        work.begin(what)
         yield
-    finally:
-        done.set()
-        teller.join()
+
+
+def time_left(done: int, total: int, begun: float) -> str:
+    """How far some equal steps are that began at `begun` of the monotonic clock, and how long the rest should take."""
+    if not done:
+        return f"0 of {total}"
+    left = (time.monotonic() - begun) / done * (total - done)
+    return f"{done} of {total}, about {left:.0f} s more"
 
 
 def in_words(seconds: float) -> str:

@@ -25,6 +25,10 @@ from photonfarm.shared.store.write.guides import jobs_with_views, used_views
 
 VERB = ("scene", "cost")  # of the renderer
 
+LEAST_S, MOST_S, SHARE_S = 20.0, 120.0, 0.1
+"""The processor seconds that measuring may take: a tenth of one for each sample that would be planned, about a tenth of
+what they cost; not below 20, into which most rooms fit, nor above 120, into which all do."""
+
 WORTH_A_CHANGE = 0.05
 """The share of the excess error that a suggestion must save: costs and noise are medians of a few views."""
 
@@ -72,7 +76,8 @@ def rehearse(
     if not (measure and (found.planned or found.guide_views)):
         return found
     try:
-        return _priced(found, named.spec, request, costs_by_renderer(named.name))
+        seconds = min(max(SHARE_S * found.planned, LEAST_S), MOST_S)
+        return _priced(found, named.spec, request, costs_by_renderer(named.name, seconds))
     except BackendError as error:
         log(f"cost and time are not known: {error}")
         return found
@@ -108,15 +113,19 @@ def _guides_of_older_views(scene: SceneStore, loaded: SceneSpec) -> tuple[int, i
     return views, most_guide_bytes(loaded, views, jobs, found[0].shard_rows)
 
 
-def costs_by_renderer(spec: str) -> SampleCosts:
-    """The costs that the renderer measures for a spec, or has kept. Raises BackendError with the reason for none.
+def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
+    """The costs that the renderer measures for a spec in so much processor time, or has kept.
+
+    Raises BackendError with the reason for none.
 
     The renderer's own messages go to stderr.
     """
     name = " ".join(VERB)
     if not is_installed(".".join(VERB)):
         raise BackendError("the renderer, which measures them, is not installed here")
-    done = subprocess.run(command(*VERB, "--json", "--", spec), stdout=subprocess.PIPE, check=False)
+    done = subprocess.run(
+        command(*VERB, "--json", "--seconds", f"{seconds:g}", "--", spec), stdout=subprocess.PIPE, check=False
+    )
     if done.returncode:
         raise BackendError(f"`photonfarm {name}` ended with exit code {done.returncode} here")
     try:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.hold_out import are_held_out, units_of
+from photonfarm.shared.core.keys import Key
+from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
 from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.shared.plan.top_up import PlannedViews
 from photonfarm.shared.scene.spec import SceneSpec
@@ -15,23 +18,73 @@ from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
 from photonfarm.shared.store.write.plans import content
 
+MOST_NAMED = 4096
+"""The largest number of configurations that a message proposes."""
+
 
 def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Request) -> None:
     """Raise SpecError if nothing or everything of what is planned and requested would be held out.
 
-    Nothing is written. The trainer checks the same, but only after everything is rendered.
+    Nothing is written. The message names numbers that would do. The trainer checks the same, but only after everything
+    is rendered.
     """
+    keys = _units(spec, store, request)
+    held_out = are_held_out(keys, share)
+    if _splits(held_out):
+        return
+    which = "all are held out, and none is left to train on" if any(held_out) else "none is held out, and one is needed"
+    of = f"of the {len(keys)} {'configurations' if spec.groups else 'views'} planned"
+    raise SpecError(f"hold_out = {share:g}: {of} {which}; {_remedy(spec, store, share, request, keys)}")
+
+
+def chosen_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> float:
+    """The share to hold out where a user names none: the default, or just enough for one of what a small plan has.
+
+    Raises SpecError if there is only one configuration (in a static scene, view).
+    """
+    keys = _units(spec, store, request)
+    share = enough(keys) or enough(keys, least=0.0)
+    if share is None:
+        more = _least(request, lambda wanted: enough(_units(spec, store, wanted)) is not None)
+        remedy = f"--modifications {more} plans enough" if more else "the spec has no other, as nothing in it varies"
+        kind = "configuration" if spec.groups else "view"
+        raise SpecError(f"{len(keys)} {kind} is planned: one to train on and one to validate on are needed; {remedy}")
+    return share
+
+
+def _remedy(spec: SceneSpec, store: str | Path, share: float, request: Request, keys: set[Key]) -> str:
+    """The numbers that would do, in words."""
+    found = []
+    if (other := enough(keys, least=0.0)) is not None:
+        found.append(f"--hold-out {other:g} holds out one of these")
+    if more := _least(request, lambda wanted: _splits(are_held_out(_units(spec, store, wanted), share))):
+        found.append(f"--modifications {more} plans enough")
+    return ", and ".join(found) or "plan more, or use another --hold-out"
+
+
+def _splits(held_out: list[bool]) -> bool:
+    """Whether some are held out, and some are not."""
+    return 0 < sum(held_out) < len(held_out)
+
+
+def _least(request: Request, works: Callable[[Request], bool]) -> int | None:
+    """The least number of configurations from the request's on that works, as more of them then do; None: not found."""
+    among = range(MOST_NAMED)
+
+    def of(modifications: int) -> bool:
+        return works(request.model_copy(update={"modifications": modifications}))
+
+    found = bisect_left(among, True, lo=min(request.modifications, MOST_NAMED), key=of)
+    return found if found < MOST_NAMED else None
+
+
+def _units(spec: SceneSpec, store: str | Path, request: Request) -> set[Key]:
+    """What is held out as one, of all that is planned and requested: configurations, or a static scene's views."""
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
     planned = _planned(spec, store, wanted)
-    keys = set(units_of(planned, np.arange(len(planned.view_row))))
-    held_out = sum(are_held_out(keys, share))
-    found = f"hold_out = {share:g}: of the {len(keys)} {'configurations' if spec.groups else 'views'} planned"
-    if not held_out:
-        raise SpecError(f"{found} none is held out, and one is needed to validate on; raise it, or plan more")
-    if held_out == len(keys):
-        raise SpecError(f"{found} all are held out, and none is left to train on; lower it, or plan more")
+    return set(units_of(planned, np.arange(len(planned.view_row))))
 
 
 def _planned(spec: SceneSpec, store: str | Path, wanted: Request) -> PlannedViews:

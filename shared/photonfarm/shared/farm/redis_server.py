@@ -11,12 +11,13 @@ import fcntl
 import hashlib
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import IO, NoReturn, Self
 
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.processes import tied
@@ -111,7 +112,7 @@ class EmbeddedRedis:
     def _start(self, lock: IO[bytes]) -> subprocess.Popen[bytes]:
         command = tied([str(server_binary())])
         for setting, value in self._settings().items():
-            command += [f"--{setting}", *value.split(" ")] if value else [f"--{setting}", ""]
+            command += [f"--{setting}", value]  # the server quotes it, also a path with blanks
         with (self.folder / "redis.log").open("ab") as log:
             self._process = subprocess.Popen(
                 command,
@@ -152,6 +153,24 @@ class EmbeddedRedis:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.02)
+
+
+def become_redis(port: int) -> NoReturn:
+    """Become a Redis on a port of this machine, for its own users, that keeps nothing; raises QueueError without one.
+
+    The process is the server itself, so whoever ends it leaves nothing behind. The store is the truth, and what was
+    queued is found again.
+    """
+    binary = str(server_binary())
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            reason = f"cannot be used: {error.strerror}; a Redis may run there already, and --port takes another"
+            raise QueueError(f"port {port}: {reason}") from error
+    settings = ("--bind", "127.0.0.1", "--port", str(port), "--save", "", "--maxmemory-policy", "noeviction")
+    os.execv(binary, [binary, *settings])  # noqa: S606 - a shell would be what is left behind
 
 
 def server_binary() -> Path:

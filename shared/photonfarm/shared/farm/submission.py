@@ -14,6 +14,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.read.other_scenes import other_scenes
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +84,8 @@ def top_up(
     opened = Store(store)
     if scene_id not in opened.scene_ids():
         raise SpecError(
-            f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; `photonfarm submit` "
-            "plans the first ones"
+            f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; "
+            f"{other_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
         )
     planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
     queued = None if redis_url is None or dry_run else queue_missing(opened, redis_url, retry=retry)

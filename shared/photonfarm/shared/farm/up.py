@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -18,13 +19,14 @@ from typing import Protocol
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError, store_errors
 from photonfarm.shared.core.processes import free_port, tied
-from photonfarm.shared.farm.hold_out_check import check_hold_out
+from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import WEB_PORT, announced
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
 from photonfarm.shared.farm.submission import submit, top_up
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress
 from photonfarm.shared.farm.waits import waits
+from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.queue import QueueStatus
@@ -80,7 +82,7 @@ def run_farm(
     workers: int,
     run: Path,
     train_steps: int,
-    hold_out: float,
+    hold_out: float | None,
     out: Path,
     reference_views: int = 0,
     reference_spp: int = 256,
@@ -90,7 +92,8 @@ def run_farm(
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
-    with them. With `web`, pages that show all of it are served on this machine until the end.
+    with them. Without a `hold_out` it is the run's, or of a new run the default or just enough for one configuration.
+    With `web`, pages that show all of it are served on this machine until the end.
 
     A wrong spec, a hold-out that leaves one side empty, and references of no valid number are refused before anything
     is written, by a SpecError.
@@ -100,13 +103,20 @@ def run_farm(
     for warning in warnings(spec, named.spec):
         talk.say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
-    which = (f"held-out={hold_out}", f"views=first:{reference_views}")  # of the planned views get references
+    share = hold_out or _hold_out_of(run)
+    if share is None:
+        share = chosen_hold_out(named.spec, store, request) if train_steps else HOLD_OUT
+        if share != HOLD_OUT:
+            talk.say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
+    which = (f"held-out={share}", f"views=first:{reference_views}")  # of the planned views get references
     if train_steps:
-        check_hold_out(named.spec, store, hold_out, request)
+        check_hold_out(named.spec, store, share, request)
     if references:
         TopUp.of(str(reference_spp), which)
     with store_errors("keep the logs of a run here", run):
         run.mkdir(parents=True, exist_ok=True)
+    with store_errors("keep preview and report here", out):  # found out now, and not when all is trained
+        out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
@@ -122,7 +132,7 @@ def run_farm(
         work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
-            verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=hold_out)
+            verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
         opened, address = Store(store), stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
         trained = run if train_steps else None
         stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
@@ -147,6 +157,14 @@ def run_farm(
                 raise IncompleteError(f"{error}. After that, {second}") from error
             raise
         _call(preview, environment)
+
+
+def _hold_out_of(run: Path) -> float | None:
+    """The share that a run holds out, which it keeps for ever; None for a new run."""
+    try:
+        return float(json.loads((run / "settings.json").read_text())["hold_out"])
+    except (OSError, ValueError, LookupError, TypeError):  # none, or one whose fault the trainer tells
+        return None
 
 
 @contextmanager

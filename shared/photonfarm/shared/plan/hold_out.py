@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -46,9 +47,33 @@ def rows_held_out(source: Keyed[Rows], rows: Rows, share: float) -> list[bool]:
 def are_held_out(units: Iterable[Key], share: float) -> list[bool]:
     """Whether the configurations (in a static scene, views) with these keys are held out of training.
 
-    They are if the first 8 bytes of the content key ("hold out", unit) are below the share.
+    They are if their place is below the share of 2^64.
+    """
+    limit = share * 2.0**64
+    return [place < limit for place in places_of(units)]
+
+
+def places_of(units: Iterable[Key]) -> list[int]:
+    """The place of each unit among all that there could be, from 0 to 2^64 − 1.
+
+    They are the first 8 bytes of the content key ("hold out", unit).
     """
     from photonfarm.shared.core.keys import encoded, key_of  # numpy is slow to load, and the constant needs none
 
-    begin, limit = encoded("hold out"), share * 2.0**64
-    return [int.from_bytes(key_of(begin + encoded(unit))[:8], "little") < limit for unit in units]
+    begin = encoded("hold out")
+    return [int.from_bytes(key_of(begin + encoded(unit))[:8], "little") for unit in units]
+
+
+def enough(units: Iterable[Key], least: float = HOLD_OUT) -> float | None:
+    """A share, at least `least`, that holds out one of these units and leaves one; None if no share does.
+
+    It is `least` itself where that does. Else it holds out as few as it can, and has as few digits as it can.
+    """
+    places = sorted(set(places_of(units)))
+    if len(places) < 2:
+        return None
+    for digits in range(2, 18):
+        share = max(least, math.ceil(places[0] / 2.0**64 * 10**digits) / 10**digits)
+        if places[0] < share * 2.0**64 <= places[-1] and (share == least or share * 2.0**64 <= places[1]):
+            return share
+    return None

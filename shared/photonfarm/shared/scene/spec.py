@@ -239,9 +239,12 @@ class SceneSpec(Frozen):
     @cached_property
     def scene_id(self) -> str:
         """32 hexadecimal digits: the digest of all that a sample's radiance depends on."""
+        return make_key("scene", _canonical(self.identity())).hex()
+
+    def identity(self) -> dict[str, Any]:
+        """All that a sample's radiance depends on, as JSON has it: specs that agree in it are one scene."""
         not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
-        described = self.model_dump(mode="json", exclude=not_of_it)
-        return make_key("scene", _canonical(described)).hex()
+        return self.model_dump(mode="json", exclude=not_of_it)
 
     @property
     def free_space_digest(self) -> str:

@@ -33,10 +33,14 @@ def load_spec(path: str | Path, *, measured_again: bool = False) -> SceneSpec:
     parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
     try:
         described = parse(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
-    except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"{file}: cannot be read: {error}") from error
+    except OSError as error:
+        raise SpecError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SpecError(f"{file}: is no spec, or not saved as UTF-8: byte {error.start} is no text") from error
     except ValueError as error:
         raise SpecError(f"{file}: is not valid {language}: {error}") from error
+    if not isinstance(described, dict):
+        raise SpecError(f"{file}: holds a {type(described).__name__}; the tables of a spec are required")
     if measured_again and isinstance(view := described.get("view"), dict):
         view.pop("free_space", None)
     return parse_spec(described, where=str(file), beside=file.parent)
@@ -69,7 +73,7 @@ def _validate(described: dict[str, Any], where: str) -> SceneSpec:
     try:
         return SceneSpec.model_validate(described)
     except ValidationError as error:
-        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec)))}") from error
+        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec), described))}") from error
 
 
 def _keys(model: type[BaseModel]) -> set[str]:
@@ -117,16 +121,29 @@ def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
     """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
     if Path(file).is_absolute() and Path(file).is_file():
         return Path(file)
+    return _folder_of(file, where, beside) / file
+
+
+def _folder_of(file: str, where: str, beside: Path | None) -> Path:
+    """The folder below which a scene file lies."""
     folders = [beside] if beside else []
     folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
     for folder in folders:
         if (folder / file).is_file():
-            return folder / file
+            return folder
     looked = ", ".join(map(str, folders)) or "nowhere"
     raise SpecError(
         f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
         f"set {SCENES_VARIABLE} to the folder that holds it"
     )
+
+
+def scene_folder(name: str, spec: SceneSpec) -> Path | None:
+    """The absolute folder below which the scene file of a named spec lies; None if it needs none."""
+    file = spec.scene.file
+    if file is None or Path(file).is_absolute():
+        return None
+    return _folder_of(file, name, find_spec(name).parent).absolute()
 
 
 def find_spec(name: str) -> Path:
@@ -139,7 +156,8 @@ def find_spec(name: str) -> Path:
         if (folder / f"{name}.toml").is_file():
             return folder / f"{name}.toml"
     known = sorted({file.stem for folder in folders for file in folder.glob("*.toml")})
-    raise SpecError(f"{name}: no such spec; give a .toml file or one of {', '.join(known)}")
+    what = "no such spec, as it is a folder" if name and path.is_dir() else "no such spec"
+    raise SpecError(f"{name or 'an empty name'}: {what}; give a .toml file or one of {', '.join(known)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -162,7 +162,7 @@ def many(tmp_path: Path, change: Callable[[np.ndarray], None], samples_: int = 2
 def test_halves_of_heavy_tailed_noise_do_not_differ(tmp_path: Path) -> None:
     report = many(tmp_path, lambda _: None)
     assert found(report) == {}
-    assert halves_in_words(report.scenes[0].halves).startswith("|S| = ")
+    assert halves_in_words(report.scenes[0].halves).startswith("no difference beyond chance: |S| = ")
 
 
 @pytest.mark.parametrize(("count", "tells"), [(37, False), (38, True)])
@@ -174,7 +174,9 @@ def test_samples_too_few_for_the_halves_to_differ_are_said_to_be_too_few(
     assert noted(report)["black-half"] == count
     assert found(report) == ({"halves-differ": 1} if tells else {})
     few = "too few samples to tell, 38 are needed at least: |S| = 6.08"
-    assert halves_in_words(report.scenes[0].halves).startswith("|S| = 6.16" if tells else few)
+    assert halves_in_words(report.scenes[0].halves).startswith(
+        "they differ by more than chance: |S| = 6.16" if tells else few
+    )
 
 
 def test_a_half_that_is_biased_somewhere_is_found(tmp_path: Path) -> None:

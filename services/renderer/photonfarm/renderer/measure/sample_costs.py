@@ -6,6 +6,7 @@ of a worker without what it does once for a scene, and without storing.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,10 +23,12 @@ from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy import cache
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.renderer.strategy.budget import Budget
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Photons
+from photonfarm.shared.core.waiting import Log, WorkLog, time_left
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -47,9 +50,6 @@ MOST_PATHS = 1 << 21
 Clean images would take minutes, and beyond one launch of the integrator time is proportional to samples anyway.
 """
 
-LOG_SECONDS = 10.0
-"""The least seconds between two lines of progress."""
-
 T = TypeVar("T")
 
 
@@ -66,19 +66,26 @@ class _Frame:
 
 
 def find_or_measure(
-    spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Callable[[str], None]
+    spec: SceneSpec, beside: Path | None, frames: int, *, again: bool, log: Log, seconds: float = math.inf
 ) -> SampleCosts:
     """The costs kept from an earlier measurement here of as many frames; with `again`, or without one, measured now.
 
-    The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does.
+    In so many `seconds` of processor time, loading included, fewer frames may fit, and what they gave will do for them.
+    The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does,
+    IncompleteError if not even one view fits.
     """
-    file = cache.file_of("costs", cache.digest_here("sample costs with guides", spec.scene_id, str(frames)))
-    if not again and (kept := _kept(file)) is not None:
-        return kept
-    log(f"measuring what samples of {spec.name} cost here, in {frames} views after {WARM_UPS} that do not count")
-    costs = measured_costs(spec, beside, frames, log)
+    of = "sample costs with guides", spec.scene_id, str(frames)
+    whole, part = (cache.file_of("costs", cache.digest_here(*of, *also)) for also in ((), ("in few seconds",)))
+    for file in [] if again else [whole, part] if math.isfinite(seconds) else [whole]:
+        if (kept := _kept(file)) is not None:
+            return kept
+    with WorkLog(log) as work_log:
+        work_log.begin(f"loading {spec.name}")
+        budget = Budget(seconds)
+        loaded = LoadedScene.load(spec, beside)
+        costs, measured = costs_within(loaded, frames, budget, work_log)
     try:
-        write_whole(file, costs.json())
+        write_whole(whole if measured == frames else part, costs.json())
     except OSError as error:
         log(f"the measurement could not be kept: {error}")
     return costs
@@ -91,27 +98,46 @@ def _kept(file: Path) -> SampleCosts | None:
         return None
 
 
-def measured_costs(
-    spec: SceneSpec, beside: Path | None = None, frames: int = FRAMES, log: Callable[[str], None] | None = None
-) -> SampleCosts:
+def measured_costs(spec: SceneSpec, frames: int = FRAMES) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
-    return sample_costs(LoadedScene.load(spec, beside), frames, log)
+    return sample_costs(LoadedScene.load(spec), frames)
 
 
-def sample_costs(scene: LoadedScene, frames: int, log: Callable[[str], None] | None = None) -> SampleCosts:
+def sample_costs(scene: LoadedScene, frames: int, log: Log = lambda _: None) -> SampleCosts:
     """The medians over views of `frames` random configurations, one view of each, after some untimed ones."""
+    with WorkLog(log) as work_log:
+        return costs_within(scene, frames, Budget(math.inf), work_log)[0]
+
+
+def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: WorkLog) -> tuple[SampleCosts, int]:
+    """The costs, and of how many frames; as many as the budget allows, and in little time no untimed one before."""
+    name, begun, measured = scene.spec.name, time.monotonic(), list[_Frame]()
+    work_log.begin(
+        f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count",
+        lambda: f"view {time_left(len(measured), WARM_UPS + frames, begun)}",
+    )
     cloud = scene.base()[1]
-    measured, logged = [], time.monotonic()
+    last_s = 0.0
     for number in range(WARM_UPS + frames):
+        if number and last_s > budget.left_s:
+            break
+        before = budget.spent_s
+        if not number and before > budget.seconds:
+            raise IncompleteError(
+                f"{name}: loading it took {before:.0f} s of processor time, more than the {budget.seconds:.0f} s for "
+                "measuring its costs; `photonfarm scene cost` measures them without a limit, and keeps them"
+            )
         measured.append(_measured(scene, cloud, number))
-        if log is not None and time.monotonic() - logged > LOG_SECONDS:
-            log(f"view {number + 1} of {WARM_UPS + frames}")
-            logged = time.monotonic()
-    measured = measured[WARM_UPS:]
+        last_s = budget.spent_s - before
+    measured = measured[min(WARM_UPS, len(measured) - 1) :]
+    return _medians(scene.spec.scene_id, measured), len(measured)
+
+
+def _medians(scene_id: str, measured: list[_Frame]) -> SampleCosts:
     noise = [frame.noise for frame in measured if frame.noise is not None]
     return SampleCosts(
-        scene.spec.scene_id,
+        scene_id,
         _median([frame.configuration_s for frame in measured]),
         _median([frame.view_s for frame in measured]),
         _median([frame.pass_s for frame in measured]),

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
-from photonfarm.renderer.strategy.candidate import DEFAULT, Candidate
+from photonfarm.renderer.strategy.budget import EDITS, VIEWS, Budget, affordable
+from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
 from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.core.models import Frozen
+from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
 
 GRID = tuple(
@@ -36,11 +37,12 @@ TIMING = 0.2
 
 LEAST_VIEWS, MOST_VIEWS = 3, 8
 
-LIT = 16
-"""The number of configurations in which light paths are traced, to see which photons are worth storing."""
+LIT, LEAST_LIT, REACH = 16, 2, 0.25
+"""The number of configurations in which light paths are traced, to see which photons are worth storing: 16, or as many,
+at least 2, as a quarter of the time allows, with what went before."""
 
-Log = Callable[[str], None]
-"""A function that takes a line about the progress."""
+IMAGES = 400
+"""The number of images that the time should pay for: about as many as ten settings need at least."""
 
 
 class CandidateRow(Frozen):
@@ -101,29 +103,37 @@ class _Compared:
     half_s: float
     choice: pilot.Choice
     rows: tuple[CandidateRow, ...]
+    notes: tuple[str, ...]  # sentences on what there was no time for
 
 
 def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> Measurement:
-    """Load the scene of a spec and measure its light transport, in about `seconds` of CPU time.
+    """Load the scene of a spec and measure its light transport, in `seconds` of CPU time for all of it.
 
-    The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does.
+    The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does,
+    IncompleteError, with the time that it takes, if the time is too short.
     """
-    begun = time.process_time()
-    log(f"loading {spec.name}")
-    pilot_scene = PilotScene(spec, beside)
-    found = content.read(pilot_scene.loaded.scene, pilot_scene.camera())
-    reach = light_reach.measure(pilot_scene.configurations(LIT), spec.view, SEED)
-    depth = spec.transport.max_depth
-    candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
-    compared = _compare(pilot_scene, beside, list(dict.fromkeys([*candidates, present(spec)])), seconds, log)
-    spent = time.process_time() - begun
+    budget = Budget(seconds)
+    with WorkLog(log) as work_log:
+        work_log.begin(f"loading {spec.name}", budget.words)
+        pilot_scene = PilotScene(spec, beside)
+        budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
+        found = content.read(pilot_scene.loaded.scene, pilot_scene.camera())
+        work_log.begin(f"following the light of {spec.name}", budget.words)
+        loaded_s = budget.spent_s
+        reach = light_reach.measure(budget.within(REACH, pilot_scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
+        edit_s = (budget.spent_s - loaded_s) / len(reach.near)
+        depth = spec.transport.max_depth
+        candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
+        every = list(dict.fromkeys([*candidates, present(spec)]))
+        compared = _compare(pilot_scene, every, edit_s, budget, work_log)
+    spent = budget.spent_s
     return Measurement(
         film=compared.film,
         spp=compared.spp,
         half_s=compared.half_s,
         views=compared.choice.views,
         max_depth=depth,
-        modelled=tuple(content.sentences(found, depth)),
+        modelled=(*content.sentences(found, depth), *compared.notes),
         left_out=tuple(map(str, left_out)),
         rows=compared.rows,
         shared=compared.choice.shared,
@@ -137,17 +147,27 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> M
 
 
 def _compare(
-    pilot_scene: PilotScene, beside: Path | None, candidates: list[Candidate], seconds: float, log: Log
+    pilot_scene: PilotScene, every: list[Candidate], edit_s: float, budget: Budget, work_log: WorkLog
 ) -> _Compared:
     spec = pilot_scene.spec
-    now, half_spp, left_s = present(spec), spec.transport.half_spp, (1 - TIMING) * seconds
-    costs = time_images(pilot_scene.renders(1)[0], candidates, half_spp, TIMING * seconds, pilot_scene.clock)
+    now, half_spp = present(spec), spec.transport.half_spp
+    work_log.begin("compiling and timing images", budget.words)
+    quick = _on_quick_film(pilot_scene, budget)
+    what = f"{spec.name}: comparing settings"
+    candidates = affordable(quick.renders(1)[0], every, {PLAIN, now} & set(every) or {now}, budget, edit_s, what)
+    timed = time_images(quick.renders(1)[0], candidates, half_spp, TIMING * budget.left_s, quick.clock)
+    pixels = spec.film.width * spec.film.height
+    scale = pixels / (quick.spec.film.width * quick.spec.film.height)
+    costs = {candidate: ImageCost(cost.fixed_s, scale * cost.sample_s) for candidate, cost in timed.items()}
     half_s = costs[now].time_s(half_spp)
+    left_s = max(budget.left_s - EDITS * VIEWS * edit_s, 0.0)
     film, spp, views = _pilot_film(spec, costs, left_s)
-    if film != spec.film:
-        pilot_scene = PilotScene(spec.model_copy(update={"film": film}), beside)
-    log(f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp")
-    pilot_spp = spp * film.width * film.height / (spec.film.width * spec.film.height)  # of the spec's film
+    pilot_scene = quick.on_film(film)
+    work_log.begin(
+        f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp",
+        budget.words,
+    )
+    pilot_spp = spp * film.width * film.height / pixels  # of the spec's film
     choice = pilot.choose(
         pilot_scene.renders(views),
         candidates,
@@ -159,7 +179,28 @@ def _compare(
         clock=pilot_scene.clock,
     )
     rows = tuple(_row(measured, costs[measured.candidate], pilot_spp, half_spp) for measured in choice.measured)
-    return _Compared(film, spp, half_s, choice, rows)
+    fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {budget.seconds:g} allows no more"
+    return _Compared(film, spp, half_s, choice, rows, (fewer,) if len(candidates) < len(every) else ())
+
+
+def _on_quick_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
+    """The scene on a film whose images are quick to render, halved as often as it helps; not below 32 pixels."""
+    target_s = budget.left_s / IMAGES
+    before = np.inf
+    while True:
+        render, film = pilot_scene.renders(1)[0], pilot_scene.spec.film
+        render(PLAIN, 0, 1)  # compiles
+        begun = pilot_scene.clock()
+        render(PLAIN, 1, 1)
+        image_s = pilot_scene.clock() - begun
+        if image_s <= target_s or min(film.width, film.height) < 64 or image_s > 0.7 * before:
+            return pilot_scene
+        before = image_s
+        pilot_scene = pilot_scene.on_film(_halved(film))
+
+
+def _halved(film: Film) -> Film:
+    return Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
 
 
 def present(spec: SceneSpec) -> Candidate:
@@ -185,7 +226,7 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     spp = int(np.clip((budget / LEAST_VIEWS - fixed) / sample, 1, spec.transport.half_spp))
     film = spec.film
     while LEAST_VIEWS * (fixed + spp * sample) > budget and spp * sample > fixed and min(film.width, film.height) >= 64:
-        film = Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
+        film = _halved(film)
         sample /= 4
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 

@@ -12,8 +12,8 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.sensor import AimedSensor
 from photonfarm.renderer.strategy.candidate import Candidate, Render
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 
 SEED = 0
@@ -23,13 +23,21 @@ SEED = 0
 class PilotScene:
     """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
 
-    def __init__(self, spec: SceneSpec, beside: Path | None) -> None:
-        """Load the scene of a spec, on a film as small as the pilot requires."""
+    def __init__(self, spec: SceneSpec, beside: Path | None, loaded: LoadedScene | None = None) -> None:
+        """Load the scene of a spec, on a film as small as the pilot requires, or take the loaded one."""
         self.spec = spec
-        self.loaded = LoadedScene.load(spec, beside)
+        self.loaded = loaded or LoadedScene.load(spec, beside)
         self._integrators: dict[Candidate, Any] = {}
         self._applied: Modification | None = None
         self._editing_s = 0.0
+
+    def on_film(self, film: Film) -> PilotScene:
+        """The same scene on another film, without loading it again; after that, only the new one may be used."""
+        if film == self.spec.film:
+            return self
+        self.loaded.apply(rest(self.spec))
+        spec = self.spec.model_copy(update={"film": film})
+        return PilotScene(spec, None, LoadedScene(spec, self.loaded.scene))
 
     def clock(self) -> float:
         """CPU seconds of this process without those of edits, which cost all candidates the same."""

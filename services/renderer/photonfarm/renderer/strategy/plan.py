@@ -11,8 +11,9 @@ from photonfarm.renderer.strategy import cache, light_reach
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost, candidates_at_equal_cost, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
-from photonfarm.renderer.strategy.measurement import Log, Measurement, measure, present
+from photonfarm.renderer.strategy.measurement import Measurement, measure, present
 from photonfarm.renderer.strategy.output.spec_file import SpecTables
+from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, cast
 
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+from photonfarm.shared.core.waiting import Log, waiting
 from photonfarm.shared.store.io.storage import open_storage
 
 if TYPE_CHECKING:
@@ -30,10 +32,10 @@ class MachineCheck:
     exit_code: int = 0  # of the command, if this check fails and is required
 
 
-def examine(store: str | Path, redis_url: str) -> Iterator[MachineCheck]:
+def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Iterator[MachineCheck]:
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
-    yield _tried("renderer", _renders)
+    yield _tried("renderer", lambda: _renders(log))
     yield _tried("store", lambda: _writes(store))
     yield _tried("embedded Redis", _starts_redis)
     yield _optional(_tried("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
@@ -56,7 +58,8 @@ def _optional(finding: MachineCheck, note: str) -> MachineCheck:
     return finding if finding.works else MachineCheck(finding.name, False, f"{finding.detail} ({note})")
 
 
-def _renders() -> str:
+@ended_by_ctrl_c()
+def _renders(log: Log) -> str:
     from photonfarm.renderer.scene import backend
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
     from photonfarm.shared.scene.spec_loading import load_spec
@@ -65,7 +68,8 @@ def _renders() -> str:
     mi = backend.load(threads=1)
     spec = load_spec("cornell")
     start = time.perf_counter()
-    image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
+    with waiting(log, "rendering a Cornell box"):
+        image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
     seconds = time.perf_counter() - start
     size = f"{spec.film.width} × {spec.film.height}"
     return f"{mi.variant()}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"

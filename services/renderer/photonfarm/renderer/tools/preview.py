@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.shared.core import pictures
+from photonfarm.shared.core.errors import store_errors
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import Geometry, Photons
@@ -71,8 +72,9 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
 
 def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
     """Write the page to a file."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(contact_sheet(reader, count))
+    with store_errors("write the sheet", out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(contact_sheet(reader, count))
 
 
 def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:

@@ -31,6 +31,7 @@ from photonfarm.trainer.networks.inputs import given
 from photonfarm.trainer.predict import animation
 from photonfarm.trainer.predict.evaluation import error_of
 from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import with_scenes
 
 VERB = "buffers"  # of the renderer
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
@@ -118,8 +119,8 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "buffers.npz"
         named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        code = subprocess.run(command(VERB, *named, *arguments), stdout=subprocess.DEVNULL, check=False).returncode
-        if code:
+        verb, found = command(VERB, *named, *arguments), with_scenes(run.folder)
+        if code := subprocess.run(verb, env=found, stdout=subprocess.DEVNULL, check=False).returncode:
             raise _ended(code)
         return Frames.read(file)
 
@@ -200,8 +201,10 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
 
 
 def _source(store: str | Path, run: TrainedRun) -> StoreSource:
-    """The samples of the run's scene; StoreError if there is no store."""
-    return StoreSource(Store(store).root, run.scene_id)
+    """The samples of the run's scene; StoreError if there is no store, or it lacks the scene."""
+    source = StoreSource(Store(store).root, run.scene_id)
+    _ = source.spec  # which says what is there instead
+    return source
 
 
 def _make(folder: Path) -> None:

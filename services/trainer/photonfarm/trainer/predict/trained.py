@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.networks import build, kind_of
@@ -18,6 +19,7 @@ from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.stored_settings import read_settings
+from photonfarm.trainer.runs.user_code import named_in_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +47,16 @@ class TrainedRun:
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""
         settings = self.settings.network
-        network = build(settings, SceneFrame.of(spec, *base, settings), self.settings.seed)
-        network.load_state_dict(self.weights)
+        with named_in_errors(architecture=settings.architecture):
+            network = build(settings, SceneFrame.of(spec, *base, settings), self.settings.seed)
+        try:
+            network.load_state_dict(self.weights)
+        except RuntimeError as error:  # a user's class has changed, or this version's
+            found = str(error).splitlines()[-1].strip().rstrip(".")
+            raise SpecError(
+                f"{self.folder}: its weights do not fit the network {settings.architecture!r} as it is now ({found}); "
+                "bring back the code that it was trained with, or train anew in another folder"
+            ) from error
         return network
 
     @property
@@ -63,4 +73,6 @@ class TrainedRun:
 
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
         """The network as a predictor on a device. SpecError if the device is not usable."""
-        return network_predictor(self.network(spec, base).to(usable_device(device)).eval())
+        predict = network_predictor(self.network(spec, base).to(usable_device(device)).eval())
+        named = named_in_errors(architecture=self.settings.network.architecture)
+        return replace(predict, images=named(predict.images))

@@ -102,7 +102,7 @@ def gathered(
     card = DatasetCard.of(store, first.scene_id)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     tell = on_progress or (lambda *_: None)
-    close_look = _CloseLook(store, first.scene_id, kept, points_used(runs), tell, timed=timed)
+    close_look = _CloseLook(store, first, kept, points_used(runs), tell, timed=timed)
     evaluation = evaluate.compare(
         store, runs, denoisers, references=references, inception=inception, most=most, device=device,
         on_progress=on_progress, choose=close_look,
@@ -175,7 +175,7 @@ class _CloseLook:
     def __init__(
         self,
         store: str | Path,
-        scene_id: str,
+        run: TrainedRun,
         kept: Sequence[int],
         points: int | None,
         on_progress: MeasureProgress,
@@ -183,7 +183,7 @@ class _CloseLook:
         timed: bool,
     ) -> None:
         self._on_progress = on_progress
-        self._store, self._scene_id, self._kept, self._points, self._timed = store, scene_id, kept, points, timed
+        self._store, self._run, self._kept, self._points, self._timed = store, run, kept, points, timed
         self.costs: FrameCosts | None = None
         self.untimed = "it was not asked for"
         self.worst: list[WorstCase] = []
@@ -194,7 +194,7 @@ class _CloseLook:
             self._on_progress("the renderer times frames", 0, 0)
             rows = list(references or images)
             try:
-                self.costs = frame_costs(self._store, self._scene_id, rows, self._kept, self._points)
+                self.costs = frame_costs(self._store, self._run, rows, self._kept, self._points)
             except BackendError as error:
                 self.untimed = str(error)
         self._on_progress("the worst cases are looked for", 0, 0)
@@ -204,7 +204,7 @@ class _CloseLook:
 
     def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
         """The views that have references, with the first network's images of them."""
-        source = StoreSource(self._store, self._scene_id)
+        source = StoreSource(self._store, self._run.scene_id)
         source.refresh()
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []

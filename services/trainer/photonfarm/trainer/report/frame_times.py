@@ -17,6 +17,7 @@ from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
 from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import with_scenes
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
@@ -54,9 +55,11 @@ class FrameTime:
 
 
 def frame_costs(
-    store: str | Path, scene_id: str, rows: Sequence[int], kept: Sequence[int], points: int | None
+    store: str | Path, run: TrainedRun, rows: Sequence[int], kept: Sequence[int], points: int | None
 ) -> FrameCosts:
     """The renderer's measurement of the frames in some rows, with so many points of the cloud, or with all.
+
+    `run` is one on their scene.
 
     The renderer's own messages go to stderr. Raises BackendError with the reason if there is no measurement.
     """
@@ -64,11 +67,12 @@ def frame_costs(
         raise BackendError("the renderer, which makes buffers and photons, is not installed here")
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
-        asked = ["--store", str(store), "--scene", scene_id, "--out", str(file)]
+        asked = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
         asked += ["--timed", str(TIMED), *([] if points is None else ["--points", str(points)])]
         asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
-        if code := subprocess.run(command(VERB, *asked), stdout=subprocess.DEVNULL, check=False).returncode:
+        verb, found = command(VERB, *asked), with_scenes(run.folder)
+        if code := subprocess.run(verb, env=found, stdout=subprocess.DEVNULL, check=False).returncode:
             raise BackendError(f"`photonfarm {VERB}` ended with exit code {code} here")
         return FrameCosts.read(file)
 

@@ -23,6 +23,7 @@ from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
+from photonfarm.shared.core.models import Changes, differing
 from photonfarm.shared.store.io.local import sync
 from photonfarm.trainer.runs.settings import NetworkSettings
 
@@ -30,9 +31,6 @@ FORMAT = 3
 ANEW = "remove it, and the run begins anew"
 METADATA = "photonfarm"
 TENSOR = "tensor"
-
-Changes = dict[str, tuple[Any, Any]]
-"""Changed settings by key: the old and the new value."""
 
 LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
@@ -147,7 +145,7 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     """
     then, now = ({"scene_id": one["scene_id"], **one["settings"]} for one in (state, identity))
     check_of_this_version(path, then["network"])
-    changed = _differing(then, now)
+    changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
@@ -174,18 +172,6 @@ def _option(key: str, value: Any) -> str:
     if name in OPTIONS:
         return f"without --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
     return f"--set {name}={'null' if value is None else value}"
-
-
-def _differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
-    """The values that differ, (then, now), by key; a key within another one as OUTER.INNER."""
-    found: Changes = {}
-    for key in {**before, **now}:
-        then, value = before.get(key), now.get(key)
-        if isinstance(then, Mapping) and isinstance(value, Mapping):
-            found |= _differing(then, value, f"{inside}{key}.")
-        elif then != value:
-            found[f"{inside}{key}"] = (then, value)
-    return found
 
 
 def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import torch
 
 from photonfarm.shared.core.errors import SpecError
@@ -17,10 +19,10 @@ def usable_device(name: str) -> torch.device:
     whose mantissa has 10 bits; `precision = bfloat16` is the setting for speed. Raises SpecError if torch cannot use
     the device.
     """
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise SpecError(f"device = {name!r}: must be auto, cpu, cuda or cuda:N")
     try:
         device = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if name == AUTO else name)
-        if device.type not in ("cpu", "cuda"):
-            raise SpecError(f"device = {name!r}: must be auto, cpu or cuda")
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:  # the latter if torch was built without CUDA
         raise SpecError(f"device = {name!r}: cannot be used here: {str(error).splitlines()[0]}") from error

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError, store_errors
+from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
 LOCK = "lock"
 CHECKPOINT = "checkpoint.safetensors"
 INITIAL = "initial.safetensors"
 METRICS = "metrics.jsonl"
 SETTINGS = "settings.json"
+SCENE_FOLDER = "scene-folder.txt"
 
 
 @contextmanager
@@ -32,3 +35,20 @@ def held(folder: Path) -> Iterator[None]:
             except BlockingIOError as error:
                 raise StoreError(f"{folder}: another trainer is at work on this run; use another run folder") from error
         yield
+
+
+def note_scene_folder(folder: Path, scenes: Path | None) -> None:
+    """Note where the run's scene file lies on this machine, for `with_scenes`; None leaves what was noted."""
+    if scenes is not None:
+        with store_errors("note where the scene lies", folder):
+            (folder / SCENE_FOLDER).write_text(f"{scenes}\n")
+
+
+def with_scenes(folder: Path) -> dict[str, str]:
+    """The environment in which the renderer's verbs find a run's scene: where a variable says, else where noted."""
+    try:
+        noted = (folder / SCENE_FOLDER).read_text().strip()
+    except (OSError, UnicodeDecodeError):
+        return dict(os.environ)
+    folders = filter(None, (os.environ.get(SCENES_VARIABLE), noted))
+    return {**os.environ, SCENES_VARIABLE: os.pathsep.join(folders)}

@@ -24,8 +24,7 @@ def is_own(name: str) -> bool:
 def load(key: str, name: str) -> Any:
     """Load the object `MODULE:NAME`; the module is searched for on Python's path and in the current folder.
 
-    `key` is the setting that names it. Raises SpecError if there is no such module or it lacks the name; other errors
-    of the module are not caught.
+    `key` is the setting that names it. Raises SpecError if there is no such module, it fails, or it lacks the name.
     """
     module, _, attribute = name.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
@@ -36,6 +35,12 @@ def load(key: str, name: str) -> Any:
         raise SpecError(
             f"{key} = {name!r}: Python finds no module {error.name!r}; run in the folder that holds it, or put that "
             "folder on PYTHONPATH"
+        ) from error
+    except Exception as error:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(here)]
+        line = f", line {frames[-1].lineno}" if frames and not isinstance(error, SyntaxError) else ""
+        raise SpecError(
+            f"{key} = {name!r}: module {module} cannot be imported{line}: {type(error).__name__}: {error}"
         ) from error
     if not hasattr(found, attribute):
         exist = ", ".join(each for each in vars(found) if not each.startswith("_")) or "nothing"

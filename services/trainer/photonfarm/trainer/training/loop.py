@@ -16,6 +16,7 @@ import torch
 
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.shared.core.estimate import group_means
+from photonfarm.shared.core.models import Changes
 from photonfarm.shared.core.processes import Stop
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
@@ -151,13 +152,13 @@ class Session:
             self._log.write("loss", step=self._step, loss=self._settings.loss, verdict=str(self._learner.verdict))
         self._report_draws()
 
-    def _start(self) -> checkpoint.Changes:
+    def _start(self) -> Changes:
         self._send_begin(continues=False)
         settle(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 
-    def _continue(self, path: Path) -> checkpoint.Changes:
+    def _continue(self, path: Path) -> Changes:
         """Resume from a checkpoint; returns the changed settings."""
         state = checkpoint.load(path)
         changed = checkpoint.check_continues(path, state, self._identity())

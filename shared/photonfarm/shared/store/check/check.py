@@ -103,11 +103,14 @@ def check_store(
 
 def halves_in_words(halves: HalvesResult) -> str:
     """The outcome of the test between A and B, in words."""
-    few = "" if halves.is_conclusive else f"too few samples to tell, {ceil(halves.limit**2)} are needed at least: "
-    return few + (
-        f"|S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} {halves.limit:.2f}, "
-        f"which chance reaches with probability {SIGNIFICANCE:g} at most; (A − B)/(A + B) = {halves.difference:+.2%} "
-        f"± {halves.standard_error:.2%} over {halves.samples} samples"
+    verdict = "no difference beyond chance" if halves.passed else "they differ by more than chance"
+    if not halves.is_conclusive:
+        verdict = f"too few samples to tell, {ceil(halves.limit**2)} are needed at least"
+    return (
+        f"{verdict}: |S| = {halves.statistic:.2f} in {halves.where}, {'below' if halves.passed else 'above'} "
+        f"{halves.limit:.2f}, which chance reaches with probability {SIGNIFICANCE:g} at most; of whole images "
+        f"(A − B)/(A + B) = {halves.difference:+.2%}, and chance allows ± {halves.allowed:.2%} over {halves.samples} "
+        "samples"
     )
 
 

@@ -32,6 +32,7 @@ class HalvesResult:
     where: str  # the block of the largest |S|, or the whole image
     difference: float  # mean over the samples of (A − B) / (A + B) of whole images
     standard_error: float  # of `difference`; 0 for a single sample
+    allowed: float  # how far `difference` may be from 0 by chance, as `statistic` may be up to `limit`
 
     @property
     def passed(self) -> bool:
@@ -92,7 +93,9 @@ class HalvesTest:
         mean = float(self._sum[-1] / n)
         variance = max(float(self._squares[-1] / n) - mean**2, 0.0)
         error = sqrt(variance / (n - 1)) if n > 1 else 0.0
-        return HalvesResult(n, float(abs(s[place])), sqrt(2 * log(2 * self._tests / SIGNIFICANCE)), where, mean, error)
+        limit = sqrt(2 * log(2 * self._tests / SIGNIFICANCE))
+        allowed = limit * sqrt(float(self._squares[-1])) / n
+        return HalvesResult(n, float(abs(s[place])), limit, where, mean, error, allowed)
 
 
 class Fingerprints:

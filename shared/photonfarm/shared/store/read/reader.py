@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,9 @@ class StoredSample:
     pass_: int
     guides: Guides | None = None  # of a reader that reads them
 
+
+REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
+"""The remedy for damaged samples."""
 
 GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
 
@@ -178,7 +182,7 @@ class SceneReader:
         batch.rows[:], batch.view_rows[:] = chosen, self._view_row[chosen]
         batch.modification_rows[:] = self._modification_row[chosen]
         batch.wide.clear()
-        with store_errors("read samples", self._storage.where):
+        with self._reading("read samples"):
             for place, row in enumerate(chosen.tolist()):
                 self._read_radiance(row, place, batch)
             for name, memory in (*batch.buffers.items(), *batch.guides.items(), *batch.seen.items()):
@@ -196,7 +200,8 @@ class SceneReader:
         seen = ViewBuffers(**buffers), batch.visibility(0)
         sample = StoredSample(row, modification, view, batch.linear(0), *seen, pass_, guides)
         if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
-            raise CorruptError(f"{self._storage.where}/{self._name}: row {row} holds a value that is not finite")
+            where = f"{self._storage.where}/{self._name}"
+            raise CorruptError(f"{where}: row {row} holds a value that is not finite; {REPAIR}")
         return sample
 
     def inputs(self, row: int) -> tuple[Modification, View, int]:
@@ -209,7 +214,7 @@ class SceneReader:
         if not self.spec.photons.paths:
             raise StoreError(f"scene {self._scene_id} has photons.paths = 0; no photons are stored")
         modification_row = self.modification_row(row)
-        with store_errors("read photons", self._storage.where):
+        with self._reading("read photons"):
             bounce = self._read("photon_bounce", modification_row)
             floats = [f.name for f in fields(Photons) if f.name != "bounce"]
             read = {
@@ -282,6 +287,9 @@ class SceneReader:
         if shard is not None and within in shard:
             self._read_from(shard, "radiance", row, batch.radiance[place])
             return
+        wide, _ = self._shard("radiance_wide", row)
+        if wide is None or within not in wide:
+            raise self._missing("radiance" if shard is None or wide is not None else "radiance_wide", row)
         batch.radiance[place] = np.nan  # so that a caller that ignores `wide` notices
         batch.wide[place] = self._read("radiance_wide", row)
 
@@ -294,10 +302,23 @@ class SceneReader:
     def _read_into(self, name: str, row: int, values: NDArray[Any]) -> None:
         shard, within = self._shard(name, row)
         if shard is None or within not in shard:
-            file = self._file(name, row // self._plans[0].shard_rows)
-            self._storage.require()
-            raise CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
+            raise self._missing(name, row)
         self._read_from(shard, name, row, values)
+
+    def _missing(self, name: str, row: int) -> CorruptError:
+        """The error of a row that is not in its shard; raises StoreError if the store is gone."""
+        file = self._file(name, row // self._plans[0].shard_rows)
+        self._storage.require()
+        return CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
+
+    @contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """Turn errors of the disk into StoreErrors, and tell of damage with its remedy."""
+        with store_errors(what, self._storage.where):
+            try:
+                yield
+            except CorruptError as error:
+                raise CorruptError(f"{error}; {REPAIR}") from error
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
         """Read a row of an open shard; if that fails, of the present file, which may have been repaired since.

@@ -24,6 +24,7 @@ from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema
+from photonfarm.shared.store.format.plain_inputs import read_plain
 from photonfarm.shared.store.io.storage import Storage
 
 PLANS = "plans"
@@ -40,6 +41,9 @@ RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a co
 
 REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
 """The remedy for most damage of a plan."""
+
+INPUTS = [field.name for field in fields(PlannedRows)]
+"""The names of a plan's arrays of inputs."""
 
 _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
@@ -189,20 +193,26 @@ def count(storage: Storage, scene: str, loaded: int = 0) -> int:
 
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan with its inputs; raises CorruptError if it is not as it was written."""
-    import zarr
-
     name = folder(scene, number)
     try:
-        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-        check_version(group.attrs, f"{storage.where}/{name}")
-        names = [field.name for field in fields(PlannedRows)]
-        rows = PlannedRows(**{each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in names})
-        about = about_plan(dict(group.attrs))
+        attributes, inputs = read_plain(storage, name, INPUTS) or _through_zarr(storage, name)
+        check_version(attributes, f"{storage.where}/{name}")
+        rows = PlannedRows(**inputs)
+        about = about_plan(attributes)
     except FileNotFoundError as error:
         raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
     except (ValueError, KeyError, RuntimeError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
     return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+
+
+def _through_zarr(storage: Storage, name: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """The attributes of a plan and its inputs, as zarr-python reads them; raises what it raises, and CorruptError."""
+    import zarr
+
+    group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+    check_version(group.attrs, f"{storage.where}/{name}")
+    return dict(group.attrs), {each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS}
 
 
 def reason(error: Exception) -> str:

@@ -233,6 +233,17 @@ def is_there(storage: Storage, scene_id: str) -> bool:
     return False
 
 
+def held(storage: Storage) -> str:
+    """The scenes that are there, by name and id, in words."""
+    named = []
+    for scene_id in scene_ids(storage):
+        try:
+            named.append(f"{read_spec(storage, scene_id).name} ({scene_id})")
+        except StoreError:
+            named.append(f"{scene_id} (unreadable)")
+    return f"it holds {', '.join(named) or 'none yet'}"
+
+
 def are_there(storage: Storage) -> bool:
     """Whether a place that may not be a store has folders of scenes; raises StoreError if it cannot be read."""
     with store_errors("look for scenes", storage.where):
@@ -246,7 +257,7 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
         spec = SceneSpec.model_validate_json(storage.read(name))
     except FileNotFoundError as error:
         if not is_there(storage, scene_id):
-            raise StoreError(f"{storage.where}: holds no scene {scene_id}") from error
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}; {held(storage)}") from error
         if storage.exists(name):  # a submission has begun the scene in the meantime
             return read_spec(storage, scene_id)
         raise CorruptError(

@@ -33,6 +33,10 @@ class Store:
         with store_errors("make a store here", self.storage.where):
             if self.storage.exists(FORMAT_FILE):
                 return
+            if Path(self.storage.where).is_symlink() and not Path(self.storage.where).exists():
+                raise StoreError(
+                    f"{self.storage.where}: is a link to what is not there; mend it, or name another store"
+                )
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
             if foreign and not self.storage.exists(FORMAT_FILE):  # no other process made one in the meantime
                 raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
@@ -140,6 +144,9 @@ def check_format(storage: Storage) -> str:
     except FileNotFoundError as error:
         if are_there(storage):
             raise CorruptError(f"{file}: is missing, and scenes are there: {_put_back()}") from error
+        if not set(storage.names("")) - {TMP}:
+            remedy = "`photonfarm submit` makes one, and --store names another"
+            raise StoreError(f"{storage.where}: there is no store; {remedy}") from error
         raise StoreError(f"{storage.where}: is not a store: {FORMAT_FILE} is missing") from error
     except OSError as error:
         raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error

@@ -306,9 +306,8 @@ def scene_import(path: Path, out: Path | None, up: str | None, as_json: bool) ->
         return
     for line in (*made.notes, *made.found):
         click.echo(line)
-    click.echo(
-        f"{made.spec} and {made.folder} are written; see it by: photonfarm up {quote(str(made.spec))} --modifications 64"
-    )
+    command = f"photonfarm up {quote(str(made.spec))} --modifications 64"
+    click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")
 
 
 @click.command()

@@ -8,6 +8,7 @@ import re
 import sys
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -297,6 +298,35 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     if write:
         spec_file.write(file, {"view": {"free_space": found.entry()}})
         click.echo(f"{file}: [view.free_space] written", err=True)
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="SPEC",
+              help="The spec to write; the scene goes into a folder beside it.  [default: as PATH]")  # fmt: skip
+@click.option("--up", type=click.Choice(["x", "y", "z"]),
+              help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
+@json_option
+def scene_import(path: Path, out: Path | None, up: str | None, as_json: bool) -> None:
+    """Make a spec of a scene of another program, and a copy of the scene that photonfarm can render.
+
+    PATH is a scene of Mitsuba (.xml, of versions 0.6 to 3), glTF (.gltf, .glb) or OBJ (.obj, with its .mtl), or what
+    Blender reads (.blend, .usd, .fbx), where there is one: docs/own-scene.md says how. Furniture, lights, views and the
+    exposure are proposed; all of it can be changed in the spec.
+    """
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads=1)
+    from photonfarm.renderer.importing.importer import AXES, import_scene
+
+    made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True))
+    if as_json:
+        click.echo(json.dumps(made.document(), indent=1))
+        return
+    for line in (*made.notes, *made.found):
+        click.echo(line)
+    command = f"photonfarm up {quote(str(made.spec))} --modifications 64"
+    click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")
 
 
 @click.command()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.scene.located_xml import parse
 
 BUILTIN_REVISION = 1
 """Incremented whenever a built-in room changes, as its content is code and not a file."""
@@ -95,12 +96,13 @@ def _shapeless(root: ElementTree.Element) -> Iterator[str]:
 
 def _parse(path: Path) -> ElementTree.Element:
     try:
-        return ElementTree.parse(path).getroot()  # noqa: S314 - the user's own scene, and expat bounds entities
+        return parse(path)
     except (OSError, ElementTree.ParseError) as error:
         raise SpecError(f"{path}: is not a readable Mitsuba scene file: {error}") from error
 
 
 def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
+    around = {part: node for node in root.iter() for part in node}
     for node in root.iter():
         reason = _UNSUPPORTED.get(node.tag)
         if node.tag == "bsdf":
@@ -111,7 +113,11 @@ def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
             reason = "included scene files are not supported; join them into one file"
         if reason:
             name = node.get("id") or node.get("name") or node.get("type")
-            raise SpecError(f"{path}: <{node.tag}> {name!r}: {reason}")
+            shape = around.get(node, root)
+            whose = f" of shape {shape.get('id', '')!r}" if shape.tag == "shape" else ""
+            line = getattr(node, "line", 0)
+            remedy = f"`photonfarm scene import {path.name}` makes a copy of the scene without what is not supported"
+            raise SpecError(f"{path}: line {line}: <{node.tag}> {name!r}{whose}: {reason}; {remedy}")
 
 
 def _named_files(root: ElementTree.Element, path: Path) -> list[Path]:

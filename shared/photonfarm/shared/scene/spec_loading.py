@@ -86,10 +86,10 @@ def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
     for group in spec.groups:
         for shape in group.shapes:
             if shape not in known:
-                near = nearest(shape, known)
-                raise SpecError(
-                    f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene; nearest: {near}"
-                )
+                fault = f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene"
+                if not known:
+                    raise SpecError(f"{fault}: its shapes have no ids; `photonfarm scene import` makes a copy with ids")
+                raise SpecError(f"{fault}; nearest: {nearest(shape, known)}")
         if isinstance(group, Light) and group.rectangle and group.name in known:
             raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
 

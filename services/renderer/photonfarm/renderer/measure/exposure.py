@@ -8,6 +8,7 @@ Shape letters: N views, H W image.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -42,6 +43,9 @@ RANGE = (-40.0, 40.0)
 
 EXACT = 1e-4
 """The range of powers at which the search ends."""
+
+SILENT_S = 4.0
+"""Seconds after which it is said how many views are rendered."""
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
@@ -126,7 +130,7 @@ def propose(
     small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
     spp = _half_spp(small.film)
     log(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
-    pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp))))
+    pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp, log))))
     exposure = pictures.exposure(target)
     if exposure is None:
         reached = pictures.display_means(2 ** RANGE[1]).mean()
@@ -167,10 +171,13 @@ def _half_spp(film: Film) -> int:
     return PATHS // (film.width * film.height)
 
 
-def _rendered(scene: LoadedScene, frames: int, spp: int) -> Iterator[F32]:
+def _rendered(scene: LoadedScene, frames: int, spp: int, log: Callable[[str], None]) -> Iterator[F32]:
     """Two halves of each view, (2, H, W, 3)."""
-    spec = scene.spec
+    spec, said = scene.spec, time.monotonic()
     for number in range(frames):
+        if time.monotonic() - said > SILENT_S:
+            said = time.monotonic()
+            log(f"{number} of {frames} views are rendered")
         modification = sample_modification(spec, SEED, number)
         scene.apply(modification)
         view = sample_view(spec, modification.key(spec.scene_id), SEED, number, modification)

@@ -62,7 +62,7 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
             f"{spec.name}: {file.path} or a file it names is not what the spec was made from; load the spec anew"
         )
     try:
-        with _threads_to_read_with():
+        with threads_to_read_with():
             scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
     except (RuntimeError, ValueError) as error:
         raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
@@ -76,7 +76,7 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
 
 
 @contextmanager
-def _threads_to_read_with() -> Iterator[None]:
+def threads_to_read_with() -> Iterator[None]:
     """Use two threads at least: the decoder of OpenEXR files waits for ever in a pool of one."""
     count = dr.thread_count()
     dr.set_thread_count(max(count, 2))

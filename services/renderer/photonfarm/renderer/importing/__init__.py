@@ -1,0 +1,1 @@
+"""`photonfarm scene import`: a scene of other programs read, written for Mitsuba 3, and a spec proposed for it."""

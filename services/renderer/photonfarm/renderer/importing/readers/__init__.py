@@ -1,0 +1,46 @@
+"""Readers, one for each kind of file; each makes an `ImportedScene`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from photonfarm.renderer.importing.imported import ImportedScene, Say
+from photonfarm.shared.core.errors import SpecError
+
+BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
+"""What Blender reads for us."""
+
+Reader = Callable[[Path, Path, Say], ImportedScene]
+"""Reads a file; what it makes of it lies in the folder that is given, and it says what takes long."""
+
+
+def reader_of(path: Path) -> Reader:
+    """The reader of a file, by its ending; raises SpecError for an unknown one and for a file that is not there."""
+    suffix = path.suffix.lower()
+    if suffix not in (".xml", ".gltf", ".glb", ".obj", *BLENDER):
+        raise SpecError(
+            f"{path}: {suffix or 'a name without an ending'} is no kind of scene that is read; known are .xml "
+            f"(Mitsuba), .gltf, .glb, .obj, and through Blender {', '.join(BLENDER)}"
+        )
+    if not path.is_file():
+        raise SpecError(f"{path}: is not there")
+    return _reader(suffix)
+
+
+def _reader(suffix: str) -> Reader:
+    if suffix == ".xml":
+        from photonfarm.renderer.importing.readers import mitsuba_xml
+
+        return mitsuba_xml.read
+    if suffix == ".obj":
+        from photonfarm.renderer.importing.readers import obj
+
+        return obj.read
+    if suffix in BLENDER:
+        from photonfarm.renderer.importing.readers import blender
+
+        return blender.read
+    from photonfarm.renderer.importing.readers import gltf
+
+    return gltf.read

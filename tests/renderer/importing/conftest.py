@@ -1,0 +1,157 @@
+"""Files to import, made here: a room in glTF of several files, and functions that write small ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.importing.loading import load
+from photonfarm.renderer.importing.readers import reader_of
+
+QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+FACES = np.array([[0, 1, 2], [0, 2, 3]], "<u4")
+SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices (8, 3) and faces (12, 3) of a box whose faces look outwards."""
+    corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]]
+                        for i in (0, 1) for j in (0, 1) for k in (0, 1)], "<f4")  # fmt: skip
+    return corners, np.array([f for a, b, c, d in SIDES for f in ((a, b, c), (a, c, d))], "<u4")
+
+
+class Gltf:
+    """A glTF document with one buffer in a file of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.binary = folder, bytearray()
+        lists = ("nodes", "meshes", "materials", "accessors", "bufferViews")
+        self.document: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": []}]}
+        self.document |= {name: [] for name in lists}
+
+    def array(self, values: np.ndarray, kind: str) -> int:
+        """Add an accessor; its number."""
+        codes = {"<f4": 5126, "<u4": 5125, "<u2": 5123, "|u1": 5121}
+        view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": values.nbytes}
+        self.binary += values.tobytes()
+        self.binary += bytes(-len(self.binary) % 4)
+        self.document["bufferViews"].append(view)
+        self.document["accessors"].append(
+            {
+                "bufferView": len(self.document["bufferViews"]) - 1,
+                "componentType": codes[values.dtype.str],
+                "count": len(values),
+                "type": kind,
+            }
+        )
+        return len(self.document["accessors"]) - 1
+
+    def material(self, name: str, **entries: Any) -> int:
+        """Add a material; its number."""
+        self.document["materials"].append({"name": name, **entries})
+        return len(self.document["materials"]) - 1
+
+    def mesh(self, vertices: np.ndarray, faces: np.ndarray, material: int | None = None, **attributes: int) -> int:
+        """Add a mesh of one primitive; its number."""
+        primitive: dict[str, Any] = {"attributes": {"POSITION": self.array(vertices, "VEC3"), **attributes}}
+        primitive["indices"] = self.array(faces.reshape(-1, 1), "SCALAR")
+        if material is not None:
+            primitive["material"] = material
+        self.document["meshes"].append({"primitives": [primitive]})
+        return len(self.document["meshes"]) - 1
+
+    def node(self, name: str, mesh: int | None = None, **entries: Any) -> int:
+        """Add a node to the scene; its number."""
+        self.document["nodes"].append({"name": name, **({} if mesh is None else {"mesh": mesh}), **entries})
+        self.document["scenes"][0]["nodes"].append(len(self.document["nodes"]) - 1)
+        return len(self.document["nodes"]) - 1
+
+    def image(self, pixels: np.ndarray, name: str) -> dict[str, int]:
+        """Add an image file; the reference to it that a material holds."""
+        Image.fromarray(pixels.astype(np.uint8)).save(self.folder / name)
+        images, textures = (self.document.setdefault(key, []) for key in ("images", "textures"))
+        images.append({"uri": name})
+        textures.append({"source": len(images) - 1})
+        return {"index": len(textures) - 1}
+
+    def write(self, name: str = "room.gltf") -> Path:
+        """Write the document and its buffer."""
+        (self.folder / "room.bin").write_bytes(self.binary)
+        self.document["buffers"] = [{"uri": "room.bin", "byteLength": len(self.binary)}]
+        (self.folder / name).write_text(json.dumps(self.document))
+        return self.folder / name
+
+
+@pytest.fixture
+def gltf(tmp_path: Path) -> Gltf:
+    """An empty document."""
+    return Gltf(tmp_path)
+
+
+@pytest.fixture
+def quad(gltf: Gltf) -> Callable[..., Path]:
+    """Function (material) → a file with a unit square that faces +z, its texture's top at y = 1."""
+
+    def make(**material: Any) -> Path:
+        uv = gltf.array(np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4"), "VEC2")
+        normal = gltf.array(np.tile(np.array([[0, 0, 1]], "<f4"), (4, 1)), "VEC3")
+        gltf.node("Quad", gltf.mesh(QUAD, FACES, gltf.material("paint", **material), TEXCOORD_0=uv, NORMAL=normal))
+        return gltf.write()
+
+    return make
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[[Path], ImportedScene]:
+    """Function (file) → what its reader makes of it."""
+    (tmp_path / "scratch").mkdir(exist_ok=True)
+    return lambda path: reader_of(path)(path, tmp_path / "scratch", lambda _: None)
+
+
+@pytest.fixture
+def loaded(tmp_path: Path, read: Callable[[Path], ImportedScene]) -> Callable[[Path], tuple[ImportedScene, Any]]:
+    """Function (file) → what its reader makes of it, and that as a Mitsuba scene."""
+
+    def make(path: Path) -> tuple[ImportedScene, Any]:
+        scene = read(path)
+        return scene, load(scene, tmp_path / "scratch", lambda _: None)
+
+    return make
+
+
+def room_of_boxes(made: Gltf) -> Path:
+    """A room of 5 × 4 × 2.6 with a table, a wardrobe named so, and two chairs that are one mesh; it has no light."""
+    paint = made.material("paint", pbrMetallicRoughness={"baseColorFactor": [0.8, 0.8, 0.8, 1], "metallicFactor": 0})
+    wood = made.material("wood", pbrMetallicRoughness={"baseColorFactor": [0.5, 0.3, 0.2, 1], "metallicFactor": 0})
+    vertices, faces = box((0, 0, 0), (5, 2.6, 4))
+    made.node("Shell", made.mesh(vertices, faces[:, ::-1].copy(), paint))
+    made.node("Table", made.mesh(*box((2, 0, 1.5), (3.2, 0.75, 2.2)), wood))
+    made.node("Wardrobe", made.mesh(*box((0.02, 0, 0.1), (0.6, 2, 1.3)), wood))
+    first, second = box((1, 0, 3), (1.4, 0.9, 3.4)), box((3.5, 0, 3), (3.9, 0.9, 3.4))
+    both = np.concatenate([first[0], second[0]]), np.concatenate([first[1], second[1] + 8]).astype("<u4")
+    made.node("Chairs", made.mesh(*both, wood))
+    return made.write()
+
+
+@pytest.fixture(scope="session")
+def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The room of boxes, which no test changes."""
+    return room_of_boxes(Gltf(tmp_path_factory.mktemp("boxes")))
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quick render that is quicker."""
+    from photonfarm.renderer.importing import importer
+    from photonfarm.renderer.measure import exposure
+
+    monkeypatch.setattr(exposure, "PATHS", 1 << 13)
+    monkeypatch.setattr(exposure, "SIDE", 32)
+    monkeypatch.setattr(importer, "FRAMES", 4)

@@ -1,0 +1,167 @@
+"""`photonfarm scene import`: from a file to a spec that renders, and what is said where that cannot be."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from photonfarm.renderer.cli import scene_import
+from photonfarm.renderer.importing.progress import EVERY_S, Progress
+from photonfarm.renderer.importing.readers import blender
+from photonfarm.renderer.scene.free_space import surroundings
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.errors import BackendError, PhotonfarmError, SpecError
+from photonfarm.shared.core.pictures import display_values
+from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.scene.view import sample_view
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """Function (arguments) → the result of the verb, in an empty folder."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return lambda *arguments: CliRunner().invoke(scene_import, [str(a) for a in arguments])
+
+
+def test_a_room_becomes_a_spec_that_renders_at_once(quick: None, boxes: Path, run: Callable[..., Result]) -> None:
+    result = run(boxes)
+    assert result.exit_code == 0, result.output
+    spec = load_spec("room.toml")
+    assert sorted(group.name for group in spec.groups) == ["ceiling-light", "chairs", "chairs-2", "table", "wardrobe"]
+    assert sorted(path.name for path in Path().iterdir()) == ["room-scene", "room.toml"]
+    scene = LoadedScene.load(spec, Path())
+    shown = []
+    for number in range(6):
+        modification = sample_modification(spec, 1, number)
+        scene.apply(modification)
+        view = sample_view(spec, modification.key(spec.scene_id), 1, number)
+        assert surroundings(scene.scene, view.origin[None]).open.all()
+        depth = scene.buffers(view).depth
+        assert (depth > 0).mean() > 0.99  # no view leaves the room
+        shown.append(display_values(np.float32(spec.exposure) * scene.render_halves(view, (number,), 2)[0]))
+    assert np.mean(shown) == pytest.approx(0.45, abs=0.12)
+
+
+def test_the_spec_is_commented_and_the_scene_lies_beside_it(
+    quick: None, boxes: Path, run: Callable[..., Result], tmp_path: Path
+) -> None:
+    shutil.copytree(boxes.parent, "source")
+    result = run("source/room.gltf", "--out", "my/den.toml", "--json")
+    made = json.loads(result.stdout)
+    assert Path(made["spec"]) == Path("my/den.toml")
+    assert "Made by `photonfarm scene import` from room.gltf" in Path("my/den.toml").read_text()
+    shutil.move("my", tmp_path / "elsewhere")
+    shutil.rmtree(tmp_path / "here")
+    assert load_spec(tmp_path / "elsewhere/den.toml").name == "den"
+
+
+def test_what_is_there_is_never_written_over(boxes: Path, run: Callable[..., Result]) -> None:
+    Path("room.toml").write_text("mine")
+    result = run(boxes)
+    assert isinstance(result.exception, SpecError)
+    assert Path("room.toml").read_text() == "mine"
+    assert [path.name for path in Path().iterdir()] == ["room.toml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "code"),
+    [
+        ("gone.glb", SpecError, 3),
+        ("notes.txt", SpecError, 3),
+        ("nothing", SpecError, 3),
+        ("den.blend", BackendError, 6),
+    ],
+)
+def test_files_that_cannot_be_imported_end_with_the_exit_code_of_the_cause(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, name: str, kind: type[PhotonfarmError], code: int
+) -> None:
+    monkeypatch.delenv(blender.VARIABLE, raising=False)
+    monkeypatch.setenv("PATH", "")
+    for made in ("a.txt", "nothing", "den.blend"):
+        Path(made).touch()
+    error = run(name).exception
+    assert isinstance(error, kind)
+    assert error.exit_code == code
+    assert name in str(error)
+
+
+def test_a_blender_that_fails_is_quoted_in_one_sentence(
+    run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program = tmp_path / "blender"
+    program.write_text("#!/bin/sh\necho Error: not a blend file\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv(blender.VARIABLE, str(program))
+    Path("den.blend").touch()
+    error = run("den.blend").exception
+    assert isinstance(error, SpecError)
+    assert "not a blend file" in str(error)
+    monkeypatch.setenv(blender.VARIABLE, "/no/blender")
+    assert isinstance(run("den.blend").exception, BackendError)
+
+
+@pytest.mark.skipif(not os.environ.get("PHOTONFARM_BLENDER"), reason="PHOTONFARM_BLENDER names no Blender")
+@pytest.mark.slow
+def test_a_blend_file_is_imported_through_blender(
+    quick: None, boxes: Path, run: Callable[..., Result], tmp_path: Path
+) -> None:
+    import subprocess
+
+    script = f"""import bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_scene.gltf(filepath={str(boxes)!r})
+bpy.ops.wm.save_as_mainfile(filepath={str(tmp_path / "den.blend")!r})
+"""
+    (tmp_path / "make.py").write_text(script)
+    command = blender.blender_command(tmp_path / "den.blend")
+    place = next(number for number, word in enumerate(command) if word.endswith("blender_export.py"))
+    subprocess.run([*command[:place], str(tmp_path / "make.py")], check=True)
+    assert run(tmp_path / "den.blend").exit_code == 0
+    assert "table" in [group.name for group in load_spec("den.toml").groups]
+
+
+def test_nothing_is_silent_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    from photonfarm.renderer.importing import progress
+
+    monkeypatch.setattr(progress, "EVERY_S", 0.05)
+    assert EVERY_S < 5
+    said: list[str] = []
+    with Progress(said.append) as say:
+        say("thinking")
+        time.sleep(0.4)
+    assert said[0] == "thinking"
+    assert len(said) > 2
+    assert all("thinking" in line for line in said)
+
+
+SCENES = [Path(folder) for folder in os.environ.get("PHOTONFARM_SCENES", "").split(os.pathsep) if folder]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "groups"),
+    [
+        ("living-room-2", {"sofa-leather", "sofa-leather-2", "table"}),
+        ("cornell-box", {"tall-box", "short-box", "light"}),
+    ],
+)
+def test_real_rooms_are_imported_without_their_ready_specs(
+    quick: None, run: Callable[..., Result], scene: str, groups: set[str]
+) -> None:
+    found: Any = next((folder / scene / "scene.xml" for folder in SCENES if (folder / scene).is_dir()), None)
+    if found is None:
+        pytest.skip("PHOTONFARM_SCENES names no folder that has it")
+    assert run(found).exit_code == 0
+    assert groups <= {group.name for group in load_spec(f"{scene}.toml").groups}

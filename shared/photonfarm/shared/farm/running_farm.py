@@ -9,10 +9,13 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.processes import process_space
-from photonfarm.shared.store import Store
+
+if TYPE_CHECKING:
+    from photonfarm.shared.store import Store
 
 WEB_PORT = 8420
 """The port of the pages, unless it is taken."""

@@ -1,6 +1,7 @@
 """What tests of several packages start or render."""
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +24,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 def analytic() -> ModuleType:
     """The module `analytic_scene`."""
     return analytic_scene
+
+
+@pytest.fixture
+def hears_ctrl_c() -> Iterator[None]:
+    """Let processes that the test starts hear SIGINT, which shells make background jobs ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

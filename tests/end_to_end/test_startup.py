@@ -62,6 +62,7 @@ def test_a_verb_loads_only_what_it_needs_and_starts_soon(store: Path, command: l
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < MOST_CPU_S
 
 
+@pytest.mark.usefixtures("hears_ctrl_c")
 @pytest.mark.parametrize(("verb", "code"), [(["scene", "plan"], -signal.SIGINT), (["submit", "--dry-run"], 130)])
 def test_ctrl_c_ends_a_measurement_within_two_seconds(tmp_path: Path, verb: list[str], code: int) -> None:
     command = [sys.executable, "-m", "photonfarm.shared.cli", *verb, "cornell"]

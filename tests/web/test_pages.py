@@ -348,6 +348,7 @@ def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneSt
 # ------------------------------------------------------------------------------------------------------------ the verb
 
 
+@pytest.mark.usefixtures("hears_ctrl_c")
 def test_the_verb_takes_a_free_port_where_its_own_is_taken_and_ends_on_ctrl_c(scene: SceneStore) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         words = ["web", "--store", str(scene.folder.parent.parent), "--port", str(taken.getsockname()[1])]

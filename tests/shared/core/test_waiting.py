@@ -5,6 +5,8 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 from photonfarm.shared.core.waiting import WorkLog, time_left
 
@@ -28,6 +30,7 @@ def test_the_time_left_follows_from_the_steps_that_are_done() -> None:
     assert time_left(2, 8, time.monotonic() - 10).startswith("2 of 8, about 30 s")
 
 
+@pytest.mark.usefixtures("hears_ctrl_c")
 def test_ctrl_c_ends_native_code_at_once() -> None:
     code = (
         "from photonfarm.shared.core.processes import ended_by_ctrl_c\n"
@@ -41,6 +44,7 @@ def test_ctrl_c_ends_native_code_at_once() -> None:
         assert child.wait(2) == -signal.SIGINT
 
 
+@pytest.mark.usefixtures("hears_ctrl_c")
 def test_afterwards_ctrl_c_is_what_it_was() -> None:
     before = signal.getsignal(signal.SIGINT)
     with ended_by_ctrl_c():

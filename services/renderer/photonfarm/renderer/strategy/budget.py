@@ -24,6 +24,9 @@ VIEWS, SCOUTS, PAIRED = 3, 8, 4
 TRACES = 5
 """How often a candidate is traced again: for other numbers of samples, and on the pilot's film."""
 
+MARGIN = 1.3
+"""What the time is multiplied by that comparing settings is expected to take: pilots took up to 1.2 times as long."""
+
 EDITS = 5
 """How often a pilot brings the scene into each view's configuration, about."""
 
@@ -88,7 +91,7 @@ def affordable(
 
     def needed(count: int) -> float:
         rendered = VIEWS * max(SCOUTS, count) + (VIEWS * PAIRED + TURNS * RANGE_OF_SAMPLES) * count
-        return float(rendered * np.mean(images) + TRACES * count * min(compiling) + EDITS * VIEWS * edit_s)
+        return MARGIN * float(rendered * np.mean(images) + TRACES * count * min(compiling) + EDITS * VIEWS * edit_s)
 
     for count, candidate in enumerate(ordered, 1):
         if count > len(first) and needed(count) + min(compiling) > budget.left_s:

@@ -176,7 +176,7 @@ def test_status_without_a_redis_is_no_error_for_who_named_none(
 ) -> None:
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("photonfarm.shared.farm.status.queue.connect", _refuses)
+    monkeypatch.setattr("photonfarm.shared.queue.connect", _refuses)
     done = CliRunner().invoke(umbrella, ["status"])
     assert done.exit_code == 0
     assert "no Redis" not in done.output

@@ -84,8 +84,8 @@ def test_who_lacks_a_name_or_a_password_is_told_which_and_nobody_to_start_a_serv
     request = Request(modifications=1)
     with pytest.raises(QueueError) as refused:
         submission.submit(NamedSpec.load("cornell"), store.root, url, request)
-    assert "redis-server" not in str(refused.value)
-    with pytest.raises(QueueError, match="redis-server"):
+    assert "photonfarm redis" not in str(refused.value)
+    with pytest.raises(QueueError, match="photonfarm redis"):
         submission.submit(NamedSpec.load("cornell"), store.root, "redis://127.0.0.1:1/0", request)
 
 

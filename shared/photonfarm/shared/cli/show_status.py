@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,8 +15,10 @@ from photonfarm.shared.farm.running_farm import RunningFarm
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, lost_plan, unread_markers
 from photonfarm.shared.farm.training import TrainingProgress
 from photonfarm.shared.farm.waits import idle
-from photonfarm.shared.queue import FailureCause, repeating_command
 from photonfarm.shared.store import SceneStatus
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue import FailureCause
 
 
 def document(
@@ -122,6 +124,8 @@ def trainings(found: Sequence[TrainingProgress]) -> None:
 
 def _failures(when: str, causes: Sequence[FailureCause], store: str | Path) -> None:
     for cause in causes:
+        from photonfarm.shared.queue import repeating_command
+
         click.echo(f"  {len(cause.jobs)} {when} × {cause.cause}" if when else f"  {len(cause.jobs)} × {cause.cause}")
         click.echo(f"      to repeat one: {repeating_command(store, cause.example)}")
 
@@ -140,6 +144,10 @@ def _queue_document(found: StoreQueue, store: str | Path) -> dict[str, Any]:
 
 
 def _failures_document(causes: Sequence[FailureCause], store: str | Path) -> list[dict[str, Any]]:
+    if not causes:
+        return []
+    from photonfarm.shared.queue import repeating_command
+
     return [
         {
             "cause": cause.cause,

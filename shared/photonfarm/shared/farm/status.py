@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
-import redis
-
-from photonfarm.shared import queue
 from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError, store_errors
-from photonfarm.shared.queue import Failure, FailureCause, QueueStatus, RenderArguments
 from photonfarm.shared.store import SceneStatus, Store
+from photonfarm.shared.store.write.store import FAILURES_FOLDER
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue import Failure, FailureCause, QueueStatus
 
 ANSWER_S = 5.0
 """How long `status` waits for an answer of Redis; workers wait longer."""
@@ -35,7 +38,14 @@ class NoQueue:
 
 
 def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
-    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone."""
+    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone.
+
+    The queue's packages are loaded only where there is something to ask: they take as long as the rest of `status`.
+    """
+    if (refused := _refused(redis_url)) and not store.storage.names(FAILURES_FOLDER):
+        return NoQueue(refused)
+    from photonfarm.shared import queue
+
     try:
         with queue.connect(redis_url, only_s=ANSWER_S) as connection:
             queue.check_served(connection, store)
@@ -49,20 +59,44 @@ def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
 
 def queue_now(store: Store, redis_url: str) -> StoreQueue | NoQueue:
     """As `queue_of`, for those who look again soon: a Redis that fails on the way is one of which nothing is known."""
+    from redis import RedisError
+
     try:
         return queue_of(store, redis_url)
-    except redis.RedisError as error:
+    except RedisError as error:
         return NoQueue(f"Redis failed: {error}")
+
+
+def _refused(redis_url: str) -> str | None:
+    """Why there is no Redis, if nothing listens at a port or socket of this machine; None if its client must tell."""
+    url = urlsplit(redis_url)
+    try:
+        if url.scheme == "unix" and not url.netloc:
+            where = url.path
+            with socket.socket(socket.AF_UNIX) as probe:
+                probe.connect(where)
+        elif url.scheme == "redis" and url.hostname in ("localhost", "127.0.0.1", "::1"):
+            where = f"{url.hostname}:{url.port or 6379}"
+            socket.create_connection((url.hostname, url.port or 6379), timeout=ANSWER_S).close()
+    except (ConnectionRefusedError, FileNotFoundError) as error:
+        return f"no Redis at {url.scheme}://{where}: {error.strerror}; `photonfarm redis` starts one"
+    except (OSError, ValueError):
+        pass
+    return None
 
 
 def _kept(store: Store) -> dict[str, Failure]:
     """The failures that the store has kept, of jobs that are still missing."""
+    from photonfarm.shared import queue
+
     with store_errors("look for failures", store.storage.where):
         return queue.kept_failures(store, lambda name: is_missing(store, name))
 
 
 def is_missing(store: Store, name: str) -> bool:
     """Whether a job is one of this store's, and not committed; False for one whose scene is damaged."""
+    from photonfarm.shared.queue import RenderArguments
+
     job = RenderArguments.of(name)
     with contextlib.suppress(CorruptError, IndexError):
         return store.has_scene(job.scene_id) and not store.scene(job.scene_id).is_done(job.job)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from photonfarm.shared.farm.status import NoQueue, StoreQueue
 from photonfarm.shared.farm.training import TrainingProgress
-from photonfarm.shared.queue import FailureCause, QueueStatus
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue import FailureCause, QueueStatus
 
 IDLE_SHOWN = 10
 """The most reasons of idle workers that are told."""

@@ -13,8 +13,7 @@ from photonfarm.shared.queue.failures import REASON_LETTERS, Failure
 from photonfarm.shared.queue.untrusted import printable
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import put_json
-
-FAILURES_FOLDER = "failures"
+from photonfarm.shared.store.write.store import FAILURES_FOLDER
 
 _NAME = re.compile(r"([0-9a-f]{32}-(?:0|[1-9][0-9]{0,13}))\.([0-9]{1,16})\.json")
 

@@ -111,7 +111,7 @@ def sample_costs(scene: LoadedScene, frames: int, log: Log = lambda _: None) -> 
 
 
 def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: WorkLog) -> tuple[SampleCosts, int]:
-    """The costs, and of how many frames; as many as the budget allows, and in little time no untimed one before."""
+    """The costs, and of how many frames; as many as the budget allows, and one at least after the one that compiles."""
     name, begun, measured = scene.spec.name, time.monotonic(), list[_Frame]()
     work_log.begin(
         f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count",
@@ -120,7 +120,7 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
     cloud = scene.base()[1]
     last_s = 0.0
     for number in range(WARM_UPS + frames):
-        if number and last_s > budget.left_s:
+        if number > 1 and last_s > budget.left_s:  # the first one compiles, and never counts
             break
         before = budget.spent_s
         if not number and before > budget.seconds:

@@ -24,6 +24,9 @@ VIEWS, SCOUTS, PAIRED = 3, 8, 4
 TRACES = 5
 """How often a candidate is traced again: for other numbers of samples, and on the pilot's film."""
 
+MARGIN = 1.3
+"""What the time is multiplied by that more settings are expected to take: pilots took up to 1.2 times as long."""
+
 EDITS = 5
 """How often a pilot brings the scene into each view's configuration, about."""
 
@@ -91,13 +94,13 @@ def affordable(
         return float(rendered * np.mean(images) + TRACES * count * min(compiling) + EDITS * VIEWS * edit_s)
 
     for count, candidate in enumerate(ordered, 1):
-        if count > len(first) and needed(count) + min(compiling) > budget.left_s:
+        if count > len(first) and MARGIN * needed(count) + min(compiling) > budget.left_s:
             return ordered[: count - 1]
         for seconds in (compiling, images):
             begun = budget.clock()
             render(candidate, 0, 1)
             seconds.append(budget.clock() - begun)
         if count <= len(first):
-            every = needed(len(ordered)) + (len(ordered) - count) * min(compiling)
+            every = MARGIN * needed(len(ordered)) + (len(ordered) - count) * min(compiling)
             budget.require(what, needed(len(first)) + (len(first) - count) * min(compiling), every)
     return ordered

@@ -14,6 +14,9 @@ from photonfarm.shared.store.format import declarations
 from photonfarm.shared.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
 from photonfarm.shared.store.write.scene_store import SCENES, PlanResult, SceneStore, are_there, is_there, scene_ids
 
+FAILURES_FOLDER = "failures"
+"""The folder in which the queue keeps why jobs failed."""
+
 T = TypeVar("T")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.renderer.cli import scene_import
+from photonfarm.renderer.cli.scene_verbs import scene_import
 from photonfarm.renderer.importing.progress import EVERY_S, Progress
 from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.free_space import surroundings

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.renderer import cli
+from photonfarm.renderer.cli import sample_verbs
 from photonfarm.renderer.jobs.render import SceneLoader, ShardRenderer
 from photonfarm.renderer.jobs.repeat import Repeated, repeat
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -111,7 +111,7 @@ def test_the_verb_says_that_the_sample_is_equal_and_leaves_the_store_as_it_is(ro
     store = room.folder.parent.parent
     before = {file: file.stat().st_mtime_ns for file in store.rglob("*")}
     arguments = ["room", "--store", str(store), "--row", "0", "--json"]
-    done = CliRunner().invoke(cli.render, arguments)
+    done = CliRunner().invoke(sample_verbs.render, arguments)
     assert done.exit_code == 0, done.output
     said = json.loads(done.stdout)
     assert (said["row"], said["pass"], said["stored"]["equal"]) == (0, 0, True)
@@ -119,5 +119,5 @@ def test_the_verb_says_that_the_sample_is_equal_and_leaves_the_store_as_it_is(ro
     reader = SceneReader(store, room.scene_id)
     reader.refresh()
     assert said["stored"]["values"] == reader.read(0).radiance.size
-    refused = CliRunner().invoke(cli.render, [*arguments, "--out", "picture.jpg"])
+    refused = CliRunner().invoke(sample_verbs.render, [*arguments, "--out", "picture.jpg"])
     assert isinstance(refused.exception, SpecError)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.renderer.cli import scene_exposure
+from photonfarm.renderer.cli.measuring_verbs import scene_exposure
 from photonfarm.renderer.measure import exposure
 from photonfarm.renderer.measure.exposure import Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene

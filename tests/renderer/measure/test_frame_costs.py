@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer.cli import measure_frames
+from photonfarm.renderer.cli.sample_verbs import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.measure.frame_costs import WARM_UPS, TimedFrame, frame_costs, in_turn
 from photonfarm.renderer.measure.partial_film import PartialFilm, part_of

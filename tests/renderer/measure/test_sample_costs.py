@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.renderer.cli import scene_cost
+from photonfarm.renderer.cli.measuring_verbs import scene_cost
 from photonfarm.renderer.measure import sample_costs as measuring
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer.cli import report_stability
+from photonfarm.renderer.cli.machine_verbs import report_stability
 from photonfarm.renderer.verify import report, rows
 from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
 from photonfarm.renderer.verify.runner import SceneResult, plus_minus, run

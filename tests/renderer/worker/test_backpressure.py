@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer import cli
+from photonfarm.renderer.cli import machine_verbs
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import FULL_S, DiskReserve, is_full
 from photonfarm.shared.core.errors import StoreError
@@ -30,7 +30,7 @@ def scene(analytic: ModuleType, store: Store) -> SceneStore:
     ("size", "in_bytes"), [("0", 0), ("500MB", 5 * 10**8), ("1.5 GB", 15 * 10**8), ("2T", 2 * 10**12), ("7kB", 7000)]
 )
 def test_a_size_is_read_as_it_is_written(size: str, in_bytes: int) -> None:
-    assert cli._bytes(None, None, size) == in_bytes
+    assert machine_verbs._bytes(None, None, size) == in_bytes
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_a_size_is_read_as_it_is_written(size: str, in_bytes: int) -> None:
     ],
 )
 def test_options_that_cannot_be_are_wrong_usage(arguments: list[str], said: str) -> None:
-    result = CliRunner().invoke(cli.work, arguments)
+    result = CliRunner().invoke(machine_verbs.work, arguments)
     assert result.exit_code == 2
     assert said in result.output
 

@@ -1,0 +1,116 @@
+"""Verbs of a machine that renders: doctor, report stability, work."""
+
+from __future__ import annotations
+
+import re
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+
+
+@click.command()
+@store_option
+@redis_option
+@json_option
+def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
+    """Try each part on this machine, and say what to do about what does not work."""
+    from photonfarm.renderer.tools.doctor import examine
+    from photonfarm.shared.cli import show
+
+    sys.exit(show.findings(examine(store, redis_url, partial(click.echo, err=True)), as_json))
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Small images, mostly one pair of settings: about two minutes.")
+@click.option("--only", multiple=True, metavar="ROW", help="This row (1 … 36) or scene alone; may be repeated.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="First seed; 0 is a seed.")
+@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
+              help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
+@ended_by_ctrl_c()
+def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
+    """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads)
+    from photonfarm.renderer.verify import report, rows
+
+    try:
+        scenes = rows.chosen(only, quick=quick)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--only") from error
+    out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be rendered first
+    found = report.examine(scenes, quick=quick, seed=seed, failures=out / "failures", log=partial(click.echo, err=True))
+    arguments = ["--quick"] * quick + [f"--only {row}" for row in only] + [f"--seed {seed}"] * (seed != 0)
+    report.write(found, out, " ".join(["photonfarm report stability", *arguments]))
+    click.echo(out / "stability.md")
+    sys.exit(0 if found.passed else 1)
+
+
+def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
+    if found is None:
+        raise click.BadParameter(f"{size!r} is not a size; write it like 500MB or 2GB")
+    return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
+
+
+@click.command()
+@store_option
+@redis_option
+@click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
+@click.option("--scene", "scene_id", metavar="ID",
+              help="Work for this scene alone: its id, how it begins, or its name.")  # fmt: skip
+@click.option("--job", type=click.IntRange(0), help="Render this one job of --scene here, without Redis, and end.")
+@click.option("--until-complete", is_flag=True, help="Stop when nothing is missing.")
+@click.option(
+    "--reserve",
+    "reserve_bytes",
+    callback=_bytes,
+    default="1GB",
+    show_default=True,
+    metavar="SIZE",
+    help="Take no job while less of the store's disk is free.",
+)
+@click.option(
+    "--ahead", type=click.FloatRange(1), metavar="RATIO",
+    help="Take no job of a scene while more of its samples are committed than RATIO × those that its trainer has used. "
+    "About the first 256 of a scene may always be (jobs are taken and finished whole, by each worker); without a "
+    "trainer it stops there. Values below 1 would stop rendering for ever.",
+)  # fmt: skip
+@click.option(
+    "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
+    metavar="SECONDS", help="End a job that takes longer; it is started up to five times. A worker that was "
+    "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
+)  # fmt: skip
+@click.option("--quiet", is_flag=True, help="Say only what is wrong.")
+@click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
+def work(
+    store: str | Path,
+    redis_url: str,
+    scene_id: str | None,
+    job: int | None,
+    check: bool,
+    **settings: Any,
+) -> None:
+    """Render queued jobs into the store, on one core, until asked to stop; start one per core.
+
+    A store that does not exist is waited for; --until-complete ends with exit code 4 then. One Redis serves one store.
+    Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.
+    """
+    from photonfarm.renderer.worker import worker
+
+    if check:
+        worker.check(redis_url)
+    elif job is None:
+        worker.run_worker(store, redis_url, scene_id=scene_id, **settings)
+    elif scene_id is None:
+        raise click.UsageError("--job needs --scene: jobs are numbered within a scene")
+    else:
+        rendered, seconds = worker.render_job(store, scene_id, job)
+        click.echo(f"job {job} rendered and committed in {seconds:.1f} s" if rendered else f"job {job} is committed")

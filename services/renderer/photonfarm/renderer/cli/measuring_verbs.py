@@ -1,0 +1,129 @@
+"""Verbs that measure a scene: scene cost, scene exposure, scene free-space, scene plan."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+
+import click
+
+from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+from photonfarm.shared.core.waiting import waiting
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
+              help="Random configurations to measure, a view of each, after some that do not count.")  # fmt: skip
+@click.option("--seconds", type=click.FloatRange(0, min_open=True),
+              help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
+@click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@json_option
+@ended_by_ctrl_c()
+def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
+    """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are.
+
+    Half a minute for a small room, minutes for a large one. `configuration` is taken by each configuration, `view` by
+    each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
+    """
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.measure.sample_costs import find_or_measure
+
+    log = partial(click.echo, err=True)
+    limit = math.inf if seconds is None else seconds
+    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, log=log, seconds=limit)
+    click.echo(costs.json() if as_json else costs.line())
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--target", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.45, show_default=True,
+              help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
+@click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
+              help="Random configurations to render, a view of each.")  # fmt: skip
+@json_option
+@ended_by_ctrl_c()
+def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
+    """Propose an exposure for SPEC, from a quick render of random views; nothing is written.
+
+    How far views differ in brightness decides how well it is known; more of them help.
+    """
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.measure.exposure import propose
+
+    log = partial(click.echo, err=True)
+    with waiting(log, f"proposing an exposure for {loaded.name}"):
+        found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
+    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
+@json_option
+@ended_by_ctrl_c()
+def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
+    """Measure where SPEC's cameras may stand: in the open, by rays, and in no movable group's box.
+
+    With it in the spec, `submit` plans no view from inside a solid or from outside the room, and camera paths are kept
+    out of them.
+    """
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec, measured_again=True)
+    backend.load(threads=1)
+    from photonfarm.renderer.measure.free_cells import measure
+    from photonfarm.renderer.strategy.output import spec_file
+
+    file = spec_file.writable(spec) if write else find_spec(spec)
+    found = measure(loaded, file.parent, partial(click.echo, err=True))
+    click.echo(json.dumps(found.entry()) if as_json else found.line())
+    if write:
+        spec_file.write(file, {"view": {"free_space": found.entry()}})
+        click.echo(f"{file}: [view.free_space] written", err=True)
+
+
+@click.command()
+@click.argument("spec")
+@click.option(
+    "--seconds",
+    type=click.IntRange(1, 86400),
+    default=60,
+    show_default=True,
+    help="Processor time for all of it, with loading and compiling; a kept measurement is reused if it was given at "
+    "least as long.",
+)
+@click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
+@click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@json_option
+@ended_by_ctrl_c()
+def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
+    """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec)
+    backend.load(threads=1)
+    from photonfarm.renderer.strategy.output import spec_file
+    from photonfarm.renderer.strategy.output.printed import lines
+    from photonfarm.renderer.strategy.plan import make_plan
+
+    file = spec_file.writable(spec) if write else find_spec(spec)
+    plan = make_plan(loaded, file.parent, seconds=seconds, again=again, log=partial(click.echo, err=True))
+    click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))
+    if write:
+        if plan.changes:
+            spec_file.write(file, plan.changes)
+        for table in plan.settings:
+            click.echo(f"{file}: [{table}] {'written' if table in plan.changes else 'stays as it is'}", err=True)

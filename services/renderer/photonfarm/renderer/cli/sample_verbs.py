@@ -1,0 +1,134 @@
+"""Verbs about the samples of a store, and images like them: buffers, measure-frames, preview, render."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import partial
+from pathlib import Path
+
+import click
+
+from photonfarm.shared.cli.options import json_option, store_option
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+from photonfarm.shared.core.waiting import waiting
+
+
+@click.command()
+@click.argument("spec")
+@store_option
+@click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
+@click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
+def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
+    """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
+    if out.suffix not in (".html", ".htm"):
+        raise click.BadParameter(f"{str(out)!r}: the sheet is a page; name it like preview.html", param_hint="--out")
+    from photonfarm.renderer.tools.preview import write_contact_sheet
+    from photonfarm.shared.scene.spec_loading import load_spec
+    from photonfarm.shared.store.read.other_scenes import scene_of
+    from photonfarm.shared.store.read.reader import SceneReader
+
+    write_contact_sheet(SceneReader(store, scene_of(store, spec, load_spec(spec))), count, out)
+    click.echo(out)
+
+
+@click.command()
+@store_option
+@click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
+@click.option(
+    "--modification", metavar="VECTOR|KEY", help="The configuration, as `store find` takes it.  [default: at rest]"
+)
+@click.option(
+    "--camera-path",
+    "path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help='JSON: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}.',
+)
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Instead: once around the scene.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="buffers.npz", show_default=True)
+@ended_by_ctrl_c()
+def buffers(
+    store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
+) -> None:  # fmt: skip
+    """Write the buffers of views along a camera path, and the photons: what `photonfarm infer --buffers` shows.
+
+    Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
+    """
+    from photonfarm.renderer.jobs.path_buffers import write_buffers
+    from photonfarm.shared.scene.camera_path import CameraPath
+
+    if (path is None) == (orbit is None):
+        raise click.UsageError("one of --camera-path and --orbit is required")
+    along = orbit or CameraPath.load(path or Path())
+    with waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
+        frames = write_buffers(store, scene, modification, along, out)
+    click.echo(f"{out}: {frames} frames")
+
+
+@click.command("measure-frames")
+@store_option
+@click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
+@click.option("--row", "rows", type=click.IntRange(0), multiple=True, required=True,
+              help="A complete sample, whose configuration and view are measured; may be repeated.")  # fmt: skip
+@click.option("--kept", type=click.IntRange(1), multiple=True, default=(1,), show_default=True, metavar="K",
+              help="Time a half-estimate of one of K pixels; may be repeated.")  # fmt: skip
+@click.option("--timed", type=click.IntRange(1), default=9, show_default=True, metavar="FRAMES",
+              help="Frames to time, after some that do not count.")  # fmt: skip
+@click.option("--points", type=click.IntRange(1), metavar="P",
+              help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
+@ended_by_ctrl_c()
+def measure_frames(
+    store: str | Path,
+    scene: str,
+    rows: tuple[int, ...],
+    kept: tuple[int, ...],
+    timed: int,
+    points: int | None,
+    out: Path,
+) -> None:
+    """Measure what the parts of a frame cost here, on one core, and what kind of surface each pixel shows.
+
+    Nothing is written to the store. Give rows of at least two configurations, so that edits are measured as between
+    samples.
+    """
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads=1)
+    from photonfarm.renderer.measure.frame_costs import write_frame_costs
+
+    with waiting(partial(click.echo, err=True), f"timing {timed} frames"):
+        costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
+    parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
+    click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()))
+    click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
+
+
+@click.command()
+@click.argument("scene", metavar="SPEC_OR_SCENE")
+@store_option
+@click.option("--row", type=click.IntRange(0), required=True, help="A sample, by its row in the store.")
+@click.option("--pass", "pass_number", type=click.IntRange(0), metavar="P",
+              help="Another pass of its view, stored or not.  [default: that of the row]")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+              help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
+@json_option
+def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
+    """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
+
+    On the same kind of machine, with the same versions, it is equal to the bit. Elsewhere it differs by rounding.
+
+    Exit codes: 0 equal to the bit, or the store does not have this pass; 1 it differs, by no more than chance (a block
+    z-test); 4 it differs by more.
+    """
+    from photonfarm.renderer.jobs.repeat import check_suffix, repeat
+
+    if out is not None:
+        check_suffix(out)
+    found = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
+    if out is not None:
+        found.write(out)
+        click.echo(f"written to {out}", err=True)
+    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+    sys.exit(found.exit_code)

@@ -1,0 +1,94 @@
+"""Verbs that show what a scene holds, or make one: scene check, scene import, scene shapes."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from shlex import quote
+
+import click
+
+from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.core.processes import ended_by_ctrl_c
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="SPEC",
+              help="The spec to write; the scene goes into a folder beside it.  [default: as PATH]")  # fmt: skip
+@click.option("--up", type=click.Choice(["x", "y", "z"]),
+              help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
+@json_option
+def scene_import(path: Path, out: Path | None, up: str | None, as_json: bool) -> None:
+    """Make a spec of a scene of another program, and a copy of the scene that photonfarm can render.
+
+    PATH is a scene of Mitsuba (.xml, of versions 0.6 to 3), glTF (.gltf, .glb) or OBJ (.obj, with its .mtl), or what
+    Blender reads (.blend, .usd, .fbx), where there is one: docs/own-scene.md says how. Furniture, lights, views and the
+    exposure are proposed; all of it can be changed in the spec.
+    """
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads=1)
+    from photonfarm.renderer.importing.importer import AXES, import_scene
+
+    made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True))
+    if as_json:
+        click.echo(json.dumps(made.document(), indent=1))
+        return
+    for line in (*made.notes, *made.found):
+        click.echo(line)
+    command = f"photonfarm up {quote(str(made.spec))} --modifications 64"
+    click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")
+
+
+@click.command()
+@click.argument("spec")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
+              help="The page.")  # fmt: skip
+@json_option
+@ended_by_ctrl_c()
+def scene_check(spec: str, out: Path, as_json: bool) -> None:
+    """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
+
+    The page shows plan and elevation, sixteen random configurations, every shape, and what cameras see. Nothing is
+    written to a store. The exit code is 0 whatever is found, as long as the spec can be used.
+    """
+    if out.suffix not in (".html", ".htm"):
+        raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")
+    from photonfarm.renderer.scene import backend
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.scene.spec_lines import SpecLines
+    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+
+    loaded, file = load_spec(spec), find_spec(spec)
+    backend.load()
+    from photonfarm.renderer.check import page, scene_check
+
+    check, lines = scene_check.check(loaded, file.parent, partial(click.echo, err=True)), SpecLines.of(file)
+    page.write(check, lines, out)
+    if as_json:
+        show.print_json([finding.document(lines) for finding in check.findings])
+        return
+    for finding in check.findings:
+        click.echo(f"{'warning' if finding.serious else 'note'}: {finding.line(lines)}")
+    click.echo(f"{out}: {len(check.findings) or 'no'} finding{'' if len(check.findings) == 1 else 's'}")
+
+
+@click.command()
+@click.argument("spec")
+@json_option
+@ended_by_ctrl_c()
+def scene_shapes(spec: str, as_json: bool) -> None:
+    """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
+    from photonfarm.renderer.check import shapes
+    from photonfarm.shared.cli import show
+
+    found = shapes.listed(spec)
+    if as_json:
+        show.print_json([shape.document() for shape in found])
+        return
+    show.print_table((shape.row() for shape in found), shapes.HEAD)
+    unnamed = sum(not shape.id for shape in found)
+    if unnamed:
+        click.echo(f"{unnamed} of {len(found)} shapes have no id, without which no group can name them", err=True)

@@ -14,7 +14,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 from photonfarm.renderer.cli.scene_verbs import scene_import
-from photonfarm.renderer.importing.progress import EVERY_S, Progress
 from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.free_space import surroundings
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -128,22 +127,6 @@ bpy.ops.wm.save_as_mainfile(filepath={str(tmp_path / "den.blend")!r})
     subprocess.run([*command[:place], str(tmp_path / "make.py")], check=True)
     assert run(tmp_path / "den.blend").exit_code == 0
     assert "table" in [group.name for group in load_spec("den.toml").groups]
-
-
-def test_nothing_is_silent_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    from photonfarm.renderer.importing import progress
-
-    monkeypatch.setattr(progress, "EVERY_S", 0.05)
-    assert EVERY_S < 5
-    said: list[str] = []
-    with Progress(said.append) as say:
-        say("thinking")
-        time.sleep(0.4)
-    assert said[0] == "thinking"
-    assert len(said) > 2
-    assert all("thinking" in line for line in said)
 
 
 SCENES = [Path(folder) for folder in os.environ.get("PHOTONFARM_SCENES", "").split(os.pathsep) if folder]

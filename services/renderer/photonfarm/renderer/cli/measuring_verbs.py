@@ -10,7 +10,7 @@ import click
 
 from photonfarm.shared.cli.options import json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.shared.core.waiting import WorkLog, waiting
 
 
 @click.command()
@@ -87,7 +87,8 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     from photonfarm.renderer.strategy.output import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)
-    found = measure(loaded, file.parent, partial(click.echo, err=True))
+    with WorkLog(partial(click.echo, err=True)) as work:
+        found = measure(loaded, file.parent, work.begin)
     click.echo(json.dumps(found.entry()) if as_json else found.line())
     if write:
         spec_file.write(file, {"view": {"free_space": found.entry()}})

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element
 
 Vector = tuple[float, float, float]
-
-Say = Callable[[str], None]
-"""Tells the user what is being done."""
 
 _NOT_OF_AN_ID = re.compile(r"[^0-9A-Za-z_-]+")
 

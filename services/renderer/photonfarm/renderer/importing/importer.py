@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from photonfarm.renderer.importing import elements, readers, splitting
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Say, Vector
+from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
 from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.progress import Progress
 from photonfarm.renderer.importing.proposal.groups import CELL, Thing, faces_of, find_things
 from photonfarm.renderer.importing.proposal.pieces import Pieces
 from photonfarm.renderer.importing.proposal.proposed import Proposal, propose
@@ -24,6 +23,7 @@ from photonfarm.renderer.importing.writing import write_scene
 from photonfarm.renderer.measure import exposure
 from photonfarm.shared.core.errors import SpecError, store_errors
 from photonfarm.shared.core.files import write_whole
+from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec_loading import load_spec
 
 AXES: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -52,7 +52,7 @@ class Imported:
         return {"spec": str(self.spec), "folder": str(self.folder), "notes": self.notes, "found": self.found}
 
 
-def import_scene(path: Path, out: Path | None, up: Vector | None, say: Say) -> Imported:
+def import_scene(path: Path, out: Path | None, up: Vector | None, log: Log) -> Imported:
     """Import a file: write a spec and, beside it, a folder with the scene.
 
     Mitsuba must have been loaded. Raises SpecError for a file that cannot be imported and for results that are there
@@ -66,9 +66,9 @@ def import_scene(path: Path, out: Path | None, up: Vector | None, say: Say) -> I
             raise SpecError(f"{there}: is there already; give another name by --out, or take it away")
     with store_errors("write the scene", spec.parent):
         spec.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=spec.parent, prefix=".import-") as scratch, Progress(say) as progress:
-            scene = read(path, Path(scratch), progress)
-            return _import(scene, path, spec, folder, Path(scratch), up, progress)
+        with tempfile.TemporaryDirectory(dir=spec.parent, prefix=".import-") as scratch, WorkLog(log) as work:
+            scene = read(path, Path(scratch), work.begin)
+            return _import(scene, path, spec, folder, Path(scratch), up, work.begin)
 
 
 def _place(path: Path, out: Path | None) -> Path:
@@ -81,34 +81,34 @@ def _place(path: Path, out: Path | None) -> Path:
 
 
 def _import(
-    scene: ImportedScene, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None, say: Say
+    scene: ImportedScene, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None, log: Log
 ) -> Imported:
-    loaded = load(scene, scratch, say)
+    loaded = load(scene, scratch, log)
     frame = Frame(up or scene.up)
-    proposal, things, belonging = _proposal(scene, loaded, frame, say)
+    proposal, things, belonging = _proposal(scene, loaded, frame, log)
     if not loaded.emitters() and not proposal.room.has_ceiling:
         elements.put_sky(scene.root)
         scene.notes.append("the scene has no light and no ceiling; it got a white sky")
     shapes = splitting.shapes_of_things(scene, loaded, belonging, len(things), scratch)
     written = scratch / "written"
     written.mkdir()
-    say("writing the scene")
+    log("writing the scene")
     write_scene(scene, written)
     text = SpecText(_name(spec.stem), f"{folder.name}/scene.xml", path.name, frame, proposal, shapes, scene.notes)
     if not loaded.emitters() and proposal.room.has_ceiling:
         text.ceiling = proposal.ceiling_light()
     (scratch / folder.name).symlink_to(written.resolve(), target_is_directory=True)
-    _keep_in_the_open(text, scratch / spec.name, say)
-    _expose(text, scratch / spec.name, say)
+    _keep_in_the_open(text, scratch / spec.name, log)
+    _expose(text, scratch / spec.name, log)
     shutil.move(str(written), folder)
     write_whole(spec, text.text())
     load_spec(spec)
     return Imported(spec, folder, scene.notes, _found(text))
 
 
-def _proposal(scene: ImportedScene, loaded: Any, frame: Frame, say: Say) -> tuple[Proposal, list[Thing], Any]:
+def _proposal(scene: ImportedScene, loaded: Any, frame: Frame, log: Log) -> tuple[Proposal, list[Thing], Any]:
     surfaces = Surfaces.of(loaded, frame)
-    say(f"looking for the room and what stands in it, among {len(surfaces.shape)} triangles")
+    log(f"looking for the room and what stands in it, among {len(surfaces.shape)} triangles")
     camera = None if scene.camera is None else frame.inward(np.array(scene.camera))
     room = find_room(loaded, surfaces, frame, camera)
     pieces = Pieces.of(surfaces, CELL * room.height)
@@ -125,26 +125,26 @@ def _name(stem: str) -> str:
     return Ids().make(stem.lstrip("._-"), "scene")
 
 
-def _keep_in_the_open(text: SpecText, draft: Path, say: Say) -> None:
+def _keep_in_the_open(text: SpecText, draft: Path, log: Log) -> None:
     """Put in where cameras may stand."""
     from photonfarm.renderer.measure.free_cells import measure
 
-    say("measuring where cameras may stand")
+    log("measuring where cameras may stand")
     draft.write_text(text.text(), encoding="utf-8")
     try:
-        text.free_space = measure(load_spec(draft), draft.parent, say).entry()
+        text.free_space = measure(load_spec(draft), draft.parent, log).entry()
     except SpecError as error:
         text.notes.append(f"cameras are not kept out of solids: {error}")
 
 
-def _expose(text: SpecText, draft: Path, say: Say) -> None:
+def _expose(text: SpecText, draft: Path, log: Log) -> None:
     """Put the exposure in; a scene that stays dark gets a light under its ceiling."""
-    say("choosing the exposure by a quick render")
+    log("choosing the exposure by a quick render")
     for _ in range(2):  # the second time with a light that is added
         draft.write_text(text.text(), encoding="utf-8")
         spec = load_spec(draft)
         try:
-            found = exposure.propose(spec, draft.parent, say, frames=FRAMES)
+            found = exposure.propose(spec, draft.parent, log, frames=FRAMES)
         except SpecError:
             if text.ceiling is not None:
                 raise
@@ -153,7 +153,7 @@ def _expose(text: SpecText, draft: Path, say: Say) -> None:
                 text.exposure = float(f"{found.exposure:.3g}")
                 return
         text.ceiling = text.proposal.ceiling_light()
-        say("the scene stays dark; a light is added under its ceiling")
+        log("the scene stays dark; a light is added under its ceiling")
 
 
 def _found(text: SpecText) -> list[str]:

@@ -10,9 +10,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene, Say, listed
+from photonfarm.renderer.importing.imported import ImportedScene, listed
 from photonfarm.renderer.importing.readers.mitsuba_parts import make_diffuse
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.waiting import Log
 
 MOST_FAULTS = 200
 
@@ -21,14 +22,14 @@ _UNKNOWN_PROPERTY = re.compile(r'^\s+- .+? "(.+?)"', re.MULTILINE)
 _UNKNOWN_PLUGIN = re.compile(r'Plugin "(.+?)" not found')
 
 
-def load(scene: ImportedScene, folder: Path, say: Say) -> Any:
+def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     """The Mitsuba scene of what was imported; adds notes to `scene` for all that had to be changed.
 
     Materials and lights are tried first, as that takes no time, and then with the shapes. Raises SpecError with
     Mitsuba's own words where no change helps.
     """
     _try(_without_shapes(scene.root), scene, folder)
-    say(f"loading {len(scene.root.findall('shape'))} shapes")
+    log(f"loading {len(scene.root.findall('shape'))} shapes")
     loaded = _try(scene.root, scene, folder)
     _flatten_lights(scene, loaded)
     return loaded

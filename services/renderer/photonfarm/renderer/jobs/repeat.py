@@ -5,7 +5,6 @@ Shape letters: H W image.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from photonfarm.shared.core.exr import write_layers
 from photonfarm.shared.core.files import whole_file
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.shared.core.waiting import Log, waiting
 from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.view import View
@@ -122,7 +121,7 @@ def repeat(
     scene: str,
     row: int,
     pass_number: int | None,
-    log: Callable[[str], None],
+    log: Log,
     load: SceneLoader = load_scene,
 ) -> Repeated:
     """Render the sample in a row again, or another pass of its view, and compare it with the stored one.

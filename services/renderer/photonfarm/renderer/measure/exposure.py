@@ -9,7 +9,7 @@ Shape letters: N views, H W image.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import sample_view
@@ -121,7 +122,7 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, log: Callable[[str], None], *, target: float = TARGET, frames: int = FRAMES
+    spec: SceneSpec, beside: Path | None, log: Log, *, target: float = TARGET, frames: int = FRAMES
 ) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
@@ -171,7 +172,7 @@ def _half_spp(film: Film) -> int:
     return PATHS // (film.width * film.height)
 
 
-def _rendered(scene: LoadedScene, frames: int, spp: int, log: Callable[[str], None]) -> Iterator[F32]:
+def _rendered(scene: LoadedScene, frames: int, spp: int, log: Log) -> Iterator[F32]:
     """Two halves of each view, (2, H, W, 3)."""
     spec, said = scene.spec, time.monotonic()
     for number in range(frames):

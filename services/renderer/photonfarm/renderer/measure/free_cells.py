@@ -10,7 +10,6 @@ Shape letters: N cells, L look-at points; X Y Z cells along the axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from photonfarm.renderer.scene.free_space import NONE, boxes_of, surroundings
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.plan.sampling import modification_vectors
 from photonfarm.shared.scene.free_space import FreeSpace, packed
 from photonfarm.shared.scene.modification import Modification, rest
@@ -64,8 +64,9 @@ class Measured:
         return self.space.model_dump(mode="json")
 
 
-def measure(spec: SceneSpec, beside: Path | None, log: Callable[[str], None]) -> Measured:
+def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
     """Measure free space by rays; raises SpecError as loading does, and where almost nothing is free."""
+    log(f"loading {spec.name}")
     scene = LoadedScene.load(spec, beside)
     groups = _group_boxes(scene)
     middles, sides = _middles(spec)

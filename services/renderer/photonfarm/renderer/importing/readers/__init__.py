@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from photonfarm.renderer.importing.imported import ImportedScene, Say
+from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.waiting import Log
 
 BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
 """What Blender reads for us."""
 
-Reader = Callable[[Path, Path, Say], ImportedScene]
+Reader = Callable[[Path, Path, Log], ImportedScene]
 """Reads a file; what it makes of it lies in the folder that is given, and it says what takes long."""
 
 

@@ -11,9 +11,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from photonfarm.renderer.importing.imported import ImportedScene, Say
+from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.readers import gltf
 from photonfarm.shared.core.errors import BackendError, SpecError
+from photonfarm.shared.core.waiting import Log
 
 VARIABLE = "PHOTONFARM_BLENDER"
 """The variable that names Blender, or a Python that has `bpy`."""
@@ -21,22 +22,22 @@ VARIABLE = "PHOTONFARM_BLENDER"
 _SCRIPT = Path(__file__).with_name("blender_export.py")
 
 
-def read(path: Path, scratch: Path, say: Say) -> ImportedScene:
+def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file. Raises BackendError without Blender, SpecError if Blender cannot read the file."""
     command = blender_command(path)
     out = scratch / "exported.glb"
-    say(f"{path.name}: Blender writes it as glTF")
-    log = scratch / "blender.log"
-    with log.open("wb") as stream:
+    log(f"{path.name}: Blender writes it as glTF")
+    output = scratch / "blender.log"
+    with output.open("wb") as stream:
         process = subprocess.Popen([*command, str(path.resolve()), str(out)], stdout=stream, stderr=stream)
         try:
             process.wait()
         finally:
             process.kill()
-    text = log.read_text(errors="replace")
+    text = output.read_text(errors="replace")
     if process.returncode or not out.is_file():
         raise SpecError(f"{path}: Blender cannot read it: {_last_words(text)}")
-    scene = gltf.read(out, scratch, say)
+    scene = gltf.read(out, scratch, log)
     scene.notes[:0] = [line.removeprefix("note: ") for line in text.splitlines() if line.startswith("note: ")]
     return scene
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Say
+from photonfarm.renderer.importing.imported import Ids, ImportedScene
 from photonfarm.renderer.importing.meshes import Mesh, write_ply
 from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node
 from photonfarm.renderer.importing.readers.gltf_materials import Materials
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.waiting import Log
 
 Matrix = NDArray[np.float64]
 
@@ -40,12 +41,12 @@ _READ = frozenset(
 )
 
 
-def read(path: Path, scratch: Path, say: Say) -> ImportedScene:
+def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; meshes and images are put into the folder `scratch`. Raises SpecError for what cannot be read."""
     file = GltfFile(path)
     scene = ImportedScene(elements.scene())
     ids = Ids()
-    reader = _Reader(file, scene, scratch, Materials(file, scene.root, scratch, scene.notes, ids), say, ids)
+    reader = _Reader(file, scene, scratch, Materials(file, scene.root, scratch, scene.notes, ids), log, ids)
     try:
         reader.read()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
@@ -63,14 +64,14 @@ class _Reader:
     scene: ImportedScene
     scratch: Path
     materials: Materials
-    say: Say
+    log: Log
     ids: Ids
     left_out: dict[str, int] = field(default_factory=dict)  # what is not carried over, and how often
 
     def read(self) -> None:
         """Read all nodes of the file's scene."""
         nodes = self.file.all("nodes")
-        self.say(f"reading {len(nodes)} nodes and {len(self.file.all('meshes'))} meshes of {self.file.path.name}")
+        self.log(f"reading {len(nodes)} nodes and {len(self.file.all('meshes'))} meshes of {self.file.path.name}")
         meshes = max(1, sum("mesh" in node for node in nodes))
         for number in self._roots():
             self._visit(number, np.eye(4), "", meshes)

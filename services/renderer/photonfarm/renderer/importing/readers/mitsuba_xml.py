@@ -7,9 +7,10 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Say, Vector, listed
+from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector, listed
 from photonfarm.renderer.importing.readers import mitsuba_instances, mitsuba_old, mitsuba_parts
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.located_xml import Located, parse
 
 INCLUDES = 15
@@ -24,9 +25,9 @@ _OF_FILES = ("bitmap", "envmap", "obj", "ply", "serialized")
 _GENERATED = re.compile(r"^(_unnamed_\d+|_arg_\d+|)$")
 
 
-def read(path: Path, _: Path, say: Say) -> ImportedScene:
+def read(path: Path, _: Path, log: Log) -> ImportedScene:
     """Read a scene; raises SpecError for what is no scene, and for files that are not there."""
-    say(f"reading {path.name}")
+    log(f"reading {path.name}")
     root = _parsed(path)
     _put_values(root, path)
     _join(root, path, path.parent, 0)

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Say
+from photonfarm.renderer.importing.imported import Ids, ImportedScene
 from photonfarm.renderer.importing.meshes import Mesh, write_ply
 from photonfarm.renderer.importing.readers.mtl import Material, put_material, read_materials
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.waiting import Log
 
 CORNERS = 3
 """The fewest corners of a face, and coordinates of a corner."""
@@ -24,9 +25,9 @@ _OBJECTS = re.compile(r"^o\s", re.MULTILINE)
 _LIBRARIES = re.compile(r"^mtllib\s+(.+?)\s*$", re.MULTILINE)
 
 
-def read(path: Path, scratch: Path, say: Say) -> ImportedScene:
+def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; meshes and changed images are put into the folder `scratch`. Raises SpecError if it cannot be."""
-    say(f"reading {path.name}")
+    log(f"reading {path.name}")
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

@@ -18,6 +18,7 @@ from photonfarm.renderer.measure import exposure, sample_costs
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture, display
 from photonfarm.shared.core.records import F32, BasePointCloud
+from photonfarm.shared.core.waiting import WorkLog, time_left
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -41,8 +42,6 @@ WARM_UPS = 2
 
 FEW_SPP = 1
 """The samples per pixel of the quicker of the two timed passes."""
-
-Log = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,15 +81,15 @@ def small(spec: SceneSpec) -> SceneSpec:
     return exposure.shrunk(spec, SIDE).model_copy(update={"points": min(spec.points, POINTS)})
 
 
-def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, log: Log) -> Samples:
+def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: WorkLog) -> Samples:
     """Render the configurations of a spec in a scene that was loaded from `small` of it."""
     film = scene.spec.film
     half_spp = int(np.clip(exposure.PATHS // (film.width * film.height), FEW_SPP + 1, 64))
     drawn = [_drawn(spec, number) for number in range(COUNT)]
-    measured = []
+    measured: list[_Measured] = []
+    begun = time.monotonic()
+    work.begin(f"rendering {COUNT} configurations", lambda: time_left(len(measured), COUNT, begun))
     for number, (modification, views) in enumerate(drawn):
-        first = "" if number else ", and compiling its kernels before"
-        log(f"rendering configuration {number + 1} of {COUNT}{first}")
         measured.append(_measured(scene, cloud, modification, views, number, half_spp))
     return Samples(
         [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +17,11 @@ from photonfarm.renderer.scene.free_space import boxes_of
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import SceneSpec
 
 PICTURED = 240
 """The most shapes that get a picture: those of movable groups, and then the largest."""
-
-QUIET_S = 3.0
-"""The most seconds between two lines of progress, unless one step takes longer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,17 +38,22 @@ class SceneCheck:
     seconds: float
 
 
-def check(spec: SceneSpec, beside: Path | None, log: Callable[[str], None]) -> SceneCheck:
+def check(spec: SceneSpec, beside: Path | None, log: Log) -> SceneCheck:
     """Check a spec; the backend must have been loaded. Raises SpecError and BackendError as loading does."""
+    with WorkLog(log) as work:
+        return _checked(spec, beside, work)
+
+
+def _checked(spec: SceneSpec, beside: Path | None, work: WorkLog) -> SceneCheck:
     begun = time.monotonic()
-    log(f"loading {spec.name}")
+    work.begin(f"loading {spec.name}")
     scene = LoadedScene.load(samples.small(spec), beside)
     group_of = groups_by_shape(spec)
     shapes = facts_of(scene.scene, group_of)
     boxes = boxes_of(scene.scene.shapes())
     still = np.array([shape.group is None for shape in shapes])
     room = _around(boxes[still] if still.any() else boxes)
-    log(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")
+    work.begin(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")
     geometry, cloud = scene.base()
     placed = placements(scene, geometry)
     colours = shape_pictures.colours(scene.scene, geometry)
@@ -59,7 +61,7 @@ def check(spec: SceneSpec, beside: Path | None, log: Callable[[str], None]) -> S
     up = int(np.abs(spec.view.up).argmax())
     pictured = _pictured(shapes, boxes)
     pictures = {number: shape_pictures.picture(geometry, number, colours[number], up) for number in pictured}
-    rendered = samples.render(scene, spec, cloud, _now_and_then(log))
+    rendered = samples.render(scene, spec, cloud, work)
     low, high = _around(boxes)
     measured = Measured(low, high, placed, rendered)
     found = findings(spec, beside, measured)
@@ -75,16 +77,3 @@ def _pictured(shapes: list[ShapeFacts], boxes: F32) -> list[int]:
     size = np.linalg.norm(boxes[:, 1] - boxes[:, 0], axis=1)
     order = sorted(range(len(shapes)), key=lambda number: (shapes[number].group is None, -size[number]))
     return order[:PICTURED]
-
-
-def _now_and_then(log: Callable[[str], None]) -> Callable[[str], None]:
-    """`log`, but for lines that follow another one too soon."""
-    last = 0.0
-
-    def say(line: str) -> None:
-        nonlocal last
-        if time.monotonic() - last > QUIET_S:
-            last = time.monotonic()
-            log(line)
-
-    return say

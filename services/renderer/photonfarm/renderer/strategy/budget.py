@@ -11,15 +11,15 @@ from typing import TypeVar
 import numpy as np
 
 from photonfarm.renderer.strategy.candidate import Candidate, Render
+from photonfarm.renderer.strategy.image_cost import LEAST_TURNS, RANGE
+from photonfarm.renderer.strategy.pilot import LEAST_PAIRS
+from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.core.errors import IncompleteError
 
 T = TypeVar("T")
 
-TURNS, RANGE_OF_SAMPLES = 4, 5
-"""The turns in which images are timed at least, and the samples per pixel of a turn's two images of a candidate."""
-
-VIEWS, SCOUTS, PAIRED = 3, 8, 4
-"""The views of a pilot at least; the images of each that weigh the others; those of each candidate that count."""
+LEAST_VIEWS = 3
+"""The views of a pilot at least."""
 
 TRACES = 5
 """How often a candidate is traced again: for other numbers of samples, and on the pilot's film."""
@@ -90,8 +90,10 @@ def affordable(
     images: list[float] = []
 
     def needed(count: int) -> float:
-        rendered = VIEWS * max(SCOUTS, count) + (VIEWS * PAIRED + TURNS * RANGE_OF_SAMPLES) * count
-        return float(rendered * np.mean(images) + TRACES * count * min(compiling) + EDITS * VIEWS * edit_s)
+        timed = (LEAST_TURNS + 1) * (1 + RANGE) * count
+        of_a_view = max(SCOUTS, count) + 2 * -(-LEAST_PAIRS // LEAST_VIEWS) * count
+        rendered_s = (timed + LEAST_VIEWS * of_a_view) * np.mean(images)
+        return float(rendered_s + TRACES * count * min(compiling) + EDITS * LEAST_VIEWS * edit_s)
 
     for count, candidate in enumerate(ordered, 1):
         if count > len(first) and MARGIN * needed(count) + min(compiling) > budget.left_s:

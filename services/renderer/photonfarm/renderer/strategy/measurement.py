@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from photonfarm.renderer.strategy import content, light_reach, pilot
-from photonfarm.renderer.strategy.budget import EDITS, VIEWS, Budget, affordable
+from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, Budget, affordable
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
@@ -35,7 +35,7 @@ FIRST_ROUND = 0.4
 TIMING = 0.2
 """The share of the given time that is spent on timing images."""
 
-LEAST_VIEWS, MOST_VIEWS = 3, 8
+MOST_VIEWS = 8
 
 LIT, LEAST_LIT, REACH = 16, 2, 0.25
 """The number of configurations in which light paths are traced, to see which photons are worth storing: 16, or as many,
@@ -160,7 +160,7 @@ def _compare(
     scale = pixels / (quick.spec.film.width * quick.spec.film.height)
     costs = {candidate: ImageCost(cost.fixed_s, scale * cost.sample_s) for candidate, cost in timed.items()}
     half_s = costs[now].time_s(half_spp)
-    left_s = max(budget.left_s - EDITS * VIEWS * edit_s, 0.0)
+    left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
     film, spp, views = _pilot_film(spec, costs, left_s)
     pilot_scene = quick.on_film(film)
     work_log.begin(

@@ -1,0 +1,136 @@
+"""The noise of guides: what it follows from, and that it is that of no sample."""
+
+from collections.abc import Callable
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from photonfarm.renderer.jobs.render import lit_points
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.gbuffer import GRID
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.keys import make_key, seed_of, view_key
+from photonfarm.shared.core.records import Guides, arrays_of
+from photonfarm.shared.scene.modification import rest
+from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.scene.view import View
+from photonfarm.shared.store.write.guides import NOISY
+
+backend.load(threads=1)
+
+from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
+from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
+from photonfarm.renderer.scene.guides import point_light, view_guides  # noqa: E402
+from photonfarm.renderer.scene.materials import Materials  # noqa: E402
+
+Images = NDArray[np.float64]
+Lit = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+KEY = make_key("view", "of a test")
+
+
+@pytest.fixture
+def lit(room: LoadedScene) -> Lit:
+    """Some points of the room at rest."""
+    room.apply(rest(room.spec))
+    position, normal = lit_points(room.base()[1], rest(room.spec))
+    return position[:64], normal[:64]
+
+
+def bytes_of(found: Guides) -> dict[str, bytes]:
+    return {name: values.tobytes() for name, values in arrays_of(found).items()}
+
+
+def test_another_key_gives_other_noise_and_the_same_of_all_else(room: LoadedScene, somewhere: View, lit: Lit) -> None:
+    one, other = (bytes_of(room.guides(somewhere, make_key("view", i), GuideSpec(), lit)) for i in (1, 2))
+    assert {name for name in one if one[name] != other[name]} == set(NOISY)
+    assert set(one) == {field.name for field in fields(Guides)}
+
+
+def test_a_key_gives_the_same_bytes_recorded_or_not_and_whatever_was_rendered_before(
+    room: LoadedScene, somewhere: View, lit: Lit
+) -> None:
+    again = room.guides(somewhere, KEY, GuideSpec(), lit)
+    arrives = [point_light(room.scene, *lit, KEY, GuideSpec(), how) for how in (None, Recorder(guides.irradiance))]
+    told = room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene)
+    plain = view_guides(*told, arrives[0])
+    fresh = view_guides(*told, arrives[1], Recorder(guides.trace))
+    assert bytes_of(again) == bytes_of(plain) == bytes_of(fresh)
+
+
+def test_images_that_are_traced_in_several_goes_are_those_of_one(
+    room: LoadedScene, somewhere: View, lit: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = room.guides(somewhere, KEY, GuideSpec(), lit)
+    monkeypatch.setattr("photonfarm.renderer.scene.guides.images.RAYS", 100 * GRID * GRID)
+    arrives = point_light(room.scene, *lit, KEY, GuideSpec())
+    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
+    for name, values in arrays_of(whole).items():
+        np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def of_many_views(room: LoadedScene, somewhere: View) -> Callable[[str], tuple[Images, Images, Images]]:
+    """Function (name of a guide) → it, and halves A and B, of 48 views (48, …) that look the same and have own keys.
+
+    Keys and seeds are made as jobs make them, of views whose vectors differ.
+    """
+    room.apply(rest(room.spec))
+    modification = rest(room.spec)
+    position, normal = lit_points(room.base()[1], modification)
+    lit = position[:64], normal[:64]
+    of_modification = modification.key(room.spec.scene_id)
+    noisy: dict[str, list[Images]] = {name: [] for name in NOISY}
+    halves = []
+    for number in range(48):
+        vector = somewhere.vector + np.float32(number)
+        found = room.guides(somewhere, view_key(of_modification, vector), GuideSpec(light_samples=1), lit)
+        for name, values in noisy.items():
+            values.append(getattr(found, name).astype(np.float64))
+        sample = make_key("sample", room.spec.scene_id, modification.vector, vector, 0)
+        halves.append(room.render_halves(somewhere, [seed_of(sample, f"half {half}") for half in "AB"]))
+    a, b = np.stack(halves).astype(np.float64).swapaxes(0, 1)
+    return lambda name: (np.stack(noisy[name]), a, b)
+
+
+def noise_of(values: Images) -> Images:
+    """What varies over views (K, …), of unit variance in each pixel; 0 where nothing does."""
+    above, spread = values - values.mean(axis=0), values.std(axis=0, ddof=1)
+    return np.divide(above, spread, out=np.zeros_like(above), where=spread > 0)
+
+
+def joint(one: Images, other: Images) -> float:
+    """How far two noises (K, …) go together over views: normally distributed if they are independent.
+
+    Of each view the product of the two, summed over pixels; the mean of these over its standard error.
+    """
+    products = (one * other).reshape(len(one), -1).sum(axis=1)
+    return float(products.mean() / (products.std(ddof=1) / np.sqrt(len(one))))
+
+
+@pytest.mark.parametrize("name", ["direct", "gloss"])
+def test_the_noise_of_direct_light_goes_together_with_neither_half(
+    name: str, of_many_views: Callable[[str], tuple[Images, Images, Images]]
+) -> None:
+    """Two-sided, at a significance of 1 in 1000 for each half; fixed keys. A correlation of 0.1 would be found."""
+    noise, a, b = map(noise_of, of_many_views(name))
+    assert (noise.std(axis=0) > 0).mean() > 0.1
+    assert abs(joint(noise, a)) < 3.3
+    assert abs(joint(noise, b)) < 3.3
+    assert abs(joint(a, b)) < 3.3
+    for mixed in (a + 0.1 * noise, b - 0.1 * noise):
+        assert abs(joint(noise, mixed)) > 3.3, "else the test would see nothing"
+
+
+def test_the_noise_of_lit_points_goes_together_with_neither_half(
+    of_many_views: Callable[[str], tuple[Images, Images, Images]],
+) -> None:
+    """The correlation is of their mean with the image's, at a significance of 1 in 1000."""
+    points, a, b = of_many_views("point_light")
+    mean = noise_of(points.mean(axis=(1, 2)))
+    direct, _, _ = of_many_views("direct")
+    assert mean.any()
+    for image in (a, b, direct):
+        assert abs(joint(mean, noise_of(image.mean(axis=(1, 2, 3))))) < 3.3

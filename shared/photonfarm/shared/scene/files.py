@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.located_xml import parse
+from photonfarm.shared.scene.located_xml import line_of, parse
 
 BUILTIN_REVISION = 1
 """Incremented whenever a built-in room changes, as its content is code and not a file."""
@@ -41,13 +41,10 @@ _UNSUPPORTED = {
     "phase": "participating media are not supported; only surfaces are",
     "volume": "volumes are not supported; only surfaces are",
 }
-_UNSUPPORTED_BSDFS = {
-    "measured_polarized": "polarisation is not supported",
-    "polarizer": "polarisation is not supported",
-    "retarder": "polarisation is not supported",
-    "circular": "polarisation is not supported",
-}
-_SHAPES = ("obj", "ply", "serialized", "rectangle", "cube", "sphere", "disk", "cylinder")
+POLARISED = ("measured_polarized", "polarizer", "retarder", "circular")
+"""The materials that are not supported: those that polarise."""
+
+SHAPES = ("obj", "ply", "serialized", "rectangle", "cube", "sphere", "disk", "cylinder")
 """Shapes with a base point cloud; instances and curves have none."""
 
 
@@ -105,19 +102,18 @@ def _refuse_unsupported(root: ElementTree.Element, path: Path) -> None:
     around = {part: node for node in root.iter() for part in node}
     for node in root.iter():
         reason = _UNSUPPORTED.get(node.tag)
-        if node.tag == "bsdf":
-            reason = _UNSUPPORTED_BSDFS.get(node.get("type", ""))
-        if node.tag == "shape" and node.get("type") not in _SHAPES:
-            reason = f"shapes of type {node.get('type')!r} are not supported; only {', '.join(_SHAPES)}"
+        if node.tag == "bsdf" and node.get("type") in POLARISED:
+            reason = "polarisation is not supported"
+        if node.tag == "shape" and node.get("type") not in SHAPES:
+            reason = f"shapes of type {node.get('type')!r} are not supported; only {', '.join(SHAPES)}"
         if node.tag == "include":
             reason = "included scene files are not supported; join them into one file"
         if reason:
             name = node.get("id") or node.get("name") or node.get("type")
             shape = around.get(node, root)
             whose = f" of shape {shape.get('id', '')!r}" if shape.tag == "shape" else ""
-            line = getattr(node, "line", 0)
             remedy = f"`photonfarm scene import {path.name}` makes a copy of the scene without what is not supported"
-            raise SpecError(f"{path}: line {line}: <{node.tag}> {name!r}{whose}: {reason}; {remedy}")
+            raise SpecError(f"{path}: line {line_of(node)}: <{node.tag}> {name!r}{whose}: {reason}; {remedy}")
 
 
 def _named_files(root: ElementTree.Element, path: Path) -> list[Path]:

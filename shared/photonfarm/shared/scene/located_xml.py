@@ -13,6 +13,11 @@ class Located(Element):
     line: int = 0
 
 
+def line_of(element: Element) -> int:
+    """The line of an element; 0 for one that is of no file."""
+    return element.line if isinstance(element, Located) else 0
+
+
 def parse(path: Path) -> Located:
     """The root of an XML file; raises OSError, or ParseError for what is no XML."""
     builder = TreeBuilder(element_factory=Located)

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from photonfarm.shared.scene.located_xml import line_of
+
 
 def scene() -> Element:
     """An empty scene."""
@@ -91,7 +93,7 @@ def text(root: Element) -> str:
 
 def place(node: Element) -> str:
     """An element as a message names it, with its line where that is known."""
-    line = getattr(node, "line", 0)
+    line = line_of(node)
     name = node.get("id") or node.get("name") or ""
     where = f"line {line}: " if line else ""
     return f"{where}<{node.tag}>{f' {name!r}' if name else ''}"

@@ -27,18 +27,8 @@ OBJECT_SHARE = 0.34
 
 _NOT_CARRIED = {"animations": "animations", "skins": "skins (meshes stand as modelled)"}
 
-_READ = frozenset(
-    {
-        "KHR_lights_punctual",
-        "KHR_materials_emissive_strength",
-        "KHR_materials_ior",
-        "KHR_materials_transmission",
-        "KHR_materials_volume",
-        "KHR_texture_transform",
-        "KHR_mesh_quantization",
-        "EXT_texture_webp",
-    }
-)
+_READ = ("KHR_lights_punctual", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_texture_webp")
+"""The extensions that are carried over, beside those of materials, each of which says what it loses."""
 
 
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:

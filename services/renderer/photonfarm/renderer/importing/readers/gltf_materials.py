@@ -93,7 +93,7 @@ class Materials:
             top.set("type", "twosided")
             elements.put_value(SubElement(top, "bsdf", type="diffuse"), "reflectance", (0.8, 0.8, 0.8))
             return made
-        self._say_what_is_lost(entry, made)
+        self._say_what_is_lost(entry, number, made)
         surface = entry.get("pbrMetallicRoughness", {})
         self._put_mask(top, entry, surface, made)
         self._put_surface(self._under_mask(top), entry, surface, made)
@@ -212,7 +212,7 @@ class Materials:
                   entry.get("normalTexture"), entry.get("emissiveTexture"))  # fmt: skip
         return [found for found in places if found is not None]
 
-    def _say_what_is_lost(self, entry: Node, made: str) -> None:
+    def _say_what_is_lost(self, entry: Node, number: int, made: str) -> None:
         lost = [_PARTS.get(name, name) for name in entry.get("extensions", {}) if name not in _CARRIED]
         if "occlusionTexture" in entry:
             lost.append("baked occlusion, which is computed here")
@@ -223,7 +223,6 @@ class Materials:
             lost.append("the map of its transmission")
         if lost:
             self.notes.append(f"material {made!r}: not carried over: {', '.join(lost)}")
-        number = self.file.all("materials").index(entry)
         sets = {_uv_set(found) for found in self._textures(number)}
         if len(sets) > 1:
             self.notes.append(

@@ -7,7 +7,10 @@ import re
 from collections.abc import Callable
 from xml.etree.ElementTree import Element, SubElement
 
+import numpy as np
+
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.readers import images
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
@@ -45,9 +48,8 @@ def _upgrade_colour(node: Element) -> None:
     elif node.tag in ("spectrum", "rgb") and node.get("value", "").startswith("#"):
         digits = node.get("value", "")[1:7]
         encoded = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
-        linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in encoded]
         node.tag = "rgb"
-        node.set("value", elements.numbers(linear))
+        node.set("value", elements.numbers(images.linear(np.array(encoded, np.float32)).tolist()))
     elif node.tag == "spectrum" and re.fullmatch(r"\s*[^\s:,]+[\s,]+[^\s:,]+[\s,]+[^\s:,]+\s*", node.get("value", "")):
         node.tag = "rgb"  # three numbers were a colour
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from xml.etree.ElementTree import Element
 
 from photonfarm.renderer.importing import elements
+from photonfarm.shared.scene.files import POLARISED, SHAPES
+from photonfarm.shared.scene.located_xml import line_of
 
-_SHAPES = ("obj", "ply", "serialized", "rectangle", "cube", "sphere", "disk", "cylinder", "instance", "shapegroup")
-
-_POLARISED = ("measured_polarized", "polarizer", "retarder", "circular")
+_SHAPES = (*SHAPES, "instance", "shapegroup")  # the last two become others
 
 _MEDIUM_PLACES = ("interior", "exterior", "medium")
 
@@ -69,7 +69,7 @@ def _drop_shapes(root: Element) -> Iterator[str]:
 
 def _replace_materials(root: Element) -> Iterator[str]:
     for bsdf in root.iter("bsdf"):
-        if bsdf.get("type") in _POLARISED:
+        if bsdf.get("type") in POLARISED:
             yield f"{elements.place(bsdf)} of type {bsdf.get('type')!r} became diffuse: polarisation is not rendered"
             make_diffuse(bsdf)
     for emitter in root.iter("emitter"):
@@ -94,5 +94,4 @@ def make_diffuse(bsdf: Element) -> None:
 def _named(shape: Element) -> str:
     file = elements.child(shape, "filename")
     known = shape.get("id") or (file.get("value") if file is not None else None) or shape.get("type")
-    line = getattr(shape, "line", 0)
-    return f"line {line}: shape {known!r}"
+    return f"line {line_of(shape)}: shape {known!r}"

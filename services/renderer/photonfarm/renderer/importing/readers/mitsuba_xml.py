@@ -11,7 +11,7 @@ from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector, l
 from photonfarm.renderer.importing.readers import mitsuba_instances, mitsuba_old, mitsuba_parts
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.located_xml import Located, parse
+from photonfarm.shared.scene.located_xml import Located, line_of, parse
 
 INCLUDES = 15
 """The deepest nesting of files that is followed; more is a file that includes itself."""
@@ -72,8 +72,7 @@ def _put_values(root: Element, path: Path) -> None:
             for name in names if "$" in text else ():
                 text = text.replace(f"${name}", values[name])
             if text.startswith("$"):
-                line = getattr(node, "line", 0)
-                raise SpecError(f"{path}: line {line}: {text} has no <default>; add one, or put a value there")
+                raise SpecError(f"{path}: line {line_of(node)}: {text} has no <default>; add one, or put a value there")
             node.set(key, text)
 
 
@@ -82,7 +81,7 @@ def _join(root: Element, path: Path, folder: Path, depth: int) -> None:
     for include in root.findall("include"):
         name = include.get("filename") or ""
         file = folder / name
-        line = getattr(include, "line", 0)
+        line = line_of(include)
         if not file.is_file():
             raise SpecError(f"{path}: line {line}: included file {name!r} is not there")
         if depth == INCLUDES:
@@ -111,8 +110,9 @@ def _find_files(root: Element, path: Path) -> None:
         name = node.get(key, "")
         file = (path.parent / name.replace("\\", "/")).resolve()
         if not file.is_file():
-            line = getattr(node, "line", 0)
-            raise SpecError(f"{path}: line {line}: file {name!r} is not there; put it there, or take its place out")
+            raise SpecError(
+                f"{path}: line {line_of(node)}: file {name!r} is not there; put it there, or take its place out"
+            )
         node.set(key, str(file))
 
 

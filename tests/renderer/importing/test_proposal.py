@@ -14,7 +14,7 @@ from photonfarm.renderer.importing.proposal.floor_plan import largest_rectangle
 from photonfarm.renderer.importing.proposal.names import group_name, is_furniture, is_shell
 from photonfarm.renderer.importing.proposal.surfaces import Frame
 from photonfarm.renderer.importing.readers import reader_of
-from photonfarm.renderer.scene.free_space import surroundings
+from photonfarm.renderer.scene.surroundings import surroundings
 
 
 @pytest.fixture(scope="module")

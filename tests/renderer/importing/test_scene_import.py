@@ -15,8 +15,8 @@ from click.testing import CliRunner, Result
 
 from photonfarm.renderer.cli.scene_verbs import scene_import
 from photonfarm.renderer.importing.readers import blender
-from photonfarm.renderer.scene.free_space import surroundings
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import surroundings
 from photonfarm.shared.core.errors import BackendError, PhotonfarmError, SpecError
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.scene.modification import sample_modification

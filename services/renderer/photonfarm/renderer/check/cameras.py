@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.free_space import LEAVING, NONE, surroundings
 from photonfarm.renderer.scene.gbuffer import reflects_here
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import LEAVING, NONE
+from photonfarm.renderer.scene.visibility import sight_shares
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import Camera, View
@@ -69,8 +69,8 @@ def look(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Cameras:
     """Cameras of the scene's present configuration; `cloud` (P, 3) are points that are there in it."""
     ids = [shape.id() or f"shape {number}" for number, shape in enumerate(scene.scene.shapes())]
     origin, target = (np.stack([getattr(view, name) for view in views]) for name in ("origin", "target"))
-    here = surroundings(scene.scene, origin)
-    sights = _sights(scene.scene, origin, target)
+    here = scene.surroundings(origin)
+    sights = sight_shares(scene.scene, origin, target)
     hit, dark = _images(scene, views)
     seen = [scene.sees(view, cloud).mean(dtype=np.float32) for view in views]
     return Cameras(
@@ -80,17 +80,6 @@ def look(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Cameras:
         dark=dark,
         seen=np.array(seen, np.float32),
     )
-
-
-def _sights(scene: Any, origin: F32, target: F32) -> F32:
-    """The share of all look-at points that each camera has an unobstructed line to, (N,)."""
-    start, end = np.repeat(origin, len(target), axis=0), np.tile(target, (len(origin), 1))
-    offset = end - start
-    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
-    ray = mi.Ray3f(o=points(start), d=mi.Vector3f(points(offset / distance[:, None])))
-    ray.maxt = floats(distance)
-    blocked = np.array(scene.ray_test(ray)).reshape(len(origin), len(target))
-    return 1 - blocked.mean(axis=1, dtype=np.float32)
 
 
 def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.check.orthographic import Projection, whole
-from photonfarm.renderer.check.placements import Placed
+from photonfarm.renderer.check.placements import Placed, group_vertices
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32, Geometry
 from photonfarm.shared.scene.spec import Box, SceneSpec
@@ -98,8 +98,7 @@ def _drawing(
         for name, kind, box in (("origin", "cameras", spec.view.origin), ("look_at", "looked at", spec.view.look_at))
     ]
     for number, group in enumerate(spec.groups):
-        faces = geometry.faces[geometry.shape_group[geometry.face_shape] == number]
-        vertices = geometry.vertices[np.unique(faces)]
+        vertices = group_vertices(geometry, number)
         kind = "object" if number < len(spec.objects) else "light"
         colour = COLOURS[number % len(COLOURS)]
         marks.append(_mark(group.name, colour, kind, group.box, projection, np.array(group.at), vertices))

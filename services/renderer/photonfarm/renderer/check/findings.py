@@ -111,18 +111,18 @@ def _of_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
 
 def _of_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
     if cameras.nothing.mean() >= EMPTY:
-        yield Finding("view.look_at", f"{_percent(cameras.nothing.mean())} of the cameras see no surface at all")
+        yield Finding("view.look_at", f"{percent(cameras.nothing.mean())} of the cameras see no surface at all")
     if cameras.behind.mean() >= BEHIND:
         yield Finding(
             "view.origin",
-            f"{_percent(cameras.behind.mean())} of the cameras stand outside the room, with a wall between them and "
+            f"{percent(cameras.behind.mean())} of the cameras stand outside the room, with a wall between them and "
             "what they look at; make origin smaller, or keep them out by `photonfarm scene free-space SPEC --write`",
         )
     elif cameras.inside_share >= INSIDE:
         most = " and ".join(repr(name) for name, _ in cameras.holders()[:2])
         yield Finding(
             "view.origin",
-            f"{_percent(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; keep "
+            f"{percent(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; keep "
             "origin away from furniture, or cameras out of it by `photonfarm scene free-space SPEC --write`",
         )
     well = cameras.placed_well
@@ -132,14 +132,14 @@ def _of_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
     if little >= SEES_LITTLE:
         yield Finding(
             "view",
-            f"{_percent(little)} of the views see fewer than {max(1, round(LEAST_SEEN * spec.points))} of the "
+            f"{percent(little)} of the views see fewer than {max(1, round(LEAST_SEEN * spec.points))} of the "
             f"{spec.points} points, as they look at a wall from close by, or past the scene",
             serious=False,
         )
     if cameras.dark[well].mean() >= BLACK_BACKS:
         yield Finding(
             "scene.file",
-            f"{_percent(cameras.dark[well].mean())} of what the cameras see are backs of one-sided materials, which "
+            f"{percent(cameras.dark[well].mean())} of what the cameras see are backs of one-sided materials, which "
             'are black; put <bsdf type="twosided"> around them in the scene file, if cameras may see them',
         )
 
@@ -174,13 +174,13 @@ def _of_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> Iter
         yield Finding(
             f"{key}.box",
             f"box of {group.name!r} lets it leave the room, or stand in what does not move, in "
-            f"{_percent(placed.outside)} of its places; make it smaller",
+            f"{percent(placed.outside)} of its places; make it smaller",
         )
     elif placed.cut >= CUT_AT_ALL:
         yield Finding(
             f"{key}.box",
-            f"box of {group.name!r} lets it stand in {placed.through!r} and others in {_percent(placed.cut)} of its "
-            f"places; at {_point(placed.place)} {_percent(placed.worst)} of it is behind them",
+            f"box of {group.name!r} lets it stand in {placed.through!r} and others in {percent(placed.cut)} of its "
+            f"places; at {_point(placed.place)} {percent(placed.worst)} of it is behind them",
             serious=placed.cut >= CUT,
         )
     up = int(np.abs(spec.view.up).argmax())
@@ -191,7 +191,8 @@ def _of_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> Iter
         )
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
+    """A share in words."""
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.scene.arrays import floats, integers, points, rows
+from photonfarm.renderer.scene.arrays import floats, integers, points, rows, shape_numbers
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32
 
@@ -72,10 +72,7 @@ def whole(scene: Any, projection: Projection, width: int, colours: F32) -> Pictu
     si = scene.ray_intersect(_along(projection, origin))
     hit, normal, shape = si.is_valid(), si.n, dr.reinterpret_array(mi.UInt32, si.shape)
     dr.eval(hit, normal, shape)
-    registered = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
-    numbers = np.full(registered.max() + 1, NOTHING)
-    numbers[registered] = np.arange(len(registered))
-    number = np.where(np.array(hit), numbers[np.array(shape)], NOTHING).reshape(size)
+    number = np.where(np.array(hit), shape_numbers(scene)[np.array(shape)], NOTHING).reshape(size)
     return _shaded(number, rows(normal, *size) @ projection.forward, colours)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.check.drawings import COLOURS
-from photonfarm.renderer.check.findings import CUT_AT_ALL, INSIDE, LEAST_SEEN, MEANS, OUTSIDE
+from photonfarm.renderer.check.findings import CUT_AT_ALL, INSIDE, LEAST_SEEN, MEANS, OUTSIDE, percent
 from photonfarm.renderer.check.scene_check import SceneCheck
 from photonfarm.renderer.check.shapes import ShapeFacts
 from photonfarm.renderer.measure.exposure import TARGET
@@ -20,6 +20,7 @@ from photonfarm.shared.core.errors import store_errors
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture, display_values
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.scene.spec_lines import SpecLines
 
 TEMPLATE = Path(__file__).with_name("check.html.j2")
@@ -88,9 +89,9 @@ def _camera_facts(check: SceneCheck) -> list[Fact]:
     holders = ", ".join(name for name, _ in cameras.holders()[:3])
     median, low = np.percentile(cameras.seen, [50, 5])
     return [
-        Fact("stand inside objects", _percent(cameras.inside_share), holders, cameras.inside_share >= INSIDE),
-        Fact("look through a wall from outside", _percent(cameras.behind.mean()), "", bool(cameras.behind.any())),
-        Fact("see no surface", _percent(cameras.nothing.mean()), "", bool(cameras.nothing.any())),
+        Fact("stand inside objects", percent(cameras.inside_share), holders, cameras.inside_share >= INSIDE),
+        Fact("look through a wall from outside", percent(cameras.behind.mean()), "", bool(cameras.behind.any())),
+        Fact("see no surface", percent(cameras.nothing.mean()), "", bool(cameras.nothing.any())),
         Fact("points that a view sees", f"{median * points:.0f} of {points}", f"5 % of views: below {low * points:.0f}",
              bool(low < LEAST_SEEN)),
     ]  # fmt: skip
@@ -106,9 +107,9 @@ def _light_facts(check: SceneCheck) -> list[Fact]:
     return [
         Fact("display mean", f"{mean:.2f}", "" if better is None else f"{TARGET:g} at exposure {better:.2g}",
              not MEANS[0] <= mean <= MEANS[1]),
-        Fact("noise of a pixel", _percent(noise), f"root mean square at {spp} samples per pixel"),
+        Fact("noise of a pixel", percent(noise), f"root mean square at {spp} samples per pixel"),
         Fact("cost of a sample", f"{seconds:.2g} s", "of one core, without guides; roughly"),
-        Fact("1000 samples", _duration(1000 * seconds), "of one core, without guides"),
+        Fact("1000 samples", in_words(1000 * seconds), "of one core, without guides"),
     ]  # fmt: skip
 
 
@@ -146,17 +147,3 @@ def _tile(check: SceneCheck, number: int) -> Tile:
     corners = (np.array([shape.min, shape.max]) - low) / size
     (x0, y0), (x1, y1) = np.clip(corners[:, [across, along]], 0, 1)
     return Tile(shape, check.pictures.get(number), (float(x0), float(y0), float(x1 - x0), float(y1 - y0)))
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
-
-
-def _duration(seconds: float) -> str:
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 120
-        else f"{seconds / 60:.0f} min"
-        if seconds < 7200
-        else f"{seconds / 3600:.1f} h"
-    )

@@ -5,7 +5,6 @@ Shape letters: C corners of a box, N places in it, V points of a group.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -15,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.free_space import surroundings
+from photonfarm.renderer.scene.arrays import floats, points, shape_numbers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import surroundings
 from photonfarm.shared.core.records import F32, Geometry
-from photonfarm.shared.scene.spec import Movable, shape_ids
+from photonfarm.shared.scene.spec import Movable
 
 PLACES = 64
 """Places in a box, beside its corners."""
@@ -51,10 +50,10 @@ def placements(scene: LoadedScene, geometry: Geometry) -> list[Placed]:
     """Each group of a scene at rest."""
     from photonfarm.renderer.scene.loading import scene_of
 
-    movable = {shape for group in scene.spec.groups for shape in shape_ids(group)}
-    still = [shape for shape in scene.scene.shapes() if shape.id() not in movable]
-    fixed = scene_of(still) if still else None
-    return [_placed(fixed, _vertices(geometry, number), group) for number, group in enumerate(scene.spec.groups)]
+    still = [shape for shape, stays in zip(scene.scene.shapes(), scene.still, strict=True) if stays]
+    fixed, hollow = scene_of(still) if still else None, scene.hollow[scene.still]
+    groups = enumerate(scene.spec.groups)
+    return [_placed(fixed, hollow, group_vertices(geometry, number), group) for number, group in groups]
 
 
 def _corners(group: Movable) -> F32:
@@ -63,13 +62,13 @@ def _corners(group: Movable) -> F32:
     return np.array([*product(*ends)], np.float32)
 
 
-def _vertices(geometry: Geometry, number: int) -> F32:
+def group_vertices(geometry: Geometry, number: int) -> F32:
     """The vertices of a group's triangles, (V, 3)."""
     faces = geometry.faces[geometry.shape_group[geometry.face_shape] == number]
     return geometry.vertices[np.unique(faces)]
 
 
-def _placed(fixed: Any, vertices: F32, group: Movable) -> Placed:
+def _placed(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable) -> Placed:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     corners = _corners(group)
     if fixed is None:
@@ -78,7 +77,7 @@ def _placed(fixed: Any, vertices: F32, group: Movable) -> Placed:
     places = np.concatenate([[group.at], corners, within])
     moves = (places - group.at).astype(np.float32)
     middle = (low + high) / 2
-    there = surroundings(fixed, middle + moves).open
+    there = surroundings(fixed, middle + moves, hollow).open
     spread = vertices[np.linspace(0, len(vertices) - 1, min(POINTS, len(vertices))).astype(np.int64)]
     behind, shapes = _behind(fixed, middle, spread, moves)
     cut = np.maximum(behind - behind[0], 0)
@@ -103,7 +102,6 @@ def _behind(fixed: Any, middle: F32, vertices: F32, moves: F32) -> tuple[NDArray
     ray.maxt = floats(np.tile((1 - TOUCHING) * distance, len(moves)))
     hit = fixed.ray_intersect_preliminary(ray)
     met = np.isfinite(np.array(hit.t))
-    registered = np.array(dr.reinterpret_array(mi.UInt32, fixed.shapes_dr())).tolist()
-    most = Counter(np.array(dr.reinterpret_array(mi.UInt32, hit.shape))[met].tolist()).most_common(1)
-    name = fixed.shapes()[registered.index(most[0][0])].id() if most else None
+    shapes = shape_numbers(fixed)[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))[met]]
+    name = fixed.shapes()[np.bincount(shapes).argmax()].id() if met.any() else None
     return met.reshape(len(moves), -1).mean(axis=1), name

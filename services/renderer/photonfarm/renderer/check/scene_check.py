@@ -13,7 +13,6 @@ from photonfarm.renderer.check.drawings import Drawing
 from photonfarm.renderer.check.findings import Finding, Measured, findings
 from photonfarm.renderer.check.placements import placements
 from photonfarm.renderer.check.shapes import ShapeFacts, facts_of, groups_by_shape
-from photonfarm.renderer.scene.free_space import boxes_of
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32
@@ -50,8 +49,7 @@ def _checked(spec: SceneSpec, beside: Path | None, work: WorkLog) -> SceneCheck:
     scene = LoadedScene.load(samples.small(spec), beside)
     group_of = groups_by_shape(spec)
     shapes = facts_of(scene.scene, group_of)
-    boxes = boxes_of(scene.scene.shapes())
-    still = np.array([shape.group is None for shape in shapes])
+    boxes, still = scene.boxes, scene.still
     room = _around(boxes[still] if still.any() else boxes)
     work.begin(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")
     geometry, cloud = scene.base()

@@ -83,7 +83,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 
     loaded = load_spec(spec, measured_again=True)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.free_cells import measure
+    from photonfarm.renderer.measure.free_space import measure
     from photonfarm.renderer.strategy.output import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)

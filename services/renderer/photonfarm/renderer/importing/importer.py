@@ -127,7 +127,7 @@ def _name(stem: str) -> str:
 
 def _keep_in_the_open(text: SpecText, draft: Path, log: Log) -> None:
     """Put in where cameras may stand."""
-    from photonfarm.renderer.measure.free_cells import measure
+    from photonfarm.renderer.measure.free_space import measure
 
     log("measuring where cameras may stand")
     draft.write_text(text.text(), encoding="utf-8")

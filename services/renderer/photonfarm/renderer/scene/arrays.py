@@ -58,6 +58,14 @@ def zeros_like(value: Any) -> Any:
     return dr.zeros(type(value), dr.shape(value)) if dr.is_array_v(value) else type(value)(0)
 
 
+def shape_numbers(scene: Any) -> NDArray[np.int64]:
+    """The number of a shape in the scene's order, by its number in Dr.Jit's registry; −1 where that is of no shape."""
+    registered = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    numbers = np.full(registered.max() + 1, -1, np.int64)
+    numbers[registered] = np.arange(len(registered))
+    return numbers
+
+
 def rows(values: Any, *shape: int) -> F32:
     """Vectors of Dr.Jit as rows of numpy, (*shape, 3)."""
     return np.ascontiguousarray(np.array(values, np.float32).T).reshape(*shape, 3)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,15 @@ from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
 from photonfarm.shared.scene.view import View
 
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.surroundings import Surroundings
+
 
 class LoadedScene:
     """A Mitsuba scene and its spec. Not thread-safe: it is in one configuration at a time.
 
-    `scene` is the Mitsuba scene, for tests and comparisons; it belongs to this object.
+    `scene` is the Mitsuba scene, for tests and comparisons; it belongs to this object. `boxes` (S, 2, 3) are the
+    bounding boxes of its shapes at rest, by the scene's order; `still` (S,) says which shapes never move.
     """
 
     def __init__(self, spec: SceneSpec, scene: Any) -> None:
@@ -29,9 +34,9 @@ class LoadedScene:
         from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.scene import gbuffer, guides
         from photonfarm.renderer.scene.editing import MovableGroup
-        from photonfarm.renderer.scene.loading import lower_corner
         from photonfarm.renderer.scene.materials import Materials
         from photonfarm.renderer.scene.sensor import AimedSensor
+        from photonfarm.renderer.scene.surroundings import boxes_of
 
         self.spec = spec
         self.scene = scene
@@ -44,7 +49,9 @@ class LoadedScene:
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
         self._groups = [MovableGroup.of(_found(by_id, shape_ids(group), group.name)) for group in spec.groups]
-        self._parking = lower_corner([s for s in shapes if s.id() not in self._group_of] or shapes)
+        self.boxes = boxes_of(shapes)
+        self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
+        self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
         self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self._state = rest(spec)
 
@@ -136,6 +143,19 @@ class LoadedScene:
         from photonfarm.renderer.scene.visibility import seen_points
 
         return seen_points(self.scene, view, self.spec, position)
+
+    @cached_property
+    def hollow(self) -> NDArray[np.bool_]:
+        """Which shapes are rooms and no solids, (S,): at rest, as groups that are away would count among the others."""
+        from photonfarm.renderer.scene.surroundings import hollow_boxes
+
+        return hollow_boxes(self.boxes)
+
+    def surroundings(self, position: F32) -> Surroundings:
+        """What surrounds points (N, 3) in the present configuration."""
+        from photonfarm.renderer.scene.surroundings import surroundings
+
+        return surroundings(self.scene, position, self.hollow)
 
     def photons(self, seed: int) -> Photons | None:
         """Surface hits of light sub-paths in the present configuration; None for a spec without photons."""

@@ -106,8 +106,3 @@ def _added_lights(spec: SceneSpec) -> dict[str, Any]:
 
 def _sentence(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-def lower_corner(shapes: list[Any]) -> Any:
-    """The lower corner (3,) of the shapes' common bounding box."""
-    return np.min([[shape.bbox().min[i] for i in range(3)] for shape in shapes], axis=0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which points a view sees, by one shadow ray to each: exact, and free of noise. Shape letter: N points.
+"""What is seen from where, by one shadow ray to each point: exact, and free of noise. Shape letter: N points.
 
 A depth buffer is less exact: a point's pixel also shows what is before and behind it, and a surface seen at an angle
 has many depths within a pixel.
@@ -42,6 +42,16 @@ def seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArr
     ray.maxt = floats(np.where(in_image, (1 - SELF_HIT) * distance - near, 0.0))
     hidden = scene.ray_test(ray, active=ray.maxt > 0)
     return in_image & ~np.array(hidden)
+
+
+def sight_shares(scene: Any, origins: F32, targets: F32) -> F32:
+    """The share of targets (L, 3) that each of the origins (N, 3) has an unobstructed line to, (N,)."""
+    start, end = origins.repeat(len(targets), axis=0), np.tile(targets, (len(origins), 1))
+    distance = np.maximum(np.linalg.norm(end - start, axis=1), np.float32(1e-30))
+    ray = mi.Ray3f(o=points(start), d=mi.Vector3f(points((end - start) / distance[:, None])))
+    ray.maxt = floats(distance)
+    blocked = np.array(scene.ray_test(ray)).reshape(len(origins), len(targets))
+    return 1 - blocked.mean(axis=1, dtype=np.float32)
 
 
 def _within(place: NDArray[np.float64], pixels: int) -> NDArray[np.bool_]:

@@ -138,7 +138,7 @@ def _origin(plan: FloorPlan, room: Room, scene: Any, frame: Frame) -> Box:
 
 def _open(plan: FloorPlan, room: Room, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
     """Where cameras stand in the open at all heights: inside no solid, not outside, and not behind something."""
-    from photonfarm.renderer.scene.free_space import LEAVING, NONE, surroundings
+    from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
 
     found = np.ones(plan.shape, np.bool_)
     for height in heights:

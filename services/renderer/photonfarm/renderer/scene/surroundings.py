@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.arrays import points as mi_points
+from photonfarm.renderer.scene.arrays import shape_numbers
 from photonfarm.shared.core.records import F32
 
 DIRECTIONS = 64
@@ -63,13 +64,16 @@ class Surroundings:
         return (self.solid == NONE) & (self.leaving <= LEAVING)
 
 
-def surroundings(scene: Any, points: F32) -> Surroundings:
-    """What surrounds points (N, 3) of a Mitsuba scene in its present state."""
+def surroundings(scene: Any, points: F32, hollow: NDArray[np.bool_] | None = None) -> Surroundings:
+    """What surrounds points (N, 3) of a Mitsuba scene in its present state.
+
+    `hollow` (S,) says which shapes are rooms; without it the present boxes tell them, as they do in a scene at rest.
+    """
     boxes = boxes_of(scene.shapes())
     step = np.float32(_STEP * np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
-    hollow, numbers = hollow_boxes(boxes), _numbers_of(scene)
+    rooms, numbers = hollow_boxes(boxes) if hollow is None else hollow, shape_numbers(scene)
     parts = [
-        _surroundings(scene, points[start : start + _POINTS], step, hollow, numbers)
+        _surroundings(scene, points[start : start + _POINTS], step, rooms, numbers)
         for start in range(0, max(len(points), 1), _POINTS)
     ]
     return Surroundings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -98,14 +102,6 @@ def directions() -> F32:
     angle = np.pi * (1 + 5**0.5) * place
     across = np.sqrt(1 - height**2)
     return np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1).astype(np.float32)
-
-
-def _numbers_of(scene: Any) -> NDArray[np.int64]:
-    """The number of a shape in the scene's order, by its number in Dr.Jit's registry."""
-    registered = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
-    numbers = np.zeros(registered.max() + 1, np.int64)
-    numbers[registered] = np.arange(len(registered))
-    return numbers
 
 
 def _surroundings(

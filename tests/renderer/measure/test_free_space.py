@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.renderer.measure.free_cells import measure
-from photonfarm.renderer.scene.free_space import NONE, surroundings
+from photonfarm.renderer.measure.free_space import measure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import NONE, surroundings
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.modification import sample_modification

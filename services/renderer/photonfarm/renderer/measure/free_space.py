@@ -1,11 +1,11 @@
 """`photonfarm scene free-space`: where cameras of a scene may stand, measured by rays.
 
-The box of origins is divided into cells. A cell is free if its middle is inside no solid (`scene.free_space`), no ray
+The box of origins is divided into cells. A cell is free if its middle is inside no solid (`scene.surroundings`), no ray
 from there meets a surface within the cell, and it sees some of the box of look-at points: outside of a room, or in the
 next one, walls are between. Then the same holds of all of the cell. Movable groups are away meanwhile; each takes the
 box around it, wherever it stands.
 
-Shape letters: N cells, L look-at points; X Y Z cells along the axes.
+Shape letters: N cells; X Y Z cells along the axes.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.free_space import NONE, boxes_of, surroundings
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import NONE
+from photonfarm.renderer.scene.visibility import sight_shares
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.waiting import Log
@@ -88,29 +87,15 @@ def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
 def _free(scene: LoadedScene, middles: F32, reach: np.floating) -> NDArray[np.bool_]:
     """Whether cells with these middles (N, 3) are free, given how far their corners are from there, (N,).
 
-    Movable groups are away, but for the question which solid a middle is inside of: by what a shape has in it, a room
-    is told from a solid.
+    Movable groups are away.
     """
-    spec = scene.spec
-    movable = {shape for group in spec.groups for shape in shape_ids(group)}
-    still = np.array([shape.id() not in movable for shape in scene.scene.shapes()])
-    solid = surroundings(scene.scene, middles).solid
-    at_rest = rest(spec)
+    spec, at_rest = scene.spec, rest(scene.spec)
     scene.apply(Modification(at_rest.translation, np.zeros_like(at_rest.present)))
-    clear = surroundings(scene.scene, middles).clearance > reach + spec.view.near
-    seen = _seen(scene.scene, middles, _inside(spec.view.look_at, LOOK_AT)) >= SEEN
-    free: NDArray[np.bool_] = clear & seen & ~((solid != NONE) & still[solid])
+    around = scene.surroundings(middles)
+    clear = around.clearance > reach + spec.view.near
+    seen = sight_shares(scene.scene, middles, _inside(spec.view.look_at, LOOK_AT)) >= SEEN
+    free: NDArray[np.bool_] = clear & seen & (around.solid == NONE)
     return free
-
-
-def _seen(scene: Any, origins: F32, targets: F32) -> F32:
-    """The share of targets (L, 3) that each of the origins (N, 3) has an unobstructed line to, (N,)."""
-    start, end = origins.repeat(len(targets), axis=0), np.tile(targets, (len(origins), 1))
-    distance = np.maximum(np.linalg.norm(end - start, axis=1), np.float32(1e-30))
-    ray = mi.Ray3f(o=points(start), d=mi.Vector3f(points((end - start) / distance[:, None])))
-    ray.maxt = floats(distance)
-    blocked = np.array(scene.ray_test(ray)).reshape(len(origins), len(targets))
-    return 1 - blocked.mean(axis=1, dtype=np.float32)
 
 
 def _inside(box: Box, count: int) -> F32:
@@ -132,9 +117,8 @@ def _group_boxes(scene: LoadedScene) -> dict[str, tuple[tuple[float, float, floa
     """The box around each group, from its `at`, larger by what the near plane would cut open."""
     spec = scene.spec
     margin = 2 * spec.view.near
-    shapes = scene.scene.shapes()
-    number = {shape.id(): i for i, shape in enumerate(shapes)}
-    boxes = boxes_of(shapes).astype(np.float64)
+    number = {shape.id(): i for i, shape in enumerate(scene.scene.shapes())}
+    boxes = scene.boxes.astype(np.float64)
     found = {}
     for group in spec.groups:
         own = boxes[[number[shape] for shape in shape_ids(group)]]

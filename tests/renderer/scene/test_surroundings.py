@@ -6,8 +6,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.scene.free_space import NONE, directions, hollow_boxes, surroundings
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import NONE, directions, hollow_boxes, surroundings
+from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec_loading import load_spec
 
 
@@ -98,3 +99,35 @@ def test_the_built_in_room_is_open_but_in_its_furniture() -> None:
     ids = [shape.id() for shape in room.shapes()]
     assert [ids[number] for number in found.solid[:2]] == list(stands)
     np.testing.assert_array_equal(found.open, [False, False, True, True, False])
+
+
+def cube(name: str, x: float, y: float, z: float, half: tuple[float, float, float]) -> str:
+    place = f'<scale x="{half[0]}" y="{half[1]}" z="{half[2]}"/><translate x="{x}" y="{y}" z="{z}"/>'
+    return f'<shape type="cube" id="{name}"><transform name="to_world">{place}</transform></shape>'
+
+
+HOUSE = cube("House", 0, 1.5, 0, (3, 1.5, 2))
+
+
+@pytest.mark.parametrize(
+    ("content", "place", "inside"),
+    [
+        (HOUSE + cube("Tree", 10, 1, 0, (0.3, 2, 0.3)), (-1, 1.5, 0), None),
+        (cube("House", 0, 1.5, 0, (5, 1.6, 5)) + cube("Cupboard", -4.4, 1, -4.4, (0.59, 1, 0.59)), (-4.4, 1, -4.4),
+         "Cupboard"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("there", [5, 3, 0])
+def test_a_room_is_no_solid_and_a_solid_no_room_whatever_groups_are_away(
+    file_scene, tmp_path, content: str, place: tuple[float, float, float], inside: str | None, there: int
+) -> None:
+    """Parked groups are outside of the house, or in the cupboard's box."""
+    crates = [f"C{i}" for i in range(5)]
+    content += "".join(cube(crate, 1 + 0.3 * i, 0.2, -0.5, (0.1, 0.2, 0.1)) for i, crate in enumerate(crates))
+    zero = {"min": [0, 0, 0], "max": [0, 0, 0]}
+    objects = [{"name": crate.lower(), "shapes": [crate], "at": [0, 0, 0], "box": zero} for crate in crates]
+    scene = file_scene(tmp_path, content + '<emitter type="constant"/>', objects=objects)
+    at_rest = rest(scene.spec)
+    scene.apply(Modification(at_rest.translation, (np.arange(5) < there).astype(at_rest.present.dtype)))
+    (number,) = scene.surroundings(np.array([place], np.float32)).solid
+    assert (None if number == NONE else scene.scene.shapes()[number].id()) == inside

@@ -20,7 +20,7 @@ from photonfarm.renderer.importing.proposal.room import find_room
 from photonfarm.renderer.importing.proposal.surfaces import Frame, Surfaces
 from photonfarm.renderer.importing.spec_text import SpecText
 from photonfarm.renderer.importing.writing import write_scene
-from photonfarm.renderer.measure import exposure
+from photonfarm.renderer.measure import exposure, free_space
 from photonfarm.shared.core.errors import SpecError, store_errors
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.waiting import Log, WorkLog
@@ -127,12 +127,10 @@ def _name(stem: str) -> str:
 
 def _keep_in_the_open(text: SpecText, draft: Path, log: Log) -> None:
     """Put in where cameras may stand."""
-    from photonfarm.renderer.measure.free_space import measure
-
     log("measuring where cameras may stand")
     draft.write_text(text.text(), encoding="utf-8")
     try:
-        text.free_space = measure(load_spec(draft), draft.parent, log).entry()
+        text.free_space = free_space.measure(load_spec(draft), draft.parent, log).entry()
     except SpecError as error:
         text.notes.append(f"cameras are not kept out of solids: {error}")
 

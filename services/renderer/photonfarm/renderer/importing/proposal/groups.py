@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -214,8 +214,7 @@ def _named_apart(things: list[Thing]) -> list[Thing]:
     for thing in things:
         taken[thing.name] += 1
         number = taken[thing.name]
-        name = thing.name if number == 1 else f"{thing.name}-{number}"
-        made.append(Thing(name, thing.pieces, thing.low, thing.high, thing.emits, thing.hangs))
+        made.append(thing if number == 1 else replace(thing, name=f"{thing.name}-{number}"))
     return made
 
 

@@ -12,6 +12,7 @@ from photonfarm.renderer.importing.proposal.groups import Thing
 from photonfarm.renderer.importing.proposal.pieces import Pieces
 from photonfarm.renderer.importing.proposal.room import Room
 from photonfarm.renderer.importing.proposal.surfaces import Frame, Points
+from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
 
 RANGE = 0.25
 """How far a thing may go to each side, as a share of the room, so that arrangements stay sensible."""
@@ -75,7 +76,6 @@ class Proposal:
     movables: list[Movable]
     origin: Box
     look_at: Box
-    plan: FloorPlan
 
     def ceiling_light(self) -> Ceiling:
         """A light for a scene that has none, or too little."""
@@ -94,15 +94,15 @@ def propose(pieces: Pieces, room: Room, things: list[Thing], scene: Any, frame: 
 
     Where there is no room nothing moves, and cameras stand in front.
     """
+    if room.is_stage:
+        return Proposal(room, [], *_in_front(room))
     moves = np.zeros(pieces.count, np.bool_)
     for thing in things:
         moves[thing.pieces] = True
     plan = FloorPlan.of(pieces, room, ~moves)
-    if room.is_stage:
-        return Proposal(room, [], *_in_front(room), plan)
     movables = [_movable(thing, plan, room) for thing in things]
     origin = _origin(plan, room, scene, frame)
-    return Proposal(room, movables, origin, _look_at(movables, room, origin), plan)
+    return Proposal(room, movables, origin, _look_at(movables, room, origin))
 
 
 def _in_front(room: Room) -> tuple[Box, Box]:
@@ -138,8 +138,6 @@ def _origin(plan: FloorPlan, room: Room, scene: Any, frame: Frame) -> Box:
 
 def _open(plan: FloorPlan, room: Room, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
     """Where cameras stand in the open at all heights: inside no solid, not outside, and not behind something."""
-    from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
-
     found = np.ones(plan.shape, np.bool_)
     for height in heights:
         around = surroundings(scene, frame.world(plan.places(height)).astype(np.float32))

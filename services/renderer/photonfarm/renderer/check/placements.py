@@ -94,7 +94,7 @@ def _placed(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable
 
 
 def _behind(fixed: Any, middle: F32, vertices: F32, moves: F32) -> tuple[NDArray[np.float64], str | None]:
-    """For each move the share of vertices behind a surface, seen from the middle, and which shape that mostly is."""
+    """The share of vertices behind a surface, seen from the middle, of each move; and which shape that mostly is."""
     offset = vertices - middle
     distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
     start = np.repeat(middle + moves, len(vertices), axis=0)

@@ -56,7 +56,7 @@ class Comparison:
         return 0 if self.is_equal else 1 if self.z < self.z_limit else StoreError.exit_code
 
     def line(self) -> str:
-        """It in words."""
+        """The comparison in words."""
         if self.is_equal:
             return f"equal to the bit, {self.values} values"
         verdict = "within what chance allows" if self.z < self.z_limit else "more than chance allows"
@@ -85,19 +85,19 @@ class Repeated:
         return 0 if self.comparison is None else self.comparison.exit_code
 
     def document(self) -> dict[str, Any]:
-        """It in figures, as JSON holds them."""
+        """The pass and its comparison, for JSON."""
         compared = self.comparison and {**asdict(self.comparison), "equal": self.comparison.is_equal}
         return {"scene": self.scene_id, "row": self.row, "pass": self.pass_number, "key": self.key, "stored": compared}
 
     def line(self) -> str:
-        """It in words."""
+        """The pass and its comparison in words."""
         if self.comparison is None:
             planned = "is not planned" if self.row is None else f"(row {self.row}) is not complete"
             return f"pass {self.pass_number} {planned}: there is nothing to compare it with"
         return f"row {self.row}, pass {self.pass_number}: {self.comparison.line()}"
 
     def write(self, file: Path) -> None:
-        """Write it as an archive or as an image with layers; as a PNG, its mean as a display shows it.
+        """Write the pass as an archive or as an image with layers; as a PNG, its mean as a display shows it.
 
         Raises StoreError if the disk refuses or OpenEXR is missing.
         """

@@ -29,7 +29,6 @@ BEYOND = 0.15
 OPEN_SHARE = 0.5
 """There is a ceiling if more than this share of steep rays hit something."""
 
-
 LEVEL, BACKS = 0.5, 0.95
 """Rays within 30 degrees of the horizon count as level; where more than that share of all hits are backs of surfaces,
 the point of view is inside of a thing, and not of a room."""
@@ -51,7 +50,7 @@ class Room:
 
     @property
     def height(self) -> float:
-        """From the floor to the ceiling."""
+        """The distance from the floor to the ceiling."""
         return float(self.high[2] - self.low[2])
 
     @property

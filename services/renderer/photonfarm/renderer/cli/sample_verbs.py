@@ -114,6 +114,7 @@ def measure_frames(
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
               help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
 @json_option
+@ended_by_ctrl_c()
 def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
     """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
 

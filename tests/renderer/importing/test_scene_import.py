@@ -16,7 +16,6 @@ from click.testing import CliRunner, Result
 from photonfarm.renderer.cli.scene_verbs import scene_import
 from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.surroundings import surroundings
 from photonfarm.shared.core.errors import BackendError, PhotonfarmError, SpecError
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.scene.modification import sample_modification
@@ -44,7 +43,7 @@ def test_a_room_becomes_a_spec_that_renders_at_once(quick: None, boxes: Path, ru
         modification = sample_modification(spec, 1, number)
         scene.apply(modification)
         view = sample_view(spec, modification.key(spec.scene_id), 1, number)
-        assert surroundings(scene.scene, view.origin[None]).open.all()
+        assert scene.surroundings(view.origin[None]).open.all()
         depth = scene.buffers(view).depth
         assert (depth > 0).mean() > 0.99  # no view leaves the room
         shown.append(display_values(np.float32(spec.exposure) * scene.render_halves(view, (number,), 2)[0]))

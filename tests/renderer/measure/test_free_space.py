@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from photonfarm.renderer.measure.free_space import measure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.surroundings import NONE, surroundings
+from photonfarm.renderer.scene.surroundings import NONE
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.modification import sample_modification
@@ -30,7 +30,7 @@ def cameras(spec: SceneSpec, scene: LoadedScene, configurations: int, views: int
         scene.apply(modification)
         key = modification.key(spec.scene_id)
         origins = np.stack([sample_view(spec, key, 0, i, modification).origin for i in range(views)])
-        here = surroundings(scene.scene, origins)
+        here = scene.surroundings(origins)
         inside += int((here.solid != NONE).sum())
         not_open += int((~here.open).sum())
         least = min(least, float(here.clearance.min()))

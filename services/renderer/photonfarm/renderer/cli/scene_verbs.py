@@ -11,6 +11,7 @@ import click
 
 from photonfarm.shared.cli.options import json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
+from photonfarm.shared.core.waiting import waiting
 
 
 @click.command()
@@ -84,7 +85,8 @@ def scene_shapes(spec: str, as_json: bool) -> None:
     from photonfarm.renderer.check import shapes
     from photonfarm.shared.cli import show
 
-    found = shapes.listed(spec)
+    with waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
+        found = shapes.listed(spec)
     if as_json:
         show.print_json([shape.document() for shape in found])
         return

@@ -6,8 +6,9 @@ point is inside a shape if at least `INSIDE` of its directions cross that shape 
 a missing bottom, and leaves out single sheets such as curtains, floors and leaves, which at most half of all directions
 cross.
 
-A room can be one closed mesh, too. So a shape whose box contains the boxes of more than half of all other shapes is
-*hollow*: to be inside it is to be in the room. One mesh that holds most of a scene's furniture is taken for a room.
+A room can be one closed mesh, too. So a shape whose box contains, at rest, the boxes of more than half of all other
+shapes is *hollow*: to be inside it is to be in the room. One mesh that holds most of a scene's furniture is taken for a
+room.
 
 **Outside.** Outside a room about half of all directions, or more, meet no surface: just outside a wall it is half of
 them. The same holds under an open sky, where nothing is wrong with it.

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from photonfarm.export.export import OnProgress, Result
 from photonfarm.shared.cli.show import print_json
+from photonfarm.shared.core.waiting import in_words
 
 LINE_S = 4.0
 """The seconds between lines of progress where there is no terminal."""
@@ -35,8 +36,8 @@ def progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
             speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
             bars.update(bar, completed=done, total=total, rate=speed, visible=True)
             if not console.is_terminal and (now - last > LINE_S or done == total):
-                last = now
-                console.print(f"{done}/{total} samples, {speed}, {(total - done) / rate:.0f} s left", highlight=False)
+                last, left = now, in_words((total - done) / rate)
+                console.print(f"{done}/{total} samples, {speed}, {left} left", highlight=False)
 
         def say(line: str) -> None:
             nonlocal began

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.processes import Stop, repeating
 from photonfarm.shared.scene.spec_loading import load_spec, scene_folder
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
@@ -280,19 +279,10 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
         (folder / ALIVE_FILE).touch()
     except OSError as error:
         raise StoreError(f"{folder}: the folder of the training run cannot be written: {error.strerror}") from error
-    ended = threading.Event()
-
-    def touch() -> None:
-        while not ended.wait(ALIVE_S / 4):
-            (folder / ALIVE_FILE).touch()
-
-    thread = threading.Thread(target=touch, daemon=True)
-    thread.start()
     try:
-        yield
+        with repeating(ALIVE_S / 4, (folder / ALIVE_FILE).touch):
+            yield
     finally:
-        ended.set()
-        thread.join()
         if folder.is_dir():
             with suppress(StoreError), held(folder):  # unless a trainer is at work there, which keeps the file
                 (folder / ALIVE_FILE).unlink(missing_ok=True)
@@ -308,19 +298,10 @@ def _reported(
     Redis serves another store, that is logged once.
     """
     reporter = _ConsumptionReporter(redis_url, store, scene_id, log)
-    ended = threading.Event()
-
-    def keep_reporting() -> None:
-        while not ended.wait(REPORT_S):
-            reporter.report()
-
-    thread = threading.Thread(target=keep_reporting, daemon=True)
-    thread.start()
     try:
-        yield reporter.take
+        with repeating(REPORT_S, reporter.report):
+            yield reporter.take
     finally:
-        ended.set()
-        thread.join()
         reporter.report()
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
+
+from photonfarm.shared.core.processes import repeating
 
 SILENCE_S = 5.0
 """The longest time without a line."""
@@ -23,21 +24,20 @@ class WorkLog:
         """Take where the lines go, and the longest silence between them."""
         self._log, self._silence_s = log, silence_s
         self._what, self._begun = "", time.monotonic()
+        self._said = self._begun
         self._how_far: Callable[[], str] | None = None
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._repeat, daemon=True)
+        self._watching = repeating(silence_s / 10, self._repeat)
 
     def __enter__(self) -> Self:
         """Begin to watch for silence."""
-        self._thread.start()
+        self._watching.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Say no more."""
-        self._ended.set()
-        self._thread.join()
+        self._watching.__exit__(None, None, None)
 
     def begin(self, what: str, how_far: Callable[[], str] | None = None) -> None:
         """Say what is done now; `how_far` says how far that is, whenever it is said again."""
@@ -45,13 +45,11 @@ class WorkLog:
         self._log(what)
 
     def _repeat(self) -> None:
-        said = self._begun
-        while not self._ended.wait(self._silence_s / 10):
-            said, now = max(said, self._begun), time.monotonic()
-            if now - said >= self._silence_s * 0.85 and self._what:
-                said = now
-                far = f", {self._how_far()}" if self._how_far else ""
-                self._log(f"{self._what}: {now - self._begun:.0f} s so far{far}")
+        now = time.monotonic()
+        if now - max(self._said, self._begun) >= self._silence_s * 0.85 and self._what:
+            self._said = now
+            far = f", {self._how_far()}" if self._how_far else ""
+            self._log(f"{self._what}: {now - self._begun:.0f} s so far{far}")
 
 
 @contextmanager
@@ -67,7 +65,7 @@ def time_left(done: int, total: int, begun: float) -> str:
     if not done:
         return f"0 of {total}"
     left = (time.monotonic() - begun) / done * (total - done)
-    return f"{done} of {total}, about {left:.0f} s more"
+    return f"{done} of {total}, about {in_words(left)} left"
 
 
 def in_words(seconds: float) -> str:

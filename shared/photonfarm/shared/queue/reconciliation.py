@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import islice
@@ -13,6 +12,7 @@ import redis
 from redis import Redis
 
 from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.core.processes import repeating
 from photonfarm.shared.queue.entries import queued_names, running_names, taken_names
 from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
 from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
@@ -101,20 +101,15 @@ def _alone(connection: Redis, wait_s: float) -> Iterator[bool]:
     if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
         yield False
         return
-    ended = threading.Event()
 
     def renew() -> None:
-        while not ended.wait(LOCK_TTL_S / 4):
-            with contextlib.suppress(redis.RedisError):
-                lock.reacquire()
+        with contextlib.suppress(redis.RedisError):
+            lock.reacquire()
 
-    renewing = threading.Thread(target=renew, daemon=True)
-    renewing.start()
     try:
-        yield True
+        with repeating(LOCK_TTL_S / 4, renew):
+            yield True
     finally:
-        ended.set()
-        renewing.join()
         if lock.owned():
             lock.release()
 

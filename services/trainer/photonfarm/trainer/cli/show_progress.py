@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,9 +12,8 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from photonfarm.shared.core.waiting import in_words
-
-LINE_S = 5.0
+from photonfarm.shared.core.processes import repeating
+from photonfarm.shared.core.waiting import SILENCE_S, time_left
 
 OnProgress = Callable[[str, int, int], None]
 
@@ -50,7 +48,6 @@ def _bars(console: Console) -> Iterator[OnProgress]:
 @contextmanager
 def _lines() -> Iterator[OnProgress]:
     now: tuple[str, int, int, float] = ("starts", 0, 0, time.monotonic())  # the last callback, and since when
-    ended = threading.Event()
 
     def show(name: str, done: int, total: int) -> None:
         nonlocal now
@@ -58,22 +55,11 @@ def _lines() -> Iterator[OnProgress]:
         if total and done == total:
             click.echo(f"{name}: {total} samples", err=True)
 
-    def repeat() -> None:
-        while not ended.wait(LINE_S):
-            click.echo(_line(*now), err=True)
-
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
+    with repeating(SILENCE_S, lambda: click.echo(_line(*now), err=True)):
         yield show
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _line(name: str, done: int, total: int, since_s: float) -> str:
-    spent = time.monotonic() - since_s
     if not total:
-        return f"{name}, for {spent:.0f} s"
-    left = f", {in_words(spent / done * (total - done))} left" if done else ""
-    return f"{name}: {done}/{total} samples{left}"
+        return f"{name}, for {time.monotonic() - since_s:.0f} s"
+    return f"{name}: sample {time_left(done, total, since_s)}"

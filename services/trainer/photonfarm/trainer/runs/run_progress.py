@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from photonfarm.shared.core.files import write_whole
+from photonfarm.shared.core.processes import repeating
 from photonfarm.shared.core.waiting import in_words
 from photonfarm.trainer.runs.wait_times import TimeKind
 
@@ -74,23 +74,19 @@ class RunProgress:
 @contextmanager
 def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
     """Keep the file up to date until the block ends, and say a line every five seconds."""
-    ended = threading.Event()
+    said = time.monotonic()
 
     def follow() -> None:
-        said = time.monotonic()
-        while not ended.wait(FILE_S):
-            with suppress(OSError):
-                write_whole(run / PROGRESS, json.dumps(progress.look()))
-            if say is not None and time.monotonic() - said >= LINE_S - FILE_S / 2:
-                said = time.monotonic()
-                say(progress.line())
+        nonlocal said
+        with suppress(OSError):
+            write_whole(run / PROGRESS, json.dumps(progress.look()))
+        if say is not None and time.monotonic() - said >= LINE_S - FILE_S / 2:
+            said = time.monotonic()
+            say(progress.line())
 
-    thread = threading.Thread(target=follow, daemon=True)
-    thread.start()
     try:
-        yield
+        with repeating(FILE_S, follow):
+            yield
     finally:
-        ended.set()
-        thread.join()
         with suppress(OSError):
             (run / PROGRESS).unlink(missing_ok=True)

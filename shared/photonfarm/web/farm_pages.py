@@ -115,7 +115,7 @@ class FarmPages:
 
         def cost(row: int) -> float | None:
             found = costs.get(row // plans[0].shard_rows)
-            return None if found is None else found.core_s / plans[0].shard_rows
+            return None if found is None else found / plans[0].shard_rows
 
         return cost
 

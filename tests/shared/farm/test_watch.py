@@ -62,7 +62,7 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     assert found.rate == pytest.approx(3 / (2 * STEADY_S))
     assert found.left_s == pytest.approx(5 / found.rate)
     assert found.core_s == samples.FIGURES.core_s
-    assert watch.costs(scene.scene_id)[0].core_s == samples.FIGURES.core_s
+    assert watch.costs(scene.scene_id)[0] == samples.FIGURES.core_s
     assert any("renders samples 1/2" in line for line in lines(view))
 
 

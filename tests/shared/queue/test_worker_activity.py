@@ -35,8 +35,9 @@ def test_what_strangers_write_as_an_activity_is_left_out(connection: Redis, valu
     assert queue.queue_status(connection).activities == {}
 
 
-def test_a_strangers_activity_is_short_and_printable_and_of_no_job(connection: Redis) -> None:
-    connection.set(DOING + "eve\x1b[2J", f"1 2 3 ../../etc \x1b[31m{'x' * 10_000}")
+@pytest.mark.parametrize("job", ["../../etc", f"{'ab' * 16}-007", f"{'ab' * 16}-{1 << 48}"])
+def test_a_strangers_activity_is_short_and_printable_and_of_no_job(connection: Redis, job: str) -> None:
+    connection.set(DOING + "eve\x1b[2J", f"1 2 3 {job} \x1b[31m{'x' * 10_000}")
     ((name, found),) = queue.queue_status(connection).activities.items()
     assert name.isprintable()
     assert found.phase.isprintable()

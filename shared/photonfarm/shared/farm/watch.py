@@ -49,11 +49,6 @@ class SceneView:
         """The samples and passes that are planned and not committed."""
         return self.samples[1] - self.samples[0] + self.passes[1] - self.passes[0]
 
-    @property
-    def committed(self) -> int:
-        """The samples and passes that are committed."""
-        return self.samples[0] + self.passes[0]
-
 
 @dataclass(frozen=True, slots=True)
 class FarmView:
@@ -73,18 +68,10 @@ class FarmView:
 
 
 @dataclass(slots=True)
-class JobCost:
-    """What a committed job took."""
-
-    core_s: float
-    worker: str
-
-
-@dataclass(slots=True)
 class _Seen:
     """What has been seen of a scene so far."""
 
-    jobs: dict[int, JobCost] = field(default_factory=dict)
+    core_s: dict[int, float] = field(default_factory=dict)  # that committed jobs took, by their numbers
     size_bytes: int = 0
     history: deque[tuple[float, int]] = field(default_factory=deque)  # when so many samples were rendered
 
@@ -111,9 +98,9 @@ class FarmWatch:
         """The runs' folders, with their logs as they were at the last look."""
         return self._runs
 
-    def costs(self, scene_id: str) -> dict[int, JobCost]:
-        """What each committed job of a scene took, as far as it has been seen."""
-        return self._seen[scene_id].jobs if scene_id in self._seen else {}
+    def costs(self, scene_id: str) -> dict[int, float]:
+        """The core-seconds that each committed job of a scene took, as far as it has been seen."""
+        return self._seen[scene_id].core_s if scene_id in self._seen else {}
 
     def look(self) -> FarmView:
         """The farm now. Raises StoreError if the store is gone."""
@@ -136,9 +123,9 @@ class FarmWatch:
     def _look_at(self, scene: SceneStore, activities: Sequence[Activity], workers: int) -> SceneView:
         seen = self._seen.setdefault(scene.scene_id, _Seen())
         progress, committed = scene.progress(), scene.committed_jobs()
-        if seen.jobs.keys() - committed:  # a repair has removed some
+        if seen.core_s.keys() - committed:  # a repair has removed some
             seen = self._seen[scene.scene_id] = _Seen()
-        for job in sorted(committed - seen.jobs.keys()):
+        for job in sorted(committed - seen.core_s.keys()):
             _add(scene, job, seen)
         in_hand = sum(each.samples for each in activities if _is_of(each, scene.scene_id))
         in_hand = min(in_hand, progress.planned_samples - progress.committed_samples)  # a report may be seconds old
@@ -146,7 +133,7 @@ class FarmWatch:
         rate = self._pace(seen, done)
         missing = progress.planned_samples - done
         further = progress.committed_passes, progress.planned_passes
-        core_s = sum(job.core_s for job in seen.jobs.values())
+        core_s = sum(seen.core_s.values())
         left = missing / rate if rate else None
         if left is None and workers and progress.committed_samples:
             left = missing * core_s / progress.committed_samples / workers
@@ -171,9 +158,9 @@ def _add(scene: SceneStore, job: int, seen: _Seen) -> None:
     try:
         marker = scene.marker(job)
     except StoreError:
-        seen.jobs[job] = JobCost(0.0, "")
+        seen.core_s[job] = 0.0
         return
-    seen.jobs[job] = JobCost(marker["figures"]["core_s"], marker["figures"]["worker"])
+    seen.core_s[job] = marker["figures"]["core_s"]
     seen.size_bytes += sum(file["size"] for file in marker["files"].values())
 
 

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from redis import Redis
 
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.queue.job import FAILURE_TTL_S, OVERDUE, STARTS, RenderArguments
+from photonfarm.shared.queue.job import FAILURE_TTL_S, OVERDUE, STARTS, RenderArguments, is_job_name
 from photonfarm.shared.queue.untrusted import batches, beginnings, names_below, printable, remove_others
 
 FAILED = "rq:photonfarm:failed:"
@@ -110,7 +109,7 @@ def _count(connection: Redis, key: str) -> int:
 
 def failed_names(connection: Redis) -> set[str]:
     """The jobs that are not queued, since they failed recently or too often."""
-    return {name for name in names_below(connection, FAILED) if _is_a_jobs(name)}
+    return {name for name in names_below(connection, FAILED) if is_job_name(name)}
 
 
 def read_failures(connection: Redis) -> dict[str, Failure]:
@@ -152,11 +151,3 @@ def repeating_command(store: str | Path, name: str) -> str:
     """The command that renders a job again in the foreground, and prints its whole error."""
     job = RenderArguments.of(name)
     return shlex.join(["photonfarm", "work", "--store", str(store), "--scene", job.scene_id, "--job", str(job.job)])
-
-
-def _is_a_jobs(name: str) -> bool:
-    try:
-        RenderArguments.of(name)
-    except QueueError:
-        return False
-    return True

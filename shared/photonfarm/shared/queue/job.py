@@ -45,3 +45,12 @@ class RenderArguments(Frozen):
         if job_name(arguments.scene_id, arguments.job) != name:  # leading zeros, digits of other scripts
             raise QueueError(f"job {name[:MAX_NAME]!r}: is not written as job {arguments.job}")
         return arguments
+
+
+def is_job_name(name: str) -> bool:
+    """Whether a text is the name of a job."""
+    try:
+        RenderArguments.of(name)
+    except QueueError:
+        return False
+    return True

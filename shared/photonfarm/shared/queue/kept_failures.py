@@ -10,12 +10,13 @@ import re
 from collections.abc import Callable
 
 from photonfarm.shared.queue.failures import REASON_LETTERS, Failure
+from photonfarm.shared.queue.job import is_job_name
 from photonfarm.shared.queue.untrusted import printable
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import put_json
 from photonfarm.shared.store.write.store import FAILURES_FOLDER
 
-_NAME = re.compile(r"([0-9a-f]{32}-(?:0|[1-9][0-9]{0,13}))\.([0-9]{1,16})\.json")
+_FILE = re.compile(r"(.+)\.([0-9]{1,16})\.json")
 
 
 def keep_failure(store: Store, name: str, reason: str, *, worker: str, at_s: float) -> None:
@@ -28,7 +29,7 @@ def kept_failures(store: Store, wanted: Callable[[str], bool]) -> dict[str, Fail
     """The last kept failure of each of the `wanted` jobs, by its name. Raises OSError if the store cannot be read."""
     by_job: dict[str, list[int]] = {}
     for file in store.storage.names(FAILURES_FOLDER):
-        if found := _NAME.fullmatch(file):
+        if (found := _FILE.fullmatch(file)) and is_job_name(found[1]):
             by_job.setdefault(found[1], []).append(int(found[2]))
     return {name: _read(store, name, times_ms) for name, times_ms in sorted(by_job.items()) if wanted(name)}
 

@@ -5,19 +5,17 @@ A report is written every few seconds and expires soon after. It is text for peo
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from redis import Redis
 
-from photonfarm.shared.queue.job import MAX_NAME
+from photonfarm.shared.queue.job import MAX_NAME, is_job_name
 from photonfarm.shared.queue.untrusted import beginnings, names_below, printable
 
 DOING = "rq:photonfarm:doing:"
 PHASE_LETTERS = 60
 _VALUE_BYTES = 4 * PHASE_LETTERS + MAX_NAME + 32
-_JOB = re.compile("[0-9a-f]{32}-[0-9]{1,15}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,5 +59,5 @@ def _parsed(value: str) -> Activity | None:
     if len(words) != 5 or not all(word.isascii() and word.isdecimal() and len(word) <= 6 for word in words[:3]):
         return None
     done, total, samples = map(int, words[:3])
-    job = words[3] if _JOB.fullmatch(words[3]) else None
+    job = words[3] if is_job_name(words[3]) else None
     return Activity(printable(words[4])[:PHASE_LETTERS], done, total, samples, job)

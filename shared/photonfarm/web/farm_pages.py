@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from photonfarm.shared.farm.status import NoQueue
+from photonfarm.shared.farm.training import VIEWS, RunFolder
 from photonfarm.shared.farm.watch import FarmView, FarmWatch
 from photonfarm.shared.store import Store
 from photonfarm.web.samples import NotThereError, SceneSamples
@@ -124,22 +125,7 @@ class FarmPages:
     def curves(self) -> list[dict[str, Any]]:
         """The curves of all runs: held-out error and loss by step and by seconds."""
         self._view.get()
-        return [
-            {
-                "run": run.folder.name,
-                "validations": _thinned(
-                    [
-                        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
-                        for r in list(run.records)
-                        if r.get("kind") == "validation"
-                    ]
-                ),
-                "losses": _thinned([[r["step"], _seconds(r), r["loss"]] for r in list(run.records) if _has_loss(r)]),
-                "steps": _steps(run.folder),
-                **_shown(run.folder, _steps(run.folder)),
-            }
-            for run in self._watch.runs
-        ]
+        return [_curves(run) for run in self._watch.runs]
 
     def prediction(self, run: int, step: int) -> bytes:
         """The picture of a run's predictions at a validation; raises NotThereError."""
@@ -147,15 +133,31 @@ class FarmPages:
         if run >= len(runs):
             raise NotThereError(f"there is no run {run}")
         try:
-            return (runs[run].folder / "views" / f"step-{step:08d}.png").read_bytes()
+            return (runs[run].folder / VIEWS / f"step-{step:08d}.png").read_bytes()
         except OSError as error:
             raise NotThereError(f"run {run} has no picture of step {step}") from error
+
+
+def _curves(run: RunFolder) -> dict[str, Any]:
+    records, steps = list(run.records), _steps(run.folder)  # a copy, as another thread may add some
+    validations = [
+        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
+        for r in records
+        if r.get("kind") == "validation"
+    ]
+    return {
+        "run": run.folder.name,
+        "validations": _thinned(validations),
+        "losses": _thinned([[r["step"], _seconds(r), r["loss"]] for r in records if _has_loss(r)]),
+        "steps": steps,
+        **_shown(run.folder, steps),
+    }
 
 
 def _steps(folder: Path) -> list[int]:
     """The validations of a run that have pictures."""
     try:
-        names = [file.name for file in (folder / "views").iterdir()]
+        names = [file.name for file in (folder / VIEWS).iterdir()]
     except OSError:
         return []
     return sorted(int(found[1]) for name in names if (found := STEP.fullmatch(name)))
@@ -166,7 +168,7 @@ def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
     from PIL import Image
 
     try:
-        with Image.open(folder / "views" / f"step-{steps[-1]:08d}.png") as picture:
+        with Image.open(folder / VIEWS / f"step-{steps[-1]:08d}.png") as picture:
             text = picture.text
         return {"scene_id": str(text["scene"]), "rows": [int(row) for row in text["rows"].split()]}
     except (OSError, IndexError, AttributeError, KeyError, ValueError):

@@ -9,10 +9,10 @@ import pytest
 from PIL import Image
 
 from photonfarm.shared.core.pictures import display
-from photonfarm.shared.farm.training import RunFolder
+from photonfarm.shared.farm.training import PROGRESS, VIEWS, RunFolder
 from photonfarm.trainer.runs import run_progress, shown_views
-from photonfarm.trainer.runs.run_progress import PROGRESS, RunProgress, followed
-from photonfarm.trainer.runs.shown_views import MOST, VIEWS, write_views
+from photonfarm.trainer.runs.run_progress import RunProgress, followed
+from photonfarm.trainer.runs.shown_views import MOST, write_views
 from photonfarm.trainer.training.loop import Hooks, train
 
 

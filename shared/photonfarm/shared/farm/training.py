@@ -15,6 +15,17 @@ from photonfarm.shared.core.waiting import in_words
 METRICS = "metrics.jsonl"
 PROGRESS = "progress.json"
 SETTINGS = "settings.json"
+VIEWS = "views"
+INITIAL = "initial.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
+METADATA = "photonfarm"
+"""The key of a checkpoint's JSON document in the header of its file."""
+
+MOST_HEADER_BYTES = 1 << 26
+
+WAITS = "waits for samples"
+"""The phase of a trainer that has nothing to train on."""
+
 TRAINS = "trains"
 """The phase of a trainer while nothing holds it up."""
 
@@ -99,6 +110,19 @@ class RunFolder:
         whole = added[: added.rfind(b"\n") + 1]
         self._read_bytes += len(whole)
         self.records += [record for line in whole.splitlines() if (record := _record(line))]
+
+
+def begun_on(run: Path) -> str | None:
+    """The id of the scene that a run was begun on; None for a new run, or one whose damage the trainer tells."""
+    for name in (INITIAL, CHECKPOINT):
+        try:
+            with (run / name).open("rb") as file:
+                length = int.from_bytes(file.read(8), "little")
+                header = json.loads(file.read(min(length, MOST_HEADER_BYTES)))
+            return str(json.loads(header["__metadata__"][METADATA])["scene_id"])
+        except (OSError, ValueError, LookupError, TypeError):
+            continue
+    return None
 
 
 def _record(line: bytes) -> dict[str, Any]:

@@ -6,16 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from photonfarm.shared.farm.status import NoQueue, StoreQueue
-from photonfarm.shared.farm.training import TrainingProgress
+from photonfarm.shared.farm.training import WAITS, TrainingProgress
 
 if TYPE_CHECKING:
     from photonfarm.shared.queue import FailureCause, QueueStatus
 
 IDLE_SHOWN = 10
 """The most reasons of idle workers that are told."""
-
-WAITING = "waits for samples"
-"""The phase of a trainer that has nothing to train on."""
 
 
 def waits(
@@ -31,8 +28,8 @@ def waits(
         if missing and not queue.status.workers:
             yield f"{missing} samples wait for a worker: none is alive; `photonfarm work` starts one"
     for training in trainings:
-        if training.phase == WAITING:
-            yield f"{training.run}: the trainer {WAITING}" + ("" if missing else ", and all that are planned are there")
+        if training.phase == WAITS:
+            yield f"{training.run}: the trainer {WAITS}" + ("" if missing else ", and all that are planned are there")
 
 
 def idle(found: QueueStatus, names: Mapping[str, str]) -> Iterator[str]:

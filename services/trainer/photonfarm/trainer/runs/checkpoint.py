@@ -24,12 +24,12 @@ from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.core.models import Changes, differing
+from photonfarm.shared.farm.training import METADATA
 from photonfarm.shared.store.io.local import sync
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 FORMAT = 3
 ANEW = "remove it, and the run begins anew"
-METADATA = "photonfarm"
 TENSOR = "tensor"
 
 LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")

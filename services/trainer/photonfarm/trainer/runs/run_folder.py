@@ -9,13 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError, store_errors
+from photonfarm.shared.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
+__all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "held", "note_scene_folder", "with_scenes"]
+
 LOCK = "lock"
-CHECKPOINT = "checkpoint.safetensors"
-INITIAL = "initial.safetensors"
-METRICS = "metrics.jsonl"
-SETTINGS = "settings.json"
 SCENE_FOLDER = "scene-folder.txt"
 
 

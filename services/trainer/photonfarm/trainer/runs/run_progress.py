@@ -12,9 +12,9 @@ from pathlib import Path
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.processes import repeating
 from photonfarm.shared.core.waiting import in_words
+from photonfarm.shared.farm.training import PROGRESS, TRAINS, WAITS
 from photonfarm.trainer.runs.wait_times import TimeKind
 
-PROGRESS = "progress.json"
 FILE_S = 2.0  # between two versions of the file
 LINE_S = 5.0  # between two lines
 SHORT_S = 1.0  # a phase that is over sooner is a part of training
@@ -22,12 +22,12 @@ WINDOW = 30  # the versions over which the pace is taken: a minute
 
 WORDS: dict[TimeKind, str] = {
     "start": "builds the network",
-    "train": "trains",
+    "train": TRAINS,
     "validate": "validates",
-    "wait_data": "waits for samples",
+    "wait_data": WAITS,
     "wait_read": "reads samples",
     "save": "writes a checkpoint",
-    "other": "trains",
+    "other": TRAINS,
 }
 
 
@@ -57,7 +57,7 @@ class RunProgress:
         (began, first), left = self._history[0], None
         if self._step > first:
             left = (self._steps - self._step) * (now - began) / (self._step - first)
-        phase = WORDS[kind] if now - since >= SHORT_S or not self._step else WORDS["train"]
+        phase = WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS
         return {
             "step": self._step, "steps": self._steps, "samples": self._samples, "phase": phase,
             "phase_s": round(now - since, 1), "left_s": left, "at_s": time.time(),
@@ -67,7 +67,7 @@ class RunProgress:
         """The present state in words."""
         found = self.look()
         left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
-        since = f" for {found['phase_s']:.0f} s" if found["phase"] != WORDS["train"] else ""
+        since = f" for {found['phase_s']:.0f} s" if found["phase"] != TRAINS else ""
         return f"step {self._step}/{self._steps}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
 
 

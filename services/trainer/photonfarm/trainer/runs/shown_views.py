@@ -11,8 +11,8 @@ from photonfarm.shared.core.errors import store_errors
 from photonfarm.shared.core.files import whole_file
 from photonfarm.shared.core.pictures import display
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.farm.training import VIEWS
 
-VIEWS = "views"
 SHOWN = 4  # the most views
 MOST = 24  # the most pictures kept; beyond, every second one goes, so that early ones become rare
 _NAME = re.compile(r"step-(\d{8})\.png")

@@ -224,6 +224,16 @@ def test_a_number_may_be_written_as_people_write_it(here: Path) -> None:
     assert (code, json.loads(out)["planned"]) == (0, 10_000)
 
 
+def test_submit_says_so_if_training_will_refuse_what_it_plans(here: Path) -> None:
+    for option in ("--dry-run --no-measure", "--no-queue"):
+        code, _, err = said(f"submit room --modifications 40 {option}")
+        (line,) = err.splitlines()
+        assert (code, line.startswith("warning: `photonfarm train` will refuse this: hold_out = 0.125")) == (0, True)
+        assert "--hold-out 0.135 holds out one of these, and --modifications 41 plans enough" in line
+    for enough in (41, 3):  # the second time the store has the others
+        assert said(f"submit room --modifications {enough} --no-queue")[2] == ""
+
+
 def test_a_full_disk_is_told(here: Path) -> None:
     command = [sys.executable, "-m", "photonfarm.shared.cli", "submit", "room", "--no-queue"]
     full = subprocess.run(
@@ -385,6 +395,17 @@ DEPTH = "differs in transport.max_depth (8 there, 6 here)"
 def test_beside_a_store_and_a_run(beside: Path, doing: Doing, command: str, code: int, names: list[str]) -> None:
     doing(beside)
     refused(command, code, *names, keeps=contents(beside))
+
+
+@pytest.mark.parametrize("left", ["initial", "checkpoint"])
+def test_up_with_a_run_of_another_scene_plans_nothing(beside: Path, left: str) -> None:
+    gone = {"initial": "checkpoint", "checkpoint": "initial"}[left]
+    (beside / f"run/{gone}.safetensors").unlink()
+    before = sorted(map(str, beside.rglob("*")))
+    (den,) = (file.name for file in (beside / "store/scenes").iterdir())
+    refused("up cornell", 3, f"--run run: was trained on den (scene {den})", "cornell (scene ", "--run")
+    refused("up cornell --store new", 3, f"--run run: was trained on scene {den}, and cornell (scene ")
+    assert sorted(map(str, beside.rglob("*"))) == before
 
 
 def test_two_trainers_in_one_folder(beside: Path) -> None:

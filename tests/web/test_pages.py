@@ -16,10 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import headless_browser
 import numpy as np
 import pytest
 import store_samples as samples
+from chromium import chromium, needs_chromium
 from PIL import Image, PngImagePlugin
 
 from photonfarm.shared.cli.main import main
@@ -303,39 +303,39 @@ def test_looks_take_at_most_their_share_of_a_core() -> None:
 # -------------------------------------------------------------------------------------------------------- in a browser
 
 
-@pytest.mark.skipif(headless_browser.CHROMIUM is None, reason="there is no Chromium here to open the pages with")
+@needs_chromium
 def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_phones_width(
-    server: PageServer, scene: SceneStore, run: Path, tmp_path: Path
+    server: PageServer, scene: SceneStore, run: Path
 ) -> None:
     address = f"http://127.0.0.1:{server.server_address[1]}/"
-    with headless_browser.page(tmp_path / "browser") as page:
+    with chromium() as page:
         for width in (1280, 390):
             page.open(address, width)
             pictures_there = "[...document.images].every((image) => image.complete && image.naturalWidth > 0)"
             page.wait_for("document.querySelectorAll('.wall img').length === 6")
             page.wait_for(pictures_there)
-            assert page.evaluate("document.querySelectorAll('svg.plot circle').length") >= 12
-            assert run.name in page.evaluate("document.body.innerText")
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert page.value("document.querySelectorAll('svg.plot circle').length") >= 12
+            assert run.name in page.value("document.body.innerText")
+            assert page.value("document.documentElement.scrollWidth") <= width
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")
             page.wait_for(pictures_there)
             drawn = "getContext('2d').getImageData(0, 0, 300, 150).data.some((value) => value > 60 && value < 255)"
             page.wait_for(f"document.querySelector('canvas').{drawn}")
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            assert page.value("document.documentElement.scrollWidth") <= width
         assert page.errors == []
 
 
-@pytest.mark.skipif(headless_browser.CHROMIUM is None, reason="there is no Chromium here to open the pages with")
-def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneStore, tmp_path: Path) -> None:
-    with headless_browser.page(tmp_path / "browser") as page:
+@needs_chromium
+def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneStore) -> None:
+    with chromium() as page:
         page.open(f"http://127.0.0.1:{server.server_address[1]}/#/sample/{scene.scene_id}/3", 800, 1600)
         page.wait_for("document.querySelector('canvas')?.width > 300")
         look = "document.querySelector('canvas').toDataURL().slice(-4000)"
         for pointer in ("mouse", "touch"):
             time.sleep(0.3)
-            before = page.evaluate(look)
-            page.evaluate(
+            before = page.value(look)
+            page.value(
                 "(() => { const c = document.querySelector('canvas'); c.setPointerCapture = () => 0;"
                 "const go = (kind, x) => c.dispatchEvent(new PointerEvent(kind, "
                 f"{{pointerId: 1, pointerType: '{pointer}', clientX: x, clientY: 50, buttons: 1}}));"

@@ -96,6 +96,18 @@ class Quiet:
         yield lambda *_: None
 
 
+def test_a_refusal_does_not_promise_that_the_same_command_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = SpecError.exit_code
+    monkeypatch.setattr(up, "command", lambda *_: [sys.executable, "-c", f"import sys; sys.exit({code})"])
+    with pytest.raises(IncompleteError) as caught:
+        up.run_farm("cornell", tmp_path / "store", Request(modifications=2), Quiet(), workers=1, train_steps=0,
+                    hold_out=0.5, run=tmp_path / "run", out=tmp_path / "out")  # fmt: skip
+    assert str(caught.value).startswith(f"worker-1 ended with exit code {code}; ")
+    assert "same command" not in str(caught.value)
+
+
 def test_what_failed_first_is_told_also_if_the_preview_fails_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

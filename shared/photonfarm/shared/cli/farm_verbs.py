@@ -63,11 +63,12 @@ def submit(
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission
+    from photonfarm.shared.farm.hold_out_check import hold_out_warning
     from photonfarm.shared.scene.plausibility import warnings
     from photonfarm.shared.scene.spec_loading import NamedSpec
 
     named = NamedSpec.load(spec)
-    for warning in warnings(spec, named.spec):
+    for warning in filter(None, (*warnings(spec, named.spec), hold_out_warning(named.spec, store, request))):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
     if dry_run:

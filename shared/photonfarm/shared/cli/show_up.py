@@ -50,7 +50,7 @@ class FarmTalk:
                 bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
             bars.update(training, completed=found.step)
             note = f"training{found.note}" if found.note else ""
-            below.plain = "\n".join(filter(None, (*found.doing.split("; "), note)))
+            below.plain = "\n".join(filter(None, (*found.doing, note)))
             for wait in found.waits:
                 if (kind := _NUMBER.sub("…", wait)) not in told:
                     told.add(kind)
@@ -72,7 +72,7 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
     left = f", {in_words(left_s)} left" if left_s and samples < planned else ""
     words = f"  further passes {passes}/{further}" if further else ""
     training = f"  steps {found.step}/{found.steps}{found.note}" if found.steps else ""
-    why = f"  ({'; '.join(found.waits)})" if found.waits else f"  ({found.doing})" if found.doing else ""
+    why = f"  ({'; '.join(found.waits)})" if found.waits else f"  ({'; '.join(found.doing)})" if found.doing else ""
     return f"samples {samples}/{planned}{in_hand}{left}{words}{training}{why}"
 
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from photonfarm.shared.core.errors import SpecError, StoreError
 from photonfarm.shared.core.estimate import stated
 from photonfarm.shared.core.waiting import in_words
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store import Store
 
 METRICS = "metrics.jsonl"
 PROGRESS = "progress.json"
@@ -123,6 +127,29 @@ def begun_on(run: Path) -> str | None:
         except (OSError, ValueError, LookupError, TypeError):
             continue
     return None
+
+
+def hold_out_of(run: Path) -> float | None:
+    """The share that a run holds out, which it keeps for ever; None for a new run."""
+    try:
+        return float(_read_json(run / SETTINGS)["hold_out"])
+    except (ValueError, LookupError, TypeError):  # none, or one whose fault the trainer tells
+        return None
+
+
+def check_run(run: Path, spec: SceneSpec, store: str | Path) -> None:
+    """Raise SpecError if a run's folder is of another scene: its trainer would refuse to go on with this one."""
+    scene_id = begun_on(run)
+    if scene_id is None or scene_id == spec.scene_id:
+        return
+    begun = f"scene {scene_id}"
+    with suppress(StoreError):
+        if (opened := Store(store)).has_scene(scene_id):
+            begun = f"{opened.scene(scene_id).spec.name} (scene {scene_id})"
+    raise SpecError(
+        f"--run {run}: was trained on {begun}, and {spec.name} (scene {spec.scene_id}) is asked for; name another "
+        "folder with --run"
+    )
 
 
 def _record(line: bytes) -> dict[str, Any]:

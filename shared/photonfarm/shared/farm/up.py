@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
@@ -17,20 +16,21 @@ from pathlib import Path
 from typing import Protocol
 
 from photonfarm.shared.core.commands import command
-from photonfarm.shared.core.errors import IncompleteError, store_errors
+from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.shared.core.processes import free_port, tied
 from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import WEB_PORT, announced
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
 from photonfarm.shared.farm.submission import submit, top_up
-from photonfarm.shared.farm.training import RunFolder, TrainingProgress
+from photonfarm.shared.farm.training import RunFolder, TrainingProgress, check_run, hold_out_of
 from photonfarm.shared.farm.waits import waits
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.queue import QueueStatus
 from photonfarm.shared.scene.plausibility import warnings
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -54,7 +54,7 @@ class FarmProgress:
     steps: int
     note: str  # what training does and its last held-out error, in words
     in_hand: int = 0  # samples and passes that are rendered, in jobs that are not committed yet
-    doing: str = ""  # what each worker does, in words
+    doing: tuple[str, ...] = ()  # what each worker does, in words
     waits: tuple[str, ...] = ()  # what waits for what, in sentences
 
 
@@ -95,22 +95,19 @@ def run_farm(
     with them. Without a `hold_out` it is the run's, or of a new run the default or just enough for one configuration.
     With `web`, pages that show all of it are served on this machine until the end.
 
-    A wrong spec, a hold-out that leaves one side empty, and references of no valid number are refused before anything
-    is written, by a SpecError.
+    A wrong spec, a run of another scene, a hold-out that leaves one side empty, and references of no valid number are
+    refused before anything is written, by a SpecError.
     After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
     named = NamedSpec.load(spec)
     for warning in warnings(spec, named.spec):
         talk.say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
-    share = hold_out or _hold_out_of(run)
-    if share is None:
-        share = chosen_hold_out(named.spec, store, request) if train_steps else HOLD_OUT
-        if share != HOLD_OUT:
-            talk.say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
-    which = (f"held-out={share}", f"views=first:{reference_views}")  # of the planned views get references
     if train_steps:
-        check_hold_out(named.spec, store, share, request)
+        check_run(run, named.spec, store)
+    asked = hold_out or hold_out_of(run)
+    share = _checked_hold_out(named.spec, store, asked, request, talk) if train_steps else asked or HOLD_OUT
+    which = (f"held-out={share}", f"views=first:{reference_views}")  # of the planned views get references
     if references:
         TopUp.of(str(reference_spp), which)
     with store_errors("keep the logs of a run here", run):
@@ -125,7 +122,8 @@ def run_farm(
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
             talk.say(f"references: {added.planned} further passes planned, {added.planned_before} planned before")
-        scene = Store(store).scene(planned.scene_id)
+        opened = Store(store)
+        scene = opened.scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
         talk.say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
@@ -133,7 +131,7 @@ def run_farm(
         verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
         if train_steps:
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
-        opened, address = Store(store), stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
+        address = stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
         trained = run if train_steps else None
         stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, talk))
@@ -159,12 +157,15 @@ def run_farm(
         _call(preview, environment)
 
 
-def _hold_out_of(run: Path) -> float | None:
-    """The share that a run holds out, which it keeps for ever; None for a new run."""
-    try:
-        return float(json.loads((run / "settings.json").read_text())["hold_out"])
-    except (OSError, ValueError, LookupError, TypeError):  # none, or one whose fault the trainer tells
-        return None
+def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, request: Request, talk: Talk) -> float:
+    """The share to hold out, as asked for or just enough; raises SpecError if it would leave one side empty."""
+    if asked is not None:
+        check_hold_out(spec, store, asked, request)
+        return asked
+    share = chosen_hold_out(spec, store, request)
+    if share != HOLD_OUT:
+        talk.say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
+    return share
 
 
 @contextmanager
@@ -278,7 +279,7 @@ class _Farm:
         return FarmProgress(
             samples, passes, trained.step, self.steps, trained.note,
             min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
-            "; ".join(f"{name} {each}" for name, each in sorted(activities.items())),
+            tuple(f"{name} {each}" for name, each in sorted(activities.items())),
             tuple(waits(self._queue, named, 0)),
         )  # fmt: skip
 
@@ -299,10 +300,10 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, ta
             for name, process in running.items():
                 if process.poll():
                     log = farm.run / f"{name}.log"
-                    raise IncompleteError(
-                        f"{name} {_end(process.returncode)}; {log} says: {_tail(log)}. What is rendered and trained is "
-                        "kept, and the same command goes on from there"
-                    )
+                    said = f"{name} {_end(process.returncode)}; {log} says: {_tail(log)}. What is rendered and trained"
+                    if process.returncode == SpecError.exit_code:  # the same command would be refused again
+                        raise IncompleteError(f"{said} is kept")
+                    raise IncompleteError(f"{said} is kept, and the same command goes on from there")
             if not alive:
                 return
             time.sleep(POLL_S)

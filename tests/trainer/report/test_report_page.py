@@ -155,11 +155,8 @@ def test_the_page_works_in_a_browser(measured, tmp_path) -> None:
         assert page.errors == []
         page.call("Emulation.setScriptExecutionDisabled", value=True)
         page.open(file, 390)
-        boxes = page.call("DOM.getDocument", depth=-1)["root"]
-        found = page.call(
-            "DOM.querySelector", nodeId=boxes["nodeId"], selector='details[open] [data-layer="prediction"]'
-        )
-        assert page.call("DOM.getBoxModel", nodeId=found["nodeId"])["model"]["width"] > 100, "rows without JavaScript"
+        prediction = 'details[open] [data-layer="prediction"]'
+        assert page.width(prediction) > 100, "rows without JavaScript"
 
 
 SHOWN = """new Promise((done) => {

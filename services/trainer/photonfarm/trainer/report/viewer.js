@@ -178,7 +178,6 @@
   $("in").addEventListener("click", () => step(1));
   $("out").addEventListener("click", () => step(-1));
   $("fit").addEventListener("click", () => zoomTo(1));
-  addEventListener("resize", draw);
   views.forEach((view, i) => {
     view.querySelectorAll("figure").forEach((each) => each.addEventListener("click", () => {
       choose("left", each.dataset.layer);
@@ -192,7 +191,11 @@
     $("strip").append(button);
   });
 
-  document.documentElement.classList.add("viewing");
-  $("viewer").hidden = false;
-  Promise.all([...document.querySelectorAll(".view img")].map((each) => each.decode())).then(() => show(0));
+  // before the pictures are decoded there is nothing to draw, also where the window changes its size
+  Promise.all([...document.querySelectorAll(".view img")].map((each) => each.decode())).then(() => {
+    document.documentElement.classList.add("viewing");
+    $("viewer").hidden = false;
+    addEventListener("resize", draw);
+    show(0);
+  });
 })();

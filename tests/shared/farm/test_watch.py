@@ -1,5 +1,6 @@
 """A farm looked at again and again, and a farm that announces itself."""
 
+import io
 import json
 import os
 import time
@@ -10,10 +11,11 @@ import pytest
 import redis
 import store_samples as samples
 from click.testing import CliRunner
+from rich.console import Console
 
 from photonfarm.shared import queue
 from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.cli.show_watch import lines
+from photonfarm.shared.cli.show_watch import drawn, lines
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm import running_farm, waits
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
@@ -78,9 +80,14 @@ def test_a_repair_takes_back_what_was_seen(scene: SceneStore, store: Store, tmp_
 def test_a_damaged_scene_is_told_and_the_others_are_watched(scene: SceneStore, store: Store, tmp_path: Path) -> None:
     other = store.scene(store.plan(samples.small_spec(points=17), Request(modifications=1)).scene_id)
     (other.folder / "spec.json").write_text("{")
-    found = {each.scene_id: each for each in FarmWatch(Store(store.root), f"unix://{tmp_path}/none").look().scenes}
+    view = FarmWatch(Store(store.root), f"unix://{tmp_path}/none").look()
+    found = {each.scene_id: each for each in view.scenes}
     assert found[other.scene_id].error
     assert found[scene.scene_id].samples == (0, 8)
+    terminal = Console(file=io.StringIO(), width=400)
+    terminal.print(drawn(view))
+    for shown in ("\n".join(lines(view)), terminal.file.getvalue()):
+        assert f"scene {other.scene_id} cannot be read: {found[other.scene_id].error}" in shown
 
 
 def test_status_watch_ends_with_exit_code_0_on_ctrl_c(

@@ -29,16 +29,18 @@ def keep_watching(watch: FarmWatch) -> None:
                 time.sleep(PLAIN_S)
         with Live(console=console, auto_refresh=False) as live:
             while True:
-                live.update(_drawn(watch.look()), refresh=True)
+                live.update(drawn(watch.look()), refresh=True)
                 time.sleep(LOOK_S)
     except KeyboardInterrupt:
         return
 
 
-def _drawn(view: FarmView) -> Group:
+def drawn(view: FarmView) -> Group:
     """The farm as a terminal shows it."""
     table = Table("scene", "id", "samples", "in hand", "rate", "left", "core time", "size", box=None, pad_edge=False)
     for scene in view.scenes:
+        if scene.error:
+            continue
         table.add_row(
             Text(scene.name), scene.scene_id[:8], _counted(scene), str(scene.in_hand), _rate(scene), _left(scene),
             f"{scene.core_s:.0f} s", f"{scene.size_bytes / 1e6:.1f} MB",
@@ -51,7 +53,6 @@ def lines(view: FarmView) -> Iterator[str]:
     now = time.strftime("%H:%M:%S")
     for scene in view.scenes:
         if scene.error:
-            yield f"{now}  {scene.name} {scene.scene_id[:8]}: cannot be read: {scene.error}"
             continue
         in_hand = f" (+{scene.in_hand} in hand)" if scene.in_hand else ""
         parts = (
@@ -65,7 +66,8 @@ def lines(view: FarmView) -> Iterator[str]:
 
 
 def _below(view: FarmView) -> Iterator[str]:
-    """What workers and trainers do, and what waits for what."""
+    """Which scenes cannot be read, what workers and trainers do, and what waits for what."""
+    yield from (f"  scene {each.scene_id} cannot be read: {each.error}" for each in view.scenes if each.error)
     if isinstance(view.queue, NoQueue):
         yield "  no farm is at work here" if not view.named_redis else f"  {view.queue.reason}"
     else:

@@ -6,7 +6,7 @@ Shape letters: H W image, G movable groups, P points of the cloud, K photon slot
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from photonfarm.shared.core.errors import SpecError
@@ -121,7 +121,7 @@ def _facts(spec: SceneSpec) -> list[Column]:
         Column("job", "int64", (), "1", "the render job that it came from"),
         Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
     ]  # fmt: skip
-    return [Column(each.name, each.dtype, each.shape, each.unit, each.meaning, fact=True) for each in found]
+    return [replace(each, fact=True) for each in found]
 
 
 def _stored(spec: SceneSpec, name: str) -> Column:

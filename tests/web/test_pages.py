@@ -132,7 +132,7 @@ def test_the_state_is_that_of_store_and_run(server: PageServer, scene: SceneStor
     found = document(server, "/api/state")
     (shown,) = found["scenes"]
     assert (shown["scene_id"], shown["samples"], shown["jobs"], shown["missing"]) == (scene.scene_id, [6, 8], [3, 4], 2)
-    assert found["queue"] is None
+    assert (found["queue"], found["failed_before"]) == (None, [])
     (training,) = found["trainings"]
     assert (training["run"], training["step"], training["steps"]) == (run.name, 100, 200)
 
@@ -192,6 +192,15 @@ def test_curves_and_predictions_are_those_of_the_run(server: PageServer, scene: 
     assert [point[:3] for point in found["validations"]] == [[0, 0.0, 1.0], [50, 50.0, 1 / 51], [100, 100.0, 1 / 101]]
     assert (found["steps"], found["rows"], found["scene_id"]) == ([50, 100], [0, 1], scene.scene_id)
     assert picture(server, "/run/0/50.png")[0, 0].tolist() == [50, 90, 20]
+
+
+def test_a_sample_costs_its_share_of_its_job_also_where_that_is_not_full(store: Store) -> None:
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=3), shard_rows=2).scene_id)
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    pages = FarmPages(store.root, FarmWatch(store, "unix:///none"))
+    costs = [pages.about(scene.scene_id, row)["core_s"] for row in range(3)]
+    assert costs == [samples.FIGURES.core_s / 2, samples.FIGURES.core_s / 2, samples.FIGURES.core_s]
 
 
 def test_a_sample_that_lands_is_seen_and_one_that_a_repair_takes_is_gone(store: Store) -> None:

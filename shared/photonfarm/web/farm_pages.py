@@ -18,6 +18,7 @@ from photonfarm.shared.farm.status import NoQueue
 from photonfarm.shared.farm.training import VIEWS, RunFolder
 from photonfarm.shared.farm.watch import FarmView, FarmWatch
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.write.plans import plan_of
 from photonfarm.web.samples import NotThereError, SceneSamples
 
 LEAST_S = 2.0
@@ -83,7 +84,7 @@ class FarmPages:
             "queue": queue and {"queued": queue.queued, "running": queue.running, "workers": queue.workers},
             "workers": [{"name": name, **asdict(each)} for name, each in sorted(view.activities.items())],
             "waits": view.waits,
-            "failures": _failures(view),
+            "failed_before": [{"cause": cause.cause, "jobs": len(cause.jobs)} for cause in view.queue.kept],
             "trainings": [asdict(training) | {"note": training.note} for training in view.trainings],
         }
 
@@ -115,8 +116,8 @@ class FarmPages:
         costs, plans = self._watch.costs(scene_id), self._store.scene(scene_id).plans()
 
         def cost(row: int) -> float | None:
-            found = costs.get(row // plans[0].shard_rows)
-            return None if found is None else found / plans[0].shard_rows
+            job = row // plans[0].shard_rows
+            return costs[job] / plan_of(plans, row).samples_in(job) if job in costs else None
 
         return cost
 
@@ -173,15 +174,6 @@ def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
         return {"scene_id": str(text["scene"]), "rows": [int(row) for row in text["rows"].split()]}
     except (OSError, IndexError, AttributeError, KeyError, ValueError):
         return {"scene_id": None, "rows": []}
-
-
-def _failures(view: FarmView) -> list[dict[str, Any]]:
-    now = [] if isinstance(view.queue, NoQueue) else view.queue.causes
-    return [
-        {"cause": cause.cause, "jobs": len(cause.jobs), "now": is_now}
-        for causes, is_now in ((now, True), (view.queue.kept, False))
-        for cause in causes
-    ]
 
 
 def _seconds(record: dict[str, Any]) -> float:

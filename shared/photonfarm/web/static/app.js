@@ -88,8 +88,8 @@ function workers(state) {
     h("span", { class: "figure" }, worker.total ? `${worker.done}/${worker.total}` : ""),
     h("span", { class: "figure" }, worker.phase)));
   const waits = state.waits.map((wait) => h("li", {}, wait));
-  const failures = state.failures.map(({ cause, jobs, now }) =>
-    h("li", { class: "bad" }, `${jobs} job${jobs === 1 ? "" : "s"} failed${now ? "" : " before, and missing"}: ${cause}`));
+  const failures = state.failed_before.map(({ cause, jobs }) =>
+    h("li", { class: "bad" }, `${jobs} job${jobs === 1 ? "" : "s"} failed before, and missing: ${cause}`));
   return card("half", "Queue and workers", null, h("p", { class: "figure" }, queue), ...list,
     waits.length + failures.length ? h("ul", { class: "plain" }, ...failures, ...waits) : null,
     list.length || waits.length || failures.length ? null : h("p", { class: "note" }, "Nothing waits for anything."));

@@ -80,6 +80,11 @@ class StoredPlan:
         """The number of samples that it holds; the rest of its last job's rows is unused."""
         return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
 
+    def samples_in(self, job: int) -> int:
+        """The number of samples in one of its jobs."""
+        first = (job - self.first_job) * self.shard_rows
+        return int(np.count_nonzero(self.rows.sample_modification[first : first + self.shard_rows] != UNUSED))
+
     def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
         """The file of one job's rows of an array."""
         return f"{self.folder}/{name}/{array.shard_name(job - self.first_job)}"

@@ -1,4 +1,4 @@
-"""How far a training run is, read from its folder, without torch."""
+"""How far a training run is and what it was begun on, read from its folder, without torch."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from photonfarm.renderer.cli import sample_verbs
 from photonfarm.renderer.jobs.render import SceneLoader, ShardRenderer
 from photonfarm.renderer.jobs.repeat import Repeated, repeat
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError, StoreError
+from photonfarm.shared.core.errors import SceneNotHereError, SpecError, StoreError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -121,3 +121,28 @@ def test_the_verb_says_that_the_sample_is_equal_and_leaves_the_store_as_it_is(ro
     assert said["stored"]["values"] == reader.read(0).radiance.size
     refused = CliRunner().invoke(sample_verbs.render, [*arguments, "--out", "picture.jpg"])
     assert isinstance(refused.exception, SpecError)
+
+
+def test_a_scene_is_found_beside_its_spec_and_below_the_current_folder(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    ball = '<shape type="sphere" id="ball"><emitter type="area"/></shape>'
+    (folder / "ball.xml").write_text(f'<scene version="3.0.0">{ball}</scene>')
+    (folder / "ball.toml").write_text(
+        'name = "ball"\nscene.file = "ball.xml"\nfilm = { width = 16, height = 16 }\n'
+        "[view]\norigin = { min = [0, 0, 3], max = [1, 1, 4] }\nlook_at = { min = [0, 0, 0], max = [1, 1, 1] }\n"
+    )
+    scene = store.scene(store.plan(load_spec(folder / "ball.toml"), Request(modifications=1)).scene_id)
+    monkeypatch.delenv("PHOTONFARM_SCENES", raising=False)
+    with pytest.raises(SceneNotHereError):
+        repeat(store.storage.where, "ball", 0, None, lambda _: None, LoadedScene.load)
+    with monkeypatch.context() as here:
+        here.chdir(folder)
+        ShardRenderer(store, worker="test", load=LoadedScene.load).render(scene.scene_id, 0)
+        by_name = repeat(store.storage.where, "ball", 0, None, lambda _: None, LoadedScene.load)
+    by_file = repeat(store.storage.where, str(folder / "ball.toml"), 0, None, lambda _: None, LoadedScene.load)
+    assert by_name.exit_code == by_file.exit_code == 0
+    assert by_name.comparison and by_name.comparison.is_equal
+    assert by_file.comparison and by_file.comparison.is_equal

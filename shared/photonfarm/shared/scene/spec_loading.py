@@ -118,7 +118,10 @@ def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset
 
 
 def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
-    """The scene file named in a spec: absolute, beside the spec, or under a folder of PHOTONFARM_SCENES."""
+    """The scene file named in a spec: absolute, beside the spec, below a folder of PHOTONFARM_SCENES, or below this one.
+
+    The current folder is looked in last, so that whoever works where `up` did finds what it found.
+    """
     if Path(file).is_absolute() and Path(file).is_file():
         return Path(file)
     return _folder_of(file, where, beside) / file
@@ -126,16 +129,20 @@ def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
 
 def _folder_of(file: str, where: str, beside: Path | None) -> Path:
     """The folder below which a scene file lies."""
-    folders = [beside] if beside else []
-    folders += [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
+    folders = [*([beside] if beside else []), *_named_folders(), Path.cwd()]
     for folder in folders:
         if (folder / file).is_file():
             return folder
-    looked = ", ".join(map(str, folders)) or "nowhere"
+    looked = ", ".join(map(str, folders))
     raise SpecError(
         f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
         f"set {SCENES_VARIABLE} to the folder that holds it"
     )
+
+
+def _named_folders() -> list[Path]:
+    """The folders of PHOTONFARM_SCENES."""
+    return [Path(part) for part in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if part]
 
 
 def scene_folder(name: str, spec: SceneSpec) -> Path | None:
@@ -174,9 +181,6 @@ class NamedSpec:
     def load(cls, name: str) -> Self:
         """The spec of a name, as `load_spec` reads it; raises SpecError."""
         spec = load_spec(name)
-        if spec.scene.file is not None:
-            try:
-                find_scene(spec.scene.file, name)
-            except SpecError:
-                return cls(name, spec, str(find_spec(name).absolute().parent))
-        return cls(name, spec, None)
+        is_found = any((folder / str(spec.scene.file)).is_file() for folder in _named_folders())
+        folder = None if is_found else scene_folder(name, spec)
+        return cls(name, spec, str(folder) if folder else None)

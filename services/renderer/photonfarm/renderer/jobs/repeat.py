@@ -22,9 +22,11 @@ from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.core.waiting import Log, waiting
 from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import scene_folder
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read.find import scene_or_spec
+from photonfarm.shared.store.read.find import is_spec_file, scene_or_spec
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import SceneMatch
 from photonfarm.shared.store.write.commit import as_stored
@@ -131,7 +133,7 @@ def repeat(
     """
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    spec = located(stored.spec)
+    spec = located(_beside(scene, stored.spec))
     reader = SceneReader(store, stored.scene_id)
     reader.refresh()
     modification, view, planned_pass = _planned(stored, row)
@@ -145,6 +147,15 @@ def repeat(
         halves, _ = halves_of(loaded, key, view)
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
+
+
+def _beside(named: str, spec: SceneSpec) -> SceneSpec:
+    """The spec with the scene file that lies beside the spec's file, if a user has named that."""
+    folder = scene_folder(named, spec) if is_spec_file(named) else None
+    if folder is None:
+        return spec
+    source = spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})
+    return spec.model_copy(update={"scene": source})
 
 
 def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:

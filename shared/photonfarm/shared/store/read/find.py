@@ -38,12 +38,17 @@ def scene_named(store: Store, text: str) -> str:
     return found[0]
 
 
+def is_spec_file(named: str) -> bool:
+    """Whether a user names a scene by a spec's file, and not by its name or id."""
+    return Path(named).suffix in (".toml", ".json")
+
+
 def scene_or_spec(store: Store, named: str) -> SceneStore:
     """The scene that a user names by a spec's file, or as `scene_named` takes it.
 
     Raises StoreError, which names the scenes that are there, and SpecError for a file that is no spec.
     """
-    text = load_spec(named).scene_id if Path(named).suffix in (".toml", ".json") else named
+    text = load_spec(named).scene_id if is_spec_file(named) else named
     return store.scene(scene_named(store, text))
 
 

@@ -144,5 +144,7 @@ def test_a_scene_is_found_beside_its_spec_and_below_the_current_folder(
         by_name = repeat(store.storage.where, "ball", 0, None, lambda _: None, LoadedScene.load)
     by_file = repeat(store.storage.where, str(folder / "ball.toml"), 0, None, lambda _: None, LoadedScene.load)
     assert by_name.exit_code == by_file.exit_code == 0
-    assert by_name.comparison and by_name.comparison.is_equal
-    assert by_file.comparison and by_file.comparison.is_equal
+    assert by_name.comparison
+    assert by_name.comparison.is_equal
+    assert by_file.comparison
+    assert by_file.comparison.is_equal

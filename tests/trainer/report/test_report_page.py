@@ -42,7 +42,7 @@ def judged(contents: ReportContents, own: HeldOutErrors, colour: HeldOutErrors) 
         replace(
             contents,
             entries=(replace(entry, row=replace(entry.row, held_out=own)),),
-            baselines=replace(contents.baselines, mean_colour=colour),
+            baselines=replace(contents.baselines, mean_colour=colour, mean_shown_colour=colour),
         )
     )
 

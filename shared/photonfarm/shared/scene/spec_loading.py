@@ -118,9 +118,9 @@ def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset
 
 
 def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
-    """The scene file named in a spec: absolute, beside the spec, below a folder of PHOTONFARM_SCENES, or below this one.
+    """The scene file named in a spec: absolute, beside the spec, or below PHOTONFARM_SCENES or the current folder.
 
-    The current folder is looked in last, so that whoever works where `up` did finds what it found.
+    The current folder comes last, so that whoever works where `up` did finds what it found.
     """
     if Path(file).is_absolute() and Path(file).is_file():
         return Path(file)

@@ -106,11 +106,17 @@ def network_predictor(network: Network) -> DevicePredictor:
     return DevicePredictor(partial(image_of, network), next(network.parameters()).device)
 
 
-def mean_colour(found: Iterator[TrainingBatch]) -> F32:
-    """The mean exposed colour over samples and pixels, (3,): the best prediction without any input."""
-    means = [batch.target.double().mean(dim=(1, 2, 3)).numpy() for batch in found]
-    colour: F32 = np.concatenate(means).mean(axis=0).astype(np.float32)
-    return colour
+def mean_colours(found: Iterator[TrainingBatch]) -> tuple[F32, F32]:
+    """The mean exposed colours over samples and pixels, (3,) each: the best predictions without any input.
+
+    The first is for `error`, the second for `shown`, with light above white cut to white.
+    """
+    means, shown = [], []
+    for batch in found:
+        for image in batch.target.double().mean(dim=1).numpy():
+            means.append(image.mean(axis=(0, 1)))
+            shown.append(np.minimum(block_means(image), WHITE).mean(axis=(0, 1)))
+    return np.mean(means, axis=0).astype(np.float32), np.mean(shown, axis=0).astype(np.float32)
 
 
 def constant_predictor(colour: F32) -> Predictor:

@@ -12,7 +12,7 @@ from photonfarm.shared.core.estimate import group_means
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.evaluation_table import counted
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
-from photonfarm.trainer.predict.evaluation import HeldOutErrors
+from photonfarm.trainer.predict.evaluation import BLOCK, HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 
 LARGE = 10  # times less error: from here on it is said as a fraction, below in percent
@@ -36,7 +36,7 @@ class Verdict:
         evaluation, first = contents.evaluation, contents.entries[0]
         errors, constant = first.row.held_out, contents.baselines.mean_colour
         further = (
-            _won(errors, constant, evaluation.unit),
+            _won(errors, constant, contents.baselines.mean_shown_colour, evaluation.unit),
             _since_start(errors.error.mean, contents.baselines.untrained.error.mean),
             _of_references(evaluation.references, first.row.metrics),
         )
@@ -68,13 +68,14 @@ def _better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]
     return own < other
 
 
-def _won(errors: HeldOutErrors, constant: HeldOutErrors, unit: str) -> str:
+def _won(errors: HeldOutErrors, constant: HeldOutErrors, shown_constant: HeldOutErrors, unit: str) -> str:
     better = _better(errors, constant)
-    shown, colour = (float(group_means(of.shown, of.units).mean()) for of in (errors, constant))
-    without_lamps = f"; without light above white, such as lamps in view, it is {_share(shown / colour)} it"
+    shown, colour = (float(group_means(of.shown, of.units).mean()) for of in (errors, shown_constant))
+    share = f"{_share(shown / colour)} that of one colour" if shown < colour else "not below that of one colour"
+    blocks = f"over blocks of {BLOCK} × {BLOCK} pixels and without light above white, such as lamps in view"
     return (
         f"Its error is below the mean colour’s in {better.sum()} of {counted(len(better), unit)} that no training "
-        f"saw{without_lamps if 0 < shown < colour else ''}."
+        f"saw{f'; {blocks}, it is {share}' if shown > 0 else ''}."
     )
 
 

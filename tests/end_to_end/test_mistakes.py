@@ -171,6 +171,12 @@ def test_in_an_empty_folder(here: Path, command: str, code: int, names: list[str
     )
 
 
+@pytest.mark.parametrize("name", ["room.glb", "scene.xml"])
+def test_a_scene_in_the_place_of_a_spec(here: Path, name: str) -> None:
+    (here / name).write_bytes(b"glTF\xff")
+    refused(f"submit {name} --no-queue", 3, f"{name}: is a scene", f"photonfarm scene import {name}")
+
+
 @pytest.mark.parametrize(
     ("spec", "names"),
     [

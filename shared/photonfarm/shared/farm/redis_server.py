@@ -106,7 +106,8 @@ class EmbeddedRedis:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise QueueError(f"{self.folder}: another Redis runs on this folder; end it or take another") from error
+            other = "another `photonfarm up` is at work with this folder; end it, or give another run folder (--run)"
+            raise QueueError(f"{self.folder}: {other}") from error
         return self._lock
 
     def _start(self, lock: IO[bytes]) -> subprocess.Popen[bytes]:

@@ -17,6 +17,9 @@ from photonfarm.shared.scene import files as scene_files
 from photonfarm.shared.scene.spec import Light, SceneSpec
 
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
+SCENE_SUFFIXES = (".xml", ".gltf", ".glb", ".obj", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
+"""What `photonfarm scene import` takes."""
+
 FEW = 3
 """Up to so many lights, a message about an unknown light names them all."""
 
@@ -30,6 +33,8 @@ def load_spec(path: str | Path, *, measured_again: bool = False) -> SceneSpec:
     Raises SpecError with one sentence that names the key, the value and the rule.
     """
     file = find_spec(str(path))
+    if file.suffix.lower() in SCENE_SUFFIXES:
+        raise SpecError(f"{file}: is a scene and no spec; `photonfarm scene import {file}` makes a spec of it")
     parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
     try:
         described = parse(file.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
@@ -129,7 +134,7 @@ def find_scene(file: str, where: str, beside: Path | None = None) -> Path:
 
 def _folder_of(file: str, where: str, beside: Path | None) -> Path:
     """The folder below which a scene file lies."""
-    folders = [*([beside] if beside else []), *_named_folders(), Path.cwd()]
+    folders = [*([beside] if beside else []), *_named_folders(), Path()]
     for folder in folders:
         if (folder / file).is_file():
             return folder

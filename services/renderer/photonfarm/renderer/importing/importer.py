@@ -157,11 +157,12 @@ def _expose(text: SpecText, draft: Path, log: Log) -> None:
 def _found(text: SpecText) -> list[str]:
     room = text.proposal.room
     named = [movable.thing.name for movable in text.proposal.movables]
+    static = "nothing was found that stands by itself; the scene is static (if it lies on its side, see --up)"
     lengths = " × ".join(f"{part:.3g}" for part in room.size)
     extent = f"no room; what is there is {lengths} units" if room.is_stage else f"room: {lengths} units"
     return [
         extent if room.has_ceiling else f"{extent}, without a ceiling",
-        f"may move: {', '.join(named) if named else 'nothing was found that stands by itself; the scene is static'}",
+        f"may move: {', '.join(named) or static}",
         f"lights: {'one is added under the ceiling' if text.ceiling else 'those of the file'}",
         f"exposure: {text.exposure:g}",
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
+from photonfarm.shared.scene.spec_loading import SCENE_SUFFIXES
 
 BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
 """What Blender reads for us."""
@@ -19,7 +20,7 @@ Reader = Callable[[Path, Path, Log], ImportedScene]
 def reader_of(path: Path) -> Reader:
     """The reader of a file, by its ending; raises SpecError for an unknown one and for a file that is not there."""
     suffix = path.suffix.lower()
-    if suffix not in (".xml", ".gltf", ".glb", ".obj", *BLENDER):
+    if suffix not in SCENE_SUFFIXES:
         raise SpecError(
             f"{path}: {suffix or 'a name without an ending'} is no kind of scene that is read; known are .xml "
             f"(Mitsuba), .gltf, .glb, .obj, and through Blender {', '.join(BLENDER)}"

@@ -186,7 +186,7 @@ def _has_loss(record: dict[str, Any]) -> bool:
 
 
 def _thinned(points: list[list[Any]]) -> list[list[Any]]:
-    """At most CURVE_POINTS of the points, evenly, with the first and the last one."""
+    """Evenly spaced points, at most CURVE_POINTS, with the first and the last one."""
     if len(points) <= CURVE_POINTS:
         return points
     return [points[i * (len(points) - 1) // (CURVE_POINTS - 1)] for i in range(CURVE_POINTS)]

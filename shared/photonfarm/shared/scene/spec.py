@@ -174,7 +174,7 @@ class Emitters(Frozen):
 
     all: Factor = 1.0  # for every light: 0 switches it off
     by_id: dict[str, Factor] = Field(default_factory=dict)
-    """For single lights instead, by the id of their shape, or "environment"."""
+    """The factors of single lights instead, by the id of their shape, or "environment"."""
 
     @model_validator(mode="before")
     @classmethod

@@ -63,7 +63,7 @@ def _share(ratio: float) -> str:
 
 
 def _better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]:
-    """In which configurations, or views of a static scene, the error is below that of the mean colour."""
+    """Whether the error is below that of the mean colour, for each configuration, or view of a static scene."""
     own, other = (group_means(of.per_sample, of.units) for of in (errors, constant))
     return own < other
 

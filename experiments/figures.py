@@ -39,7 +39,7 @@ ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-ve
 METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
 COMPARED = ("oidn 1/1", "light_transport_photons", "guided", "guided_transport", "guided_transport_photons",
             "denoise_1")  # fmt: skip
-"""What stands beside the reference: the best denoiser, the best of the published networks, ours, and a denoiser of the room."""
+"""What is shown beside the reference: the best denoiser and published network, ours, and a denoiser of the room."""
 
 BEFORE, AFTER = "light_transport_photons", "guided_transport"
 VIEWS = 3  # at most, of the first ones

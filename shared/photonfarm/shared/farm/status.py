@@ -58,7 +58,7 @@ def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
 
 
 def queue_now(store: Store, redis_url: str) -> StoreQueue | NoQueue:
-    """As `queue_of`, for those who look again soon: a Redis that fails on the way is one of which nothing is known."""
+    """What `queue_of` gives, for those who look again soon: a Redis that fails on the way tells nothing."""
     from redis import RedisError
 
     try:

@@ -63,7 +63,7 @@ def _share(ratio: float) -> str:
 
 
 def _better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]:
-    """Whether the error is below that of the mean colour, for each configuration, or view of a static scene."""
+    """Whether the error is below the mean colour’s, for each configuration, or view of a static scene."""
     own, other = (group_means(of.per_sample, of.units) for of in (errors, constant))
     return own < other
 

@@ -79,7 +79,8 @@ def room() -> trimesh.Scene:
     add(scene, "vase", [upright(capsule(0.35, 0.14), (0, 0.315, 0))], (1.6, 0, -1.2), (0.15, 0.25, 0.6), roughness=0.15)
     add(scene, "ball", [icosphere(3, 0.25)], (-1.7, 0.25, 1.0), (0.85, 0.5, 0.1), roughness=0.3)
 
-    add(scene, "panel", [box((1.0, 0.04, 0.6))], (0, HEIGHT - 0.03, 0), BLACK, light=(1.0, 0.95, 0.85))
+    panel = trimesh.Trimesh([(-0.5, 0, -0.3), (0.5, 0, -0.3), (0.5, 0, 0.3), (-0.5, 0, 0.3)], [(0, 1, 2), (0, 2, 3)])
+    add(scene, "panel", [panel], (0, HEIGHT - 0.01, 0), BLACK, light=(1.0, 0.95, 0.85))  # faces down
     add(scene, "lamp-foot", [upright(cylinder(0.03, 1.5), (0, 0.75, 0))], (-2.0, 0, -0.6), BLACK)
     add(scene, "lamp", [icosphere(3, 0.16)], (-2.0, 1.6, -0.6), BLACK, light=(1.0, 0.6, 0.3))
     return scene

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import NamedSpec
@@ -45,7 +46,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["train", "--help"], HEAVY | {"numpy", "redis", "rq"}),
         (["scene", "plan", "--help"], HEAVY | {"numpy", "redis", "rq", "pydantic"}),
         (["scene", "show", "room"], HEAVY | {"redis", "rq"}),
-        (["status"], HEAVY | {"redis", "rq"}),  # nothing listens there
+        (["status"], HEAVY | {"redis", "rq", "awscrt"}),  # nothing listens there
         (["store", "find"], HEAVY | {"redis", "rq"}),
         (["submit", "room", "--dry-run", "--no-measure"], HEAVY),
     ],
@@ -60,6 +61,30 @@ def test_a_verb_loads_only_what_it_needs_and_starts_soon(store: Path, command: l
     assert done.returncode == 0, done.stderr
     assert needless.isdisjoint(json.loads(done.stderr.splitlines()[-1]))
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < MOST_CPU_S
+
+
+def test_status_with_a_redis_loads_neither_rq_nor_what_only_shards_need(
+    store: Path, common_redis: EmbeddedRedis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", common_redis.url)
+    environment = {**os.environ, "PHOTONFARM_STORE": str(store)}
+    command = [sys.executable, "-c", CODE, "status"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "0 queued" in done.stdout
+    assert (HEAVY | {"rq", "awscrt"}).isdisjoint(json.loads(done.stderr.splitlines()[-1]))
+
+
+def test_numpy_is_loaded_without_threads_and_the_environment_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = """
+import os, sys
+from photonfarm.shared.cli.options import StorePlace
+StorePlace().convert("store", None, None)
+threads = len(os.listdir("/proc/self/task"))
+print("numpy" in sys.modules, threads, os.environ.get("OPENBLAS_NUM_THREADS"))
+"""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "1", "None"]
 
 
 @pytest.mark.usefixtures("hears_ctrl_c")

@@ -22,6 +22,9 @@ if sys.platform == "linux":
 os.execv(sys.argv[2], sys.argv[2:])
 """
 
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+"""The variable that numpy's wheels read when they are loaded."""
+
 
 def tied(command: Sequence[str]) -> list[str]:
     """The command, wrapped so that on Linux it gets SIGTERM when this process ends; the main thread must start it."""
@@ -43,6 +46,22 @@ def ended_by_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def numpy_on_one_thread() -> Iterator[None]:
+    """Load numpy within the block without the threads of its matrix products.
+
+    They turn while they wait for work: on two cores a verb that starts then takes 50 ms of processor time more. What
+    we do in numpy has no use for them, and torch has threads of its own. Our environment is afterwards as before.
+    """
+    before = os.environ.get(_BLAS_THREADS)
+    os.environ[_BLAS_THREADS] = before or "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_BLAS_THREADS]
 
 
 @contextmanager

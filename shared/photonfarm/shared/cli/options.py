@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from photonfarm.shared.core.processes import numpy_on_one_thread
+from photonfarm.shared.core.processes import loading
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -27,7 +27,7 @@ class StorePlace(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The Path or the URL; fails for a URL that is not that of a bucket."""
-        with numpy_on_one_thread():
+        with loading():
             from photonfarm.shared.store.io.storage import SCHEMES, is_url
 
         if re.match(r"(s3|gs|az):/?[^/]", str(value)):

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+import redis
 
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
@@ -64,10 +65,9 @@ def test_a_verb_loads_only_what_it_needs_and_starts_soon(store: Path, command: l
 
 
 def test_status_with_a_redis_loads_neither_rq_nor_what_only_shards_need(
-    store: Path, common_redis: EmbeddedRedis, monkeypatch: pytest.MonkeyPatch
+    store: Path, common_redis: EmbeddedRedis, connection: redis.Redis
 ) -> None:
-    monkeypatch.setenv("PHOTONFARM_REDIS_URL", common_redis.url)
-    environment = {**os.environ, "PHOTONFARM_STORE": str(store)}
+    environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": common_redis.url}
     command = [sys.executable, "-c", CODE, "status"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     assert "0 queued" in done.stdout

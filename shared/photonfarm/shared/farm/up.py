@@ -280,7 +280,7 @@ class _Farm:
             samples, passes, trained.step, self.steps, trained.note,
             min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
-            tuple(waits(self._queue, named, 0)),
+            tuple(map(str, waits(self._queue, named, 0))),
         )  # fmt: skip
 
     def _status(self) -> QueueStatus | None:

@@ -31,6 +31,10 @@ from photonfarm.shared.store.write.guides import GuideStore, GuideWriter, has_gu
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 SCENES = "scenes"
+
+CHECKED_JOBS = 10_000
+"""How many of the missing jobs are looked at for damaged inputs: as many as are queued. The next ones follow later."""
+
 _SCENE_ID = re.compile("[0-9a-f]{32}")
 
 
@@ -77,8 +81,13 @@ class SceneStore:
     # ------------------------------------------------------------------------------------------------------------ plans
 
     def plans(self) -> list[StoredPlan]:
-        """The plans that are there by now, in order."""
+        """The plans that are there by now, in order, with all their inputs."""
         self._plans = plans.load_all(self.storage, self.name, self._plans)
+        return self._plans
+
+    def _declared(self) -> list[StoredPlan]:
+        """The plans that are there by now, in order, whose inputs are read when they are needed."""
+        self._plans = plans.declared(self.storage, self.name, self._plans)
         return self._plans
 
     def plan(
@@ -135,7 +144,7 @@ class SceneStore:
     def job_rows(self, job: int) -> JobRows:
         """The inputs and outputs of a job; raises IndexError for a job of no plan."""
         if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
-            self.plans()
+            self._declared()
         return plans.job_rows(self._plans, job)
 
     def job_writer(self, job: int) -> JobWriter:
@@ -150,7 +159,7 @@ class SceneStore:
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
-        found = self.plans()
+        found = self._declared()
         return found[-1].end_job if found else 0
 
     def committed_jobs(self) -> set[int]:
@@ -158,10 +167,17 @@ class SceneStore:
         return markers.jobs(self.storage, self.name)
 
     def missing_jobs(self) -> list[int]:
-        """The jobs that are planned and not committed, or lack the guides that the scene has, in order."""
+        """The jobs that are planned and not committed, or lack the guides that the scene has, in order.
+
+        Raises CorruptError if inputs of the first ones are damaged: nobody could render them.
+        """
         committed = self.committed_jobs()
-        missing = {job for job in range(self.jobs()) if job not in committed}
-        return sorted(missing.union(self.guides.lacks(self._plans)))
+        jobs = range(self.jobs())
+        uncommitted = {job for job in jobs if job not in committed}
+        unguided = self.guides.lacks(self._plans, [job for job in jobs if job in committed])
+        missing = sorted(uncommitted.union(unguided))
+        plans.check_inputs(self._plans, missing[:CHECKED_JOBS])
+        return missing
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""

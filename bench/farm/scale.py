@@ -26,7 +26,7 @@ from bench.harness import results
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 
 SAMPLES = (10_000, 31_600, 100_000, 316_000, 1_000_000)
-BUCKET = (10_000, 32_000, 100_000, 320_000)
+BUCKET = (64_000, 160_000, 400_000, 1_000_000)
 WORKERS = (4, 16, 64, 256)
 PLANS = (4, 16, 64)
 

@@ -286,13 +286,16 @@ Measured = Mapping[str, Mapping[float, Mapping[str, float]]]
 
 
 def grown(measured: Measured) -> list[Grown]:
-    """The growth of every cost that was measured at three sizes or more; what a step did not do counts as 0."""
+    """The growth of every cost that was measured at three sizes or more; what a step never did costs 0."""
     found = []
     for cost in COSTS:
-        by_size = measured.get(cost.step, {})
-        sizes = sorted(by_size)
-        values = [by_size[size].get(cost.name, 0.0) for size in sizes]
-        if len(sizes) >= 3:
+        by_size = {size: values.get(cost.name, 0.0) for size, values in measured.get(cost.step, {}).items()}
+        positive = {size: value for size, value in by_size.items() if value > 0}
+        if len(positive) >= 3:
+            by_size = positive
+        if len(by_size) >= 3:
+            sizes = sorted(by_size)
+            values = [by_size[size] for size in sizes]
             found.append(Grown(cost, tuple(sizes), tuple(values), Growth.of(sizes, values)))
     return found
 

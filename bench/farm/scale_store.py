@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.farm.plans import Markers
-from bench.farm.scale_operations import counted, peak_bytes, processor_s, resident_bytes
+from bench.farm.scale_operations import counted, forget_peak, peak_bytes, processor_s, resident_bytes
 from photonfarm.shared.store.io.local import LocalStorage
 
 SPEC = "room"
@@ -41,10 +41,11 @@ def timed(action: Callable[[], Any]) -> Costs:
     `held_bytes` is what stays, with the action's result; `peak_bytes` the most above what was there before.
     """
     with counted(LocalStorage) as operations:
-        memory, before, began = resident_bytes(), peak_bytes(), processor_s()
+        forget_peak()
+        memory, began = resident_bytes(), processor_s()
         kept = action()
         core_s = processor_s() - began
-        held, most = resident_bytes() - memory, peak_bytes() - before
+        held, most = resident_bytes() - memory, peak_bytes() - memory
         del kept
     costs = {"core_s": core_s, "held_bytes": float(max(held, 0)), "peak_bytes": float(max(most, 0))}
     return {**costs, **{name: float(count) for name, count in operations.items()}}

@@ -24,6 +24,7 @@ from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, R
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
+from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.commit import JobWriter
@@ -72,6 +73,7 @@ class SceneStore:
         self.spec = read_spec(storage, scene_id)
         self.guides = GuideStore(storage, self.name, self.spec)
         self._plans: list[StoredPlan] = []
+        self._followed = [FollowedMarkers(storage, name) for name in (self.name, self.guides.name)]
 
     @property
     def folder(self) -> Path:
@@ -191,9 +193,16 @@ class SceneStore:
         """The marker of a committed job: its files and its figures."""
         return markers.read(self.storage, self.name, job)
 
-    def progress(self) -> Progress:
-        """The scene's progress; costs one listing of the markers, and of those of guides."""
-        committed, guided = self.committed_jobs(), self.guides.committed_jobs()
+    def progress(self, *, followed: bool = False) -> Progress:
+        """The scene's progress; costs one listing of the markers, and of those of guides.
+
+        For callers who ask often, `followed` ones cost less, and what a repair sets aside is seen later
+        (`FollowedMarkers`).
+        """
+        if followed:
+            committed, guided = (each.look() for each in self._followed)
+        else:
+            committed, guided = self.committed_jobs(), self.guides.committed_jobs()
         found = self.plans()
         complete = plans.complete_rows(found, committed)
         usable = complete.copy()

@@ -101,6 +101,16 @@ COSTS = (
         1e8,
         "0.1 TB for 1000 workers at once",
     ),
+    Cost("ahead", "held_bytes", "samples", "a worker with --ahead: memory that it keeps", "MB", 1e9, "as above"),
+    Cost(
+        "ahead",
+        "again_core_s",
+        "samples",
+        "a worker with --ahead, its looks, each 5 s or rarer: processor time",
+        "s",
+        2.5,
+        "half a core",
+    ),
     Cost("reconcile", "core_s", "samples", "an empty queue filled: processor time", "s", 5.0, "workers wait for it"),
     Cost(
         "reconcile",
@@ -159,7 +169,15 @@ COSTS = (
         1000.0,
         "a minute and a half at 0.1 s each",
     ),
-    Cost("bucket missing", "list", "samples", "bucket: what is missing: LISTs", "", 100.0, "10 s at 0.1 s each"),
+    Cost(
+        "bucket missing",
+        "list",
+        "samples",
+        "bucket: all that is missing, at the end and where the queue is filled: LISTs",
+        "",
+        300.0,
+        "30 s at 0.1 s each",
+    ),
     Cost(
         "bucket refresh",
         "list",
@@ -286,10 +304,13 @@ Measured = Mapping[str, Mapping[float, Mapping[str, float]]]
 
 
 def grown(measured: Measured) -> list[Grown]:
-    """The growth of every cost that was measured at three sizes or more; what a step never did costs 0."""
+    """The growth of every cost that was measured at three sizes or more; what was not done at a size costs 0."""
     found = []
     for cost in COSTS:
-        by_size = {size: values.get(cost.name, 0.0) for size, values in measured.get(cost.step, {}).items()}
+        step = measured.get(cost.step, {})
+        if not any(cost.name in values for values in step.values()):
+            continue
+        by_size = {size: values.get(cost.name, 0.0) for size, values in step.items()}
         positive = {size: value for size, value in by_size.items() if value > 0}
         if len(positive) >= 3:
             by_size = positive

@@ -153,6 +153,16 @@ def reader(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     return {**found, **{f"news_{name}": value for name, value in news.items()}}
 
 
+def ahead(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
+    """What --ahead costs a worker: a count of what is committed, and another one later."""
+    from photonfarm.renderer.worker.backpressure import TrainerPace
+    from photonfarm.shared import queue
+
+    connection, store = queue.connect(redis), _store(folder)
+    first = timed(TrainerPace(store, connection, 1.5).ahead)
+    return {**first, "again_core_s": timed(TrainerPace(store, connection, 1.5).ahead)["core_s"]}
+
+
 def find(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """`store find` of one sample by its key."""
     from photonfarm.shared.store.read.find import Query, find_samples
@@ -166,7 +176,7 @@ def find(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 
 STEPS: dict[str, Callable[[Path, int, str], Costs]] = {
     "plan": plan, "mark": mark, "plan_more": plan_more, "worker": worker, "reconcile": reconcile, "status": status,
-    "reader": reader, "find": find,
+    "reader": reader, "find": find, "ahead": ahead,
 }  # fmt: skip
 
 

@@ -155,7 +155,11 @@ class PlannedRows:
 
     def some(self, name: InputName, rows: NDArray[np.int64]) -> NDArray[Any]:
         """The values of an input in some rows; raises IndexError for a row too many."""
-        values: NDArray[Any] = getattr(self, name)[rows]
+        return self.of(name)[rows]
+
+    def of(self, name: InputName) -> NDArray[Any]:
+        """An input by its name."""
+        values: NDArray[Any] = getattr(self, name)
         return values
 
     def load(self) -> PlannedRows:

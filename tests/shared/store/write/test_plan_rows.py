@@ -98,6 +98,20 @@ def test_damage_keeps_the_jobs_from_being_queued_whose_inputs_it_is_in(store: St
         again(scene).plans()
 
 
+def test_progress_is_followed_without_what_it_does_not_need(store: Store, read: Counter[str]) -> None:
+    scene = planned(store, 40)
+    lazy = again(scene)
+    read.clear()
+    assert lazy.progress(followed=True).planned_samples == 80
+    assert {name.split("/")[-2] for name in read if "/c." in name} == {"sample_modification", "sample_view"}
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    read.clear()
+    progress = lazy.progress(followed=True)
+    assert not any("/c." in name for name in read)
+    assert progress == scene.progress()
+    assert progress.committed_samples == 3
+
+
 def test_what_guides_lack_is_found_without_the_whole_plan(store: Store, read: Counter[str]) -> None:
     scene = planned(store, 40)
     scene.guides.want(scene.spec.guides)

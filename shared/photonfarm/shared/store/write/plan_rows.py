@@ -32,6 +32,7 @@ class StoredRows:
         self._all: PlannedRows | None = None
         self._inputs: dict[InputName, PlainInput] = {}
         self._chunks: dict[InputName, OrderedDict[int, NDArray[Any]]] = {}
+        self._wholes: dict[InputName, NDArray[Any]] = {}
         self._sound: dict[InputName, set[int]] = {}  # the chunks that were read, and were as they were written
 
     def load(self) -> PlannedRows:
@@ -39,6 +40,7 @@ class StoredRows:
         if self._all is None:
             self._all = self._read_all()
             self._chunks.clear()
+            self._wholes.clear()
         return self._all
 
     def some(self, name: InputName, rows: NDArray[np.int64]) -> NDArray[Any]:
@@ -98,32 +100,43 @@ class StoredRows:
         self._sound.setdefault(name, set()).add(number)
         return values
 
+    def _whole(self, name: InputName) -> NDArray[Any]:
+        """An input of all rows; the others are not read for it."""
+        if self._all is not None:
+            return self._all.of(name)
+        if name not in self._wholes:
+            try:
+                self._wholes[name] = self._input(name).all()
+            except UNLIKE:
+                return self.load().of(name)
+        return self._wholes[name]
+
     @property
     def modification(self) -> F32:
         """Of all rows, as the others; see `PlannedRows`."""
-        return self.load().modification
+        return self._whole("modification")
 
     @property
     def view(self) -> F32:
         """See `PlannedRows`."""
-        return self.load().view
+        return self._whole("view")
 
     @property
     def sample_modification(self) -> NDArray[np.int64]:
         """See `PlannedRows`."""
-        return self.load().sample_modification
+        return self._whole("sample_modification")
 
     @property
     def sample_view(self) -> NDArray[np.int64]:
         """See `PlannedRows`."""
-        return self.load().sample_view
+        return self._whole("sample_view")
 
     @property
     def sample_pass(self) -> NDArray[np.int32]:
         """See `PlannedRows`."""
-        return self.load().sample_pass
+        return self._whole("sample_pass")
 
     @property
     def sample_key(self) -> NDArray[np.uint8]:
         """See `PlannedRows`."""
-        return self.load().sample_key
+        return self._whole("sample_key")

@@ -168,12 +168,14 @@ class SceneStore:
         """The jobs that have their marker."""
         return markers.jobs(self.storage, self.name)
 
-    def missing_jobs(self) -> list[int]:
+    def missing_jobs(self, *, followed: bool = False) -> list[int]:
         """The jobs that are planned and not committed, or lack the guides that the scene has, in order.
 
-        Raises CorruptError if inputs of the first ones are damaged: nobody could render them.
+        `followed` is for callers who ask often, as in `progress`: they may be told late of jobs that a repair has set
+        aside, and should ask without it before they take nothing to be missing. Raises CorruptError if inputs of the
+        first jobs are damaged: nobody could render them.
         """
-        committed = self.committed_jobs()
+        committed = self._followed[0].look() if followed else self.committed_jobs()
         jobs = range(self.jobs())
         uncommitted = {job for job in jobs if job not in committed}
         unguided = self.guides.lacks(self._plans, [job for job in jobs if job in committed])
@@ -196,14 +198,14 @@ class SceneStore:
     def progress(self, *, followed: bool = False) -> Progress:
         """The scene's progress; costs one listing of the markers, and of those of guides.
 
-        For callers who ask often, `followed` ones cost less, and what a repair sets aside is seen later
-        (`FollowedMarkers`).
+        It costs those who ask often less if it is `followed`: what a repair sets aside may then be seen late
+        (`FollowedMarkers`), and damage in inputs that are not needed is not seen.
         """
         if followed:
             committed, guided = (each.look() for each in self._followed)
         else:
             committed, guided = self.committed_jobs(), self.guides.committed_jobs()
-        found = self.plans()
+        found = self._declared() if followed else self.plans()
         complete = plans.complete_rows(found, committed)
         usable = complete.copy()
         if self.guides.settings() is not None and found:

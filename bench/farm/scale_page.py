@@ -17,7 +17,8 @@ SAMPLE_BYTES = 1.0e6
 def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str) -> str:
     """The page; `before` are the same costs at an earlier commit."""
     tables = "\n\n".join(_table(axis, now, before) for axis in ORDERED if any(e.cost.axis == axis for e in now))
-    earlier = f", and in brackets at commit {commit}, before what is told under [Mended](#mended)" if before else ""
+    product = f"the product at commit {commit.split()[0]}, measured by this bench"
+    earlier = f"; in brackets, before what is told under [Mended](#mended): {product}" if before else ""
     return f"""# What breaks first
 
 Ten million samples (10 TB of `{SPEC}`), a thousand workers, a thousand plans: which cost is the first that nobody can

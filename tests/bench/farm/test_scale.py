@@ -67,10 +67,12 @@ def test_what_ends_first_is_told_first() -> None:
 def test_the_page_sets_what_was_before_beside_what_is_now(tmp_path: Path) -> None:
     now = grown(measured(exponent=1, at_target=0.5))
     file = tmp_path / "before.json"
-    file.write_text(json.dumps({"measured": measured(exponent=2, at_target=100), "commit": "abc"}))
+    file.write_text(
+        json.dumps({"measured": measured(exponent=2, at_target=100), "commit": "abc with uncommitted changes"})
+    )
     earlier, commit = scale.read(file)
     text = page(now, {each.cost: each for each in grown(earlier)}, commit)
-    assert "at commit abc" in text
+    assert "at commit abc, measured" in text
     assert "1.00 ± 0.00 (2.00 ± 0.00)" in text
     assert "never" not in text.split("## Files")[0]
     assert "| 32 | 312,500 |" in text

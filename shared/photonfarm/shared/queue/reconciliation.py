@@ -198,10 +198,10 @@ def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) ->
     alive = names_below(connection, ALIVE)
     _tidy(queue, alive)
     under_way = {*queued, *alive}
+    busy = under_way | failed_names(connection)
     held = _by_scene(queued)
     missing = _missing_by_scene(store, only)
-    failed = failed_names(connection)
-    lacking = {scene_id: _lacking(scene_id, jobs, under_way | failed, limit) for scene_id, jobs in missing.items()}
+    lacking = {scene_id: _lacking(scene_id, jobs, busy, limit) for scene_id, jobs in missing.items()}
     has = {scene_id: len(held.get(scene_id, ())) for scene_id in {**held, **lacking}}
     shares = _shares({scene_id: count + len(lacking.get(scene_id, ())) for scene_id, count in has.items()}, limit)
     wanted = [

@@ -1,7 +1,7 @@
 """What breaks first as a farm grows to 10 million samples, a thousand workers and 10 TB. Nothing is rendered.
 
     python -m bench.farm.scale [--samples N …] [--workers N …] [--bucket N …] [--plans N …]
-                               [--before FILE] [--kept FILE] [--folder DIR] [--out DIR]
+                               [--before FILE] [--kept FILE …] [--folder DIR] [--out DIR]
 
 Stores, plans, queue, workers, Redis and S3 server are real. Markers of most jobs come from a generator, and workers
 commit images of 8 × 8 pixels that cost nothing. Costs are fitted over sizes that fit this machine, and extrapolated.
@@ -72,14 +72,21 @@ def measure(options: argparse.Namespace) -> Found:
     return dict(found)
 
 
-def kept(options: argparse.Namespace) -> tuple[Found, str]:
-    """What of the figures in --kept is not measured now, and the commit that they were measured at."""
-    if options.kept is None:
-        return {}, ""
-    earlier, commit = read(options.kept)
+def kept(options: argparse.Namespace) -> tuple[Found, dict[str, str]]:
+    """What of the figures in --kept is not measured now, and at which commit each step was measured.
+
+    A step is taken from the first file that has it.
+    """
     now = {name for name in MEASURED if getattr(options, name)}
-    left = {step: sizes for step, sizes in earlier.items() if part_of(step) not in now}
-    return {step: {size: dict(values) for size, values in sizes.items()} for step, sizes in left.items()}, commit
+    found: Found = {}
+    commits: dict[str, str] = {}
+    for file in options.kept:
+        earlier, commit = read(file)
+        for step, sizes in earlier.items():
+            if part_of(step) not in now and step not in found:
+                found[step] = {size: dict(values) for size, values in sizes.items()}
+                commits[step] = commit
+    return found, commits
 
 
 def part_of(step: str) -> str:
@@ -108,13 +115,13 @@ def main() -> int:
     )
     parser.add_argument("--folder", type=Path, help="for the stores, which are removed (a temporary one)")
     options = parser.parse_args()
-    known, known_at = kept(options)
+    known, commits = kept(options)
     measured = {**known, **measure(options)}
     now = grown(measured)
     earlier = read(options.before) if options.before.exists() else None
     before = {each.cost: each for each in grown(earlier[0])} if earlier else {}
-    values = {"kept_from_commit": known_at, "measured": measured, "growth": [asdict(each) for each in now]}
-    results.write("scale", page(now, before, earlier[1] if earlier else ""), values, options.out)
+    values = {"kept_from_commits": commits, "measured": measured, "growth": [asdict(each) for each in now]}
+    results.write("scale", page(now, before, earlier[1] if earlier else "", commits), values, options.out)
     return 0
 
 

@@ -14,8 +14,11 @@ SAMPLE_BYTES = 1.0e6
 """A sample with its guides, as docs/results/store.md has it for `room`: 0.8 to 1.7 MB."""
 
 
-def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str) -> str:
-    """The page; `before` are the same costs at an earlier commit."""
+def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str, kept: Mapping[str, str] | None = None) -> str:
+    """The page; `before` are the same costs at an earlier commit, and `kept` the commits of what was not measured anew.
+
+    The latter are by step.
+    """
     tables = "\n\n".join(_table(axis, now, before) for axis in ORDERED if any(e.cost.axis == axis for e in now))
     product = f"the product at commit {commit.partition(' ')[0]}, measured by this bench"
     earlier = f"\nIn brackets is what was before [what is mended](#mended): {product}." if before else ""
@@ -46,7 +49,16 @@ jobs and more. Commands include those within scripts.
 
 {_files()}
 
-{MENDED}"""
+{MENDED}{_kept(kept or {})}"""
+
+
+def _kept(kept: Mapping[str, str]) -> str:
+    """At which commits the steps were measured that were kept."""
+    steps: dict[str, list[str]] = {}
+    for step, commit in kept.items():
+        steps.setdefault(commit, []).append(step)
+    told = [f"{', '.join(each)} at {commit}" for commit, each in steps.items()]
+    return f"\n\nMeasured earlier: {'; '.join(told)}." if told else ""
 
 
 def _verdict(now: Sequence[Grown], before: Mapping[Cost, Grown]) -> str:

@@ -79,9 +79,15 @@ def test_the_page_sets_what_was_before_beside_what_is_now(tmp_path: Path) -> Non
     assert "| 32 | 312,500 |" in text
 
 
-def test_what_is_not_measured_again_is_kept(tmp_path: Path) -> None:
-    file = tmp_path / "scale.json"
-    steps = {step: {"4": {"core_s": 1.0}} for step in ("plan", "bucket news", "plans", "workers")}
-    file.write_text(json.dumps({"measured": steps, "commit": "abc"}))
-    options = argparse.Namespace(kept=file, samples=[], bucket=[], plans=[4, 16], workers=[4])
-    assert scale.kept(options) == ({step: {4.0: {"core_s": 1.0}} for step in ("plan", "bucket news")}, "abc")
+def test_what_is_not_measured_again_is_kept_from_the_first_file_that_has_it(tmp_path: Path) -> None:
+    def file(commit: str, *steps: str) -> Path:
+        document = {"measured": {step: {"4": {"from": commit}} for step in steps}, "commit": commit}
+        (tmp_path / commit).write_text(json.dumps(document))
+        return tmp_path / commit
+
+    files = [file("abc", "workers", "bucket news"), file("def", "bucket news", "plan", "plans")]
+    options = argparse.Namespace(kept=files, samples=[], bucket=[], plans=[4, 16], workers=[])
+    found, commits = scale.kept(options)
+    assert commits == {"workers": "abc", "bucket news": "abc", "plan": "def"}
+    assert found == {step: {4.0: {"from": commit}} for step, commit in commits.items()}
+    assert "Measured earlier: workers, bucket news at abc; plan at def." in page([], {}, "", commits)

@@ -111,7 +111,7 @@ def main() -> int:
     parser.add_argument("--workers", type=int, nargs="*", default=WORKERS)
     parser.add_argument("--before", type=Path, default=BEFORE, help="figures of an earlier run (scale_before.json)")
     parser.add_argument(
-        "--kept", type=Path, help="figures of an earlier run, kept for what is not measured in this one"
+        "--kept", type=Path, nargs="*", default=(), help="figures of earlier runs, for what is not measured now"
     )
     parser.add_argument("--folder", type=Path, help="for the stores, which are removed (a temporary one)")
     options = parser.parse_args()

@@ -10,6 +10,9 @@ from bench.farm.scale_workers import COMMITTED, JOB_S
 from bench.harness import results
 
 ORDERED: tuple[Axis, ...] = ("samples", "workers", "plans")
+SOON = 4
+"""How many of the costs that are borne are named as the next to end."""
+
 SAMPLE_BYTES = 1.0e6
 """A sample with its guides, as docs/results/store.md has it for `room`: 0.8 to 1.7 MB."""
 
@@ -72,9 +75,15 @@ def _verdict(now: Sequence[Grown], before: Mapping[Cost, Grown]) -> str:
             f"**{title}**, {len(named)} costs are more than can be borne, the first to end first:\n\n"
             + "\n".join(named)
             if named
-            else f"**{title}**, every cost is borne."
+            else f"**{title}**, every cost is borne. The next to end:\n\n{_next(now)}"
         )
     return "\n\n".join(lines)
+
+
+def _next(costs: Sequence[Grown]) -> str:
+    """The costs that are borne and end first."""
+    soon = sorted(costs, key=lambda each: each.room)[:SOON]
+    return "\n".join(f"{i}. {_told(each)}" for i, each in enumerate(soon, 1))
 
 
 def _told(each: Grown) -> str:

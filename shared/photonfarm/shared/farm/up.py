@@ -100,7 +100,7 @@ def run_farm(
     After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
     named = NamedSpec.load(spec)
-    for warning in warnings(spec, named.spec):
+    for warning in warnings(named):
         talk.say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
     if train_steps:

@@ -75,7 +75,8 @@ def test_a_plan_submitted_from_the_host_is_rendered_by_three_workers_and_trained
     assert password not in compose("exec", "-T", "redis", "sh", "-c", "cat /proc/[0-9]*/cmdline", data=data)
     compose("--profile", "web", "up", "-d", "web", data=data)
     assert "<title>photonfarm" in fetched("http://localhost:8420/", deadline)
-    assert 'photonfarm_samples_committed_total{scene="room"' in fetched("http://localhost:8420/metrics", deadline)
+    metrics = fetched("http://localhost:8420/metrics", deadline)
+    assert 'photonfarm_samples_committed_total{pass="first",scene="room"' in metrics
 
 
 def fetched(url: str, deadline: float) -> str:

@@ -90,8 +90,9 @@ def _view(contents: ReportContents, target: Target) -> ShownView:
 def caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) -> str:
     """What a view is shown for, and its row; one of median error may still be the worst of some kinds of pixels."""
     kinds = [case.kind for case in worst if case.row == row and not (is_median and case.kind == ALL)]
-    shown_for = ["View of median error"] * is_median + ([worst_view(kinds)] if kinds else [])
-    return "; ".join([*shown_for, f"row {row}"]) if shown_for else f"Row {row}"
+    parts = ["view of median error"] * is_median + ([worst_view(kinds)] if kinds else []) + [f"row {row}"]
+    text = "; ".join(parts)
+    return text[0].upper() + text[1:]
 
 
 def _shown(name: str, image: F32, target: F32, of: str = "") -> tuple[Layer, Layer, float]:

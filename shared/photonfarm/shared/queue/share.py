@@ -31,8 +31,9 @@ class Share(Frozen):
     @classmethod
     def parse(cls, text: str) -> Share:
         """The share that is written as K/N; raises SpecError for any other text."""
-        number, slash, of = text.partition("/")
-        if not (slash and number.isdecimal() and of.isdecimal() and int(number) < int(of)):
+        number, _, of = text.partition("/")
+        digits = number + of
+        if not (number and of and digits.isascii() and digits.isdecimal() and int(number) < int(of)):
             raise SpecError(f"share {text!r}: K/N is required, with K from 0 to N - 1, as 0/4 to 3/4")
         return cls(number=int(number), of=int(of))
 

@@ -143,7 +143,7 @@ class ShareWorker:
             try:
                 rendered = self._renderer.render(scene_id, job)
             except _TakenError:
-                log.info("worker %s: gives up %s, which another worker has committed", self._settings.name, name)
+                self._talk.given_up(name)
             except Exception as error:
                 self._outcomes.failed(name, error)
         self._in_hand = None

@@ -32,9 +32,14 @@ def start(analytic: ModuleType, tmp_path: Path) -> Iterator[Starter]:
             name = f"worker-{share.partition('/')[0]}"
             process = stack.enter_context(
                 analytic.start_worker(
-                    scene.folder.parent.parent, None, analytic.command(*child), tmp_path / f"{name}.log",
-                    share=share, name=name, **settings,
-                )  # fmt: skip
+                    scene.folder.parent.parent,
+                    None,
+                    analytic.command(*child),
+                    tmp_path / f"{name}.log",
+                    share=share,
+                    name=name,
+                    **settings,
+                )
             )
             stack.callback(process.kill)
             return process

@@ -11,10 +11,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from click.testing import CliRunner
 
+from photonfarm.renderer.worker.worker import run_worker
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import jobs_left_alone, kept_failures
+from photonfarm.shared.queue import job_name, jobs_left_alone, kept_failures
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -116,6 +120,7 @@ def test_sigterm_lets_the_job_at_hand_be_finished(
     scene = planned(8)
     running = start(scene, "0/1", 0.2)
     analytic.wait_for(lambda: scene.committed_jobs())
+    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # rows of the next one
     done = len(scene.committed_jobs())
     running.send_signal(signal.SIGTERM)
     assert running.wait(20) == 0
@@ -139,16 +144,45 @@ def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_the_ne
     assert scene.missing_jobs() == []
 
 
-def test_a_job_that_hangs_and_one_that_ends_its_process_have_failed(
+def test_a_job_that_ends_its_process_has_failed_and_the_others_go_on(
     analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
 ) -> None:
     scene = planned(2)
-    store = Store(scene.folder.parent.parent)
-    running = start(scene, "0/2", 60, until_complete=True, deadline_s=3.0)
-    analytic.wait_for(lambda: (scene.folder / "base").exists())
+    running = start(scene, "0/2", 0.5, until_complete=True)
+    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # its first rows
     os.kill(analytic.child_of(running), signal.SIGKILL)
     assert running.wait(60) == 7
-    reasons = [failure.reason for failure in kept_failures(store, lambda _: True).values()]
-    assert "SIGKILL" in reasons[0]
-    assert "took longer than --deadline 3 s" in reasons[1]
-    assert len(jobs_left_alone(store, time.time())) == 2
+    assert scene.missing_jobs() == [0]
+    store = Store(scene.folder.parent.parent)
+    (failure,) = kept_failures(store, lambda _: True).values()
+    assert "SIGKILL" in failure.reason
+    assert jobs_left_alone(store, time.time()) == {job_name(scene.scene_id, 0)}
+
+
+@pytest.mark.slow
+def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., SceneStore], start: Starter) -> None:
+    scene = planned(2)
+    assert start(scene, "0/2", 60, until_complete=True, deadline_s=3.0).wait(60) == 7
+    kept = kept_failures(Store(scene.folder.parent.parent), lambda _: True).values()
+    assert [failure.times for failure in kept] == [1, 1]
+    assert all("took longer than --deadline 3 s" in failure.reason for failure in kept)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--share", "2/2"],
+        ["--share", "0/2", "--job", "1", "--scene", "room"],
+        ["--share", "0/2", "--check"],
+        ["--share", "0/2", "--ahead", "4"],
+        ["--share", "0/2", "--scene", "room", "room"],
+        ["room"],
+    ],
+)
+def test_what_does_not_go_with_a_share_is_wrong_usage(arguments: list[str]) -> None:
+    assert CliRunner().invoke(umbrella, ["work", *arguments]).exit_code == 2
+
+
+def test_a_worker_has_a_redis_or_a_share(store: Store) -> None:
+    with pytest.raises(QueueError):
+        run_worker(store.root)

@@ -109,7 +109,7 @@ def slurm(
 ) -> None:
     """Plan samples of each SPEC, and render them by workers that SLURM runs as an array.
 
-    Without Redis the workers share the jobs by the store alone (`photonfarm work --share K/N`). A task that is preempted,
+    Without Redis the workers share the jobs by the store alone (`photonfarm work --share`). A task that is preempted,
     that loses its node or reaches its time limit goes back into the queue, and loses the job in hand. The same command
     goes on from what is stored.
 

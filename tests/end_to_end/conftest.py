@@ -1,3 +1,4 @@
+import importlib
 import os
 import re
 import subprocess
@@ -52,3 +53,17 @@ def small_room_in() -> Callable[[Path], Path]:
 def small_room(small_room_in: Callable[[Path], Path], tmp_path: Path) -> Path:
     """The spec of the small room, in an empty folder."""
     return small_room_in(tmp_path)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: an empty one, without a Redis, and with modules of its own."""
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
+    monkeypatch.delenv("PHOTONFARM_SCENES", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    sys.modules.pop("mine", None)
+    importlib.invalidate_caches()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"

@@ -73,9 +73,10 @@ def test_a_plan_submitted_from_the_host_is_rendered_by_three_workers_and_trained
     assert len(password) == 64
     assert password not in compose("logs", "--no-color", data=data)
     assert password not in compose("exec", "-T", "redis", "sh", "-c", "cat /proc/[0-9]*/cmdline", data=data)
-    compose("--profile", "web", "up", "-d", "web", data=data)
-    assert "<title>photonfarm" in fetched("http://localhost:8420/", deadline)
-    metrics = fetched("http://localhost:8420/metrics", deadline)
+    (port,) = s3_server.free_ports(1)
+    compose("--profile", "web", "up", "-d", "web", data=data, PHOTONFARM_WEB_PORT=str(port))
+    assert "<title>photonfarm" in fetched(f"http://localhost:{port}/", deadline)
+    metrics = fetched(f"http://localhost:{port}/metrics", deadline)
     assert 'photonfarm_samples_committed_total{pass="first",scene="room"' in metrics
 
 

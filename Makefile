@@ -38,7 +38,7 @@ test-compose: $(STAMP)
 # The chart and the kustomize files, validated by helm and kubectl and run for real by Podman (docs/kubernetes.md); what
 # is not found is skipped.
 test-kubernetes: $(VENV)/.kubernetes-ready
-	PHOTONFARM_TEST_KUBERNETES=1 $(BIN)/python -m pytest -s tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
+	PHOTONFARM_TEST_KUBERNETES=1 $(BIN)/python -m pytest -sv tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
 
 $(VENV)/.kubernetes-ready: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[kubernetes]'

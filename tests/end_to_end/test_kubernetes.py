@@ -234,9 +234,12 @@ def without_digest(key: tuple[str, str]) -> tuple[str, str]:
 # -------------------------------------------------------------------------------------------------------------- Podman
 
 RELEASE = NETWORK = "photonfarm-test"
-MODIFICATIONS = 24
+MODIFICATIONS = 48  # of which training holds out some
 PLAN = ["--modifications", str(MODIFICATIONS), "--views", "1", "--shard-rows", "1"]
-PODMAN_VALUES = {"trainer": {"enabled": False}, "plans": [{"name": "first", "spec": "room", "args": PLAN}]}
+PODMAN_VALUES = {
+    "plans": [{"name": "first", "spec": "room", "args": PLAN}],
+    "trainer": {"spec": "room", "args": ["--steps", "4", "--batch", "4"]},
+}
 
 
 @pytest.fixture
@@ -250,7 +253,7 @@ def podman() -> Tool:
 def farm(helm: Tool, podman: Tool, tmp_path: Path) -> Iterator[dict[str, str]]:
     """The chart's pods, running; their containers, by what they do."""
     version = yaml.safe_load((CHART / "Chart.yaml").read_text())["appVersion"]
-    for target in ("redis", "renderer"):
+    for target in ("redis", "renderer", "trainer"):
         image = f"localhost/photonfarm/{target}:{version}"
         podman("build", "--network", "host", "--target", target, "--tag", image, ROOT)
     command, text = [sys.executable, str(ROOT / "scripts/podman_pods.py")], rendered(helm, PODMAN_VALUES, RELEASE)
@@ -278,7 +281,7 @@ def farm(helm: Tool, podman: Tool, tmp_path: Path) -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.timeout(2400)
-def test_the_pods_of_the_chart_complete_a_plan_under_podman(podman: Tool, farm: dict[str, str]) -> None:
+def test_the_pods_of_the_chart_complete_a_plan_and_train_on_it_under_podman(podman: Tool, farm: dict[str, str]) -> None:
     assert [part for part in farm if "renderer" in part] == ["renderer-0", "renderer-1"]
     renderers = [farm["renderer-0"], farm["renderer-1"]]
     status: dict[str, Any] = {}
@@ -305,7 +308,10 @@ def test_the_pods_of_the_chart_complete_a_plan_under_podman(podman: Tool, farm: 
     podman("exec", renderers[1], "photonfarm", "work", "--check")
 
     (plan,) = (container for part, container in farm.items() if part.startswith("plan-first"))
-    assert inspected(podman, plan)["State"]["ExitCode"] == 0
+    (trainer,) = (container for part, container in farm.items() if part.startswith("trainer"))
+    for job in (plan, trainer):
+        assert podman("wait", job).stdout == "0\n"
+    podman("exec", renderers[0], "test", "-s", "/data/run/checkpoint.safetensors")
     password = podman("exec", farm["redis"], "cat", "/run/photonfarm/redis_password").stdout.strip()
     assert len(password) >= 48  # Podman 4.3 leaves it in base64, for all pods alike
     for container in farm.values():

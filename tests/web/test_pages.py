@@ -31,8 +31,10 @@ from photonfarm.shared.plan.sample_costs import relative_variance
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.web import images
-from photonfarm.web.farm_pages import FarmPages, Kept
+from photonfarm.web.farm_pages import FarmPages
 from photonfarm.web.images import POINT
+from photonfarm.web.kept import Kept
+from photonfarm.web.routes import page_routes
 from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import PageServer
 
@@ -77,7 +79,7 @@ def trained(scene: SceneStore, folder: Path) -> Path:
 @contextmanager
 def served(store: Store, runs: list[Path]) -> Iterator[PageServer]:
     watch = FarmWatch(store, "unix:///none", runs)
-    with PageServer(FarmPages(store.root, watch), "127.0.0.1", 0) as serving:
+    with PageServer(page_routes(FarmPages(store.root, watch)), "127.0.0.1", 0) as serving:
         thread = threading.Thread(target=serving.serve_forever, args=(0.02,))
         thread.start()
         try:

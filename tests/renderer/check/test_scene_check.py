@@ -15,7 +15,7 @@ from photonfarm.renderer.check.scene_check import SceneCheck, check
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.plan.request import PlannedContent, Request, expand
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">
 <shape type="cube" id="walls"><transform name="to_world"><scale x="2" y="1.5" z="2"/><translate y="1.5"/></transform>
@@ -71,7 +71,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 
 
 def checked(spec: Path) -> SceneCheck:
-    return check(load_spec(spec), spec.parent, lambda _: None)
+    return check(NamedSpec.load(str(spec)), lambda _: None)
 
 
 AT, BOX = "at = [0, 0, 0]", "box = { min = [-1.2, 0, -1.2], max = [1.2, 0, 1.2] }"

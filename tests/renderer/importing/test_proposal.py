@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from photonfarm.renderer.importing.importer import _proposal
 from photonfarm.renderer.importing.loading import load
@@ -17,13 +18,17 @@ from photonfarm.renderer.importing.readers import reader_of
 from photonfarm.renderer.scene.surroundings import surroundings
 
 
-@pytest.fixture(scope="module")
-def proposal(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The proposal for the room of boxes, and its Mitsuba scene."""
-    scratch = tmp_path_factory.mktemp("scratch")
-    scene = reader_of(boxes)(boxes, scratch, lambda _: None)
+def proposed(file: Path, scratch: Path) -> Any:
+    """The proposal for a file, and its Mitsuba scene."""
+    scene = reader_of(file)(file, scratch, lambda _: None)
     made = load(scene, scratch, lambda _: None)
     return (*_proposal(scene, made, Frame((0, 1, 0)), lambda _: None), made)
+
+
+@pytest.fixture(scope="module")
+def proposal(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The proposal for the room of boxes."""
+    return proposed(boxes, tmp_path_factory.mktemp("scratch"))
 
 
 def test_the_room_is_found_and_all_that_stands_in_it_also_two_chairs_of_one_mesh(proposal: Any) -> None:
@@ -36,6 +41,21 @@ def test_the_room_is_found_and_all_that_stands_in_it_also_two_chairs_of_one_mesh
     for number in chairs:
         assert (belonging.thing == number).sum() == 12
         assert len(set(belonging.shape[belonging.thing == number])) == 1
+
+
+@pytest.mark.parametrize(("name", "count"), [("Stool.2", 1), ("Basket", 2)])
+def test_parts_of_one_name_are_one_thing_without_touching_and_a_sheet_is_none(
+    gltf: Any, tmp_path: Path, name: str, count: int
+) -> None:
+    shell = trimesh.creation.box(bounds=[[0, 0, 0], [5, 2.6, 4]])
+    outer = trimesh.creation.box(bounds=[[3, 0, 2], [3.6, 0.6, 2.6]])
+    inner = trimesh.creation.box(bounds=[[3.1, 0, 2.1], [3.5, 0.5, 2.5]])
+    sheet = trimesh.creation.box(bounds=[[1, 0, 1], [1.01, 0.8, 1.6]])
+    shell.invert()
+    for own, mesh in (("Shell", shell), ("Stool.1", outer), (name, inner), ("Sheet", sheet)):
+        gltf.node(own, gltf.mesh(mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")))
+    _, things, _, _ = proposed(gltf.write(), tmp_path)
+    assert len(things) == count
 
 
 def test_things_stay_inside_the_room_on_the_floor_wherever_they_may_be(proposal: Any) -> None:
@@ -108,7 +128,13 @@ def test_names_say_what_belongs_to_the_room(name: str, shell: bool, furniture: b
 
 @pytest.mark.parametrize(
     ("name", "made"),
-    [("SofaLeather_0007", "sofa-leather"), ("Chair.001", "chair"), ("123", "object"), ("Tisch grün", "tisch-gr-n")],
+    [
+        ("SofaLeather_0007", "sofa-leather"),
+        ("Chair.001", "chair"),
+        ("Chair_2.001", "chair"),
+        ("123", "object"),
+        ("Tisch grün", "tisch-gr-n"),
+    ],
 )
 def test_groups_have_names_that_a_spec_allows(name: str, made: str) -> None:
     assert group_name(name) == made

@@ -37,6 +37,40 @@ def test_what_is_written_twice_is_written_once() -> None:
     assert spec_file.put(once, SETTINGS, where="spec") == once
 
 
+MIXED = """# first
+[[objects]]
+name = "a"
+
+# second
+[[lights]]
+name = "b"
+shapes = [
+[1]
+]
+
+# third
+[[objects]]
+name = "c"
+
+# fourth
+[photons]
+depth = 4  # few
+
+[photons.more]
+a = 1
+
+# fifth
+[film]
+width = 8
+"""
+
+
+def test_comments_stay_where_they_are_in_a_file_in_which_objects_and_lights_alternate() -> None:
+    changed = spec_file.put(MIXED, {"photons": {"depth": 2, "more": {"a": 2, "b": {"c": 3}}}}, where="spec")
+    assert changed == MIXED.replace("depth = 4", "depth = 2").replace("a = 1\n", "a = 2\n\n[photons.more.b]\nc = 3\n")
+    assert spec_file.put(MIXED, {"transport": {"half_spp": 9}}, where="spec") == f"{MIXED}\n[transport]\nhalf_spp = 9\n"
+
+
 @pytest.mark.parametrize(
     "text", ["", 'name = "a"', 'name = "a"\r\n[film]\r\nwidth = 8\r\n', "[transport]", "[photons]\n"]
 )

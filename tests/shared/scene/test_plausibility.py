@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.scene.plausibility import doubts, warnings
 from photonfarm.shared.scene.spec_lines import lines_of
-from photonfarm.shared.scene.spec_loading import find_spec, load_spec, parse_spec
+from photonfarm.shared.scene.spec_loading import NamedSpec, find_spec, parse_with_lights
 
 ROOM: dict[str, Any] = {
     "name": "checked",
@@ -25,7 +25,7 @@ TABLE = {"name": "table", "shapes": ["table-wood"], "at": [0, 0, 0], "box": {"mi
 def keys(**changes: Any) -> list[str]:
     """The keys that are doubted in a spec of the built-in room."""
     changes["view"] = ROOM["view"] | changes.get("view", {})
-    return [doubt.key for doubt in doubts(parse_spec(ROOM | changes, where="test"))]
+    return [doubt.key for doubt in doubts(*parse_with_lights(ROOM | changes, where="test"))]
 
 
 def origin(*at: float) -> dict[str, Any]:
@@ -34,7 +34,7 @@ def origin(*at: float) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", ["room", "cornell"])
 def test_nothing_is_said_of_the_built_in_specs(name: str) -> None:
-    assert warnings(name, load_spec(name)) == []
+    assert warnings(NamedSpec.load(name)) == []
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_what_can_hardly_be_meant_is_named_by_its_key(changes: dict[str, Any], d
 def test_a_scene_file_without_any_light_is_doubted(tmp_path: Path, lights: str, is_dark: bool) -> None:
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0"><shape type="cube"/>{lights}</scene>')
     described = ROOM | {"scene": {"file": "scene.xml"}}
-    found = doubts(parse_spec(described, where="test", beside=tmp_path), tmp_path)
+    found = doubts(*parse_with_lights(described, where="test", beside=tmp_path))
     assert [doubt.key for doubt in found] == (["scene"] if is_dark else [])
 
 

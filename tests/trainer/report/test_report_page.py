@@ -35,14 +35,16 @@ def errors(*per_sample: float) -> HeldOutErrors:
     return HeldOutErrors(Estimate.of(group_means(values, units)), 0.1, values, values, units)
 
 
-def judged(contents: ReportContents, own: HeldOutErrors, colour: HeldOutErrors) -> Verdict:
-    """The verdict if these had been the errors of the network and of the mean colour."""
+def judged(
+    contents: ReportContents, own: HeldOutErrors, colour: HeldOutErrors, shown: HeldOutErrors | None = None
+) -> Verdict:
+    """The verdict if these had been the errors of the network and of the mean colour; `shown`: of light up to white."""
     entry = contents.entries[0]
     return Verdict.of(
         replace(
             contents,
             entries=(replace(entry, row=replace(entry.row, held_out=own)),),
-            baselines=replace(contents.baselines, mean_colour=colour, mean_shown_colour=colour),
+            baselines=replace(contents.baselines, mean_colour=colour, mean_shown_colour=shown or colour),
         )
     )
 
@@ -54,6 +56,10 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
     assert better.sentence == "light_transport predicts unseen configurations with 1/18 of the mean colour’s error."
     assert "in 3 of 3 configurations" in better.further[0]
     assert "with 50 % of " in judged(contents, errors(0.9, 0.9), errors(1.8, 1.8)).sentence
+    with_lamps = judged(contents, errors(0.1, 0.1), errors(50, 50), shown=errors(2, 2))
+    assert "with 1/20 of " in with_lamps.sentence, "of both ratios the one that says less"
+    assert "it is 1/500 of that error" in with_lamps.further[0]
+    assert "1/20 of that of one colour" in with_lamps.further[0]
     worse = judged(contents, errors(3.6, 3.6, 0.1, 0.1, 3.6, 3.6), colour)
     assert worse.kind == "worse"
     assert "worse than the mean colour" in worse.sentence

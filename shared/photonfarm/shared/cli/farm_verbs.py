@@ -68,7 +68,7 @@ def submit(
     from photonfarm.shared.scene.spec_loading import NamedSpec
 
     named = NamedSpec.load(spec)
-    for warning in filter(None, (*warnings(spec, named.spec), hold_out_warning(named.spec, store, request))):
+    for warning in filter(None, (*warnings(named), hold_out_warning(named.spec, store, request))):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
     if dry_run:

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from photonfarm.shared.core.processes import loading
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -25,7 +27,8 @@ class StorePlace(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The Path or the URL; fails for a URL that is not that of a bucket."""
-        from photonfarm.shared.store.io.storage import SCHEMES, is_url
+        with loading():
+            from photonfarm.shared.store.io.storage import SCHEMES, is_url
 
         if re.match(r"(s3|gs|az):/?[^/]", str(value)):
             self.fail(f"{value!r} is no URL of a bucket; write {str(value)[:2]}://BUCKET/PREFIX.", param, ctx)

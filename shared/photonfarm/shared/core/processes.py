@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import socket
@@ -21,6 +22,9 @@ if sys.platform == "linux":
         sys.exit(1)  # that process has ended already
 os.execv(sys.argv[2], sys.argv[2:])
 """
+
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+"""The variable that numpy's wheels read when they are loaded."""
 
 
 def tied(command: Sequence[str]) -> list[str]:
@@ -43,6 +47,27 @@ def ended_by_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Load a verb's packages within the block, for a third less of its processor time; for once in a process.
+
+    Garbage is not looked for meanwhile, and never among what there is then: loading makes hardly any, and what is
+    loaded stays. Numpy is loaded without the threads of its matrix products, which turn while they wait for work: we
+    have no use for them, and torch has its own. Our environment is afterwards as before.
+    """
+    before, collects = os.environ.get(_BLAS_THREADS), gc.isenabled()
+    os.environ[_BLAS_THREADS] = before or "1"
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if collects:
+            gc.enable()
+        if before is None:
+            del os.environ[_BLAS_THREADS]
 
 
 @contextmanager

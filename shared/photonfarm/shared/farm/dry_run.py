@@ -76,11 +76,11 @@ def rehearse(
     if not (measure and (found.planned or found.guide_views)):
         return found
     try:
-        seconds = min(max(SHARE_S * found.planned, LEAST_S), MOST_S)
-        return _priced(found, named.spec, request, costs_by_renderer(named.name, seconds))
+        costs = costs_by_renderer(named.name, min(max(SHARE_S * found.planned, LEAST_S), MOST_S))
     except BackendError as error:
         log(f"cost and time are not known: {error}")
         return found
+    return _priced(found, named.spec, request, costs)
 
 
 def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:

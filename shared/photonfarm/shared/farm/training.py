@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,8 @@ class TrainingProgress:
     left_s: float | None = None  # until the last step, at the pace so far
     validation: dict[str, Any] | None = None  # the last record of one
     ended: str | None = None  # why, if the run has ended
+    loss: float | None = None  # the last one that was logged
+    seconds: dict[str, float] = field(default_factory=dict)  # so far, by what they were spent on
 
     @property
     def error(self) -> str:
@@ -99,6 +102,8 @@ class RunFolder:
             said.get("left_s"),
             validation,
             ended,
+            next((loss for each in reversed(self.records) if (loss := _loss(each)) is not None), None),
+            next((each["seconds"] for each in reversed(self.records) if isinstance(each.get("seconds"), dict)), {}),
         )
 
     def _read_log(self) -> None:
@@ -159,6 +164,13 @@ def _record(line: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def _loss(record: dict[str, Any]) -> float | None:
+    """The loss that a record of the log holds; None if it holds none, or one that is no number."""
+    loss = record.get("loss")
+    trains = record.get("kind") == "train" and isinstance(loss, float) and math.isfinite(loss)
+    return loss if trains else None
 
 
 def _read_json(file: Path) -> dict[str, Any]:

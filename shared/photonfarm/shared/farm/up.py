@@ -100,7 +100,7 @@ def run_farm(
     After any interruption the same call resumes, as the store and the trainer's checkpoints remain.
     """
     named = NamedSpec.load(spec)
-    for warning in warnings(spec, named.spec):
+    for warning in warnings(named):
         talk.say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
     if train_steps:
@@ -280,7 +280,7 @@ class _Farm:
             samples, passes, trained.step, self.steps, trained.note,
             min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
-            tuple(waits(self._queue, named, 0)),
+            tuple(map(str, waits(self._queue, named, 0))),
         )  # fmt: skip
 
     def _status(self) -> QueueStatus | None:

@@ -18,6 +18,11 @@ rq:photonfarm:store                 the id of the store that this Redis serves, 
 rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of
 from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
 from photonfarm.shared.queue.entries import put_back, take
@@ -40,10 +45,28 @@ from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_jo
 from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import FUNCTION, OVERDUE, QUEUE, STARTS, RenderArguments, job_name
 from photonfarm.shared.queue.kept_failures import keep_failure, kept_failures
-from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
-from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.status import QueueStatus, queue_status
 from photonfarm.shared.queue.worker_activity import Activity, clear_activity, report_activity
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, reconcile
+    from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
+else:
+    _WITH_RQ = {
+        "QUEUE_LIMIT": "reconciliation",
+        "reconcile": "reconciliation",
+        "QueueWorker": "rq_adapter",
+        "RenderJob": "rq_adapter",
+        "open_queue": "rq_adapter",
+    }
+
+    def __getattr__(name: str) -> Any:
+        """What needs RQ, which is loaded only when it is asked for: `status` asks for none of it."""
+        if name not in _WITH_RQ:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_WITH_RQ[name]}"), name)
+
 
 __all__ = [
     "ALIVE",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, field
 from itertools import islice
 
 import redis
@@ -14,9 +13,8 @@ from redis import Redis
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.processes import repeating
 from photonfarm.shared.queue.entries import queued_names, running_names, taken_names
-from photonfarm.shared.queue.failures import FAILURES, Failure, failed_names, forget_failures, read_failures
-from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S, workers_alive
-from photonfarm.shared.queue.idle_workers import IdleReports, read_idle_reports
+from photonfarm.shared.queue.failures import FAILURES, failed_names, forget_failures
+from photonfarm.shared.queue.heartbeat import ALIVE, HEARTBEAT_MOST_S
 from photonfarm.shared.queue.job import OVERDUE, STARTS, job_name
 from photonfarm.shared.queue.rq_adapter import (
     EXECUTIONS,
@@ -29,7 +27,6 @@ from photonfarm.shared.queue.rq_adapter import (
 )
 from photonfarm.shared.queue.served_store import serve
 from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
-from photonfarm.shared.queue.worker_activity import Activity, read_activities
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
@@ -192,33 +189,3 @@ def _tidy(queue: RenderQueue, alive: set[str]) -> None:
 
 def _text(name: bytes) -> str:
     return name.decode(errors="replace")
-
-
-# ------------------------------------------------------------------------------------------------------------- status
-
-
-@dataclass(frozen=True, slots=True)
-class QueueStatus:
-    """The queue and the workers, as Redis has them."""
-
-    queued: int
-    running: int  # jobs with a heartbeat
-    workers: int  # with a heartbeat; those of this machine only if their process lives
-    failed: dict[str, Failure]  # by job name
-    idle_reports: IdleReports
-    activities: Mapping[str, Activity] = field(default_factory=dict)  # by worker
-
-
-def queue_status(connection: Redis) -> QueueStatus:
-    """Jobs queued, running and failed, and workers; raises QueueError if Redis fails."""
-    try:
-        return QueueStatus(
-            queued=len(open_queue(connection)),
-            running=len(names_below(connection, ALIVE)),
-            workers=len(workers_alive(connection)),
-            failed=read_failures(connection),
-            idle_reports=read_idle_reports(connection),
-            activities=read_activities(connection),
-        )
-    except redis.RedisError as error:
-        raise QueueError(f"Redis failed while it was asked for its status: {error}") from error

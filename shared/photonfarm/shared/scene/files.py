@@ -56,6 +56,7 @@ class SceneFile:
     shape_ids: frozenset[str]
     emitting: frozenset[str]  # ids of the shapes that are lights
     shapeless: frozenset[str]  # lights that are not shapes: ENVIRONMENT, and the ids of others that have one
+    has_unnamed_light: bool  # a shape or another light without an id shines
     digest: str  # of the file and of every file it names
 
     @classmethod
@@ -66,17 +67,16 @@ class SceneFile:
         shapes = {node.get("id", ""): node for node in root.iter("shape") if node.get("id")}
         lights = {node.get("id") for node in root.iter("emitter")} - {None}
         emitting = {name for name, node in shapes.items() if _emits(node, lights)}
+        unnamed = any(not node.get("id") and _emits(node, lights) for node in root.iter("shape")) or any(
+            not node.get("id") and node.get("type") not in ("area", *_ENVIRONMENTS) for node in root.findall("emitter")
+        )
         digest = _digest(path, _named_files(root, path))
-        return cls(path, frozenset(shapes), frozenset(emitting), frozenset(_shapeless(root)), digest)
+        return cls(path, frozenset(shapes), frozenset(emitting), frozenset(_shapeless(root)), unnamed, digest)
 
-
-def light_ids(path: Path) -> frozenset[str]:
-    """The ids of a scene file's lights, as those of `SceneFile`; "" stands for all that have none."""
-    root = _parse(path)
-    lights = {node.get("id") for node in root.iter("emitter")} - {None}
-    shining = {node.get("id", "") for node in root.iter("shape") if _emits(node, lights)}
-    unnamed = {"" for node in root.findall("emitter") if node.get("type") != "area" and not node.get("id")}
-    return frozenset(shining | unnamed | set(_shapeless(root)))
+    @property
+    def lights(self) -> frozenset[str]:
+        """The ids of all lights; "" stands for those that have none."""
+        return self.emitting | self.shapeless | ({""} if self.has_unnamed_light else frozenset())
 
 
 def _emits(shape: ElementTree.Element, lights: Set[str | None]) -> bool:

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.scene.files import BUILTIN_EMITTING, light_ids
 from photonfarm.shared.scene.spec import Box, Movable, SceneSpec
 from photonfarm.shared.scene.spec_lines import SpecLines
-from photonfarm.shared.scene.spec_loading import find_scene, find_spec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 
 USUAL_FOV = (10.0, 130.0)
 """Fields of view between which nothing is said, in degrees."""
@@ -35,16 +33,15 @@ class Doubt:
     sentence: str  # what is said there, and what follows from it
 
 
-def warnings(name: str, spec: SceneSpec) -> list[str]:
-    """The doubts about a checked spec of this name, each as one sentence after the line of its file."""
-    file = find_spec(name)
-    lines = SpecLines.of(file)
-    return [f"{lines.place(doubt.key)}: {doubt.sentence}" for doubt in doubts(spec, file.parent)]
+def warnings(named: NamedSpec) -> list[str]:
+    """The doubts about a spec, each as one sentence after the line of its file."""
+    lines = SpecLines.of(named.file)
+    return [f"{lines.place(doubt.key)}: {doubt.sentence}" for doubt in doubts(named.spec, named.lights)]
 
 
-def doubts(spec: SceneSpec, beside: Path | None = None) -> list[Doubt]:
-    """What a spec says that can hardly be meant; `beside` is its folder, where its scene file may lie."""
-    return [*_of_view(spec), *_of_transport(spec), *_of_lights(spec, beside), *_of_groups(spec)]
+def doubts(spec: SceneSpec, lights: frozenset[str]) -> list[Doubt]:
+    """What a spec says that can hardly be meant; `lights` are the ids of the scene's own lights."""
+    return [*_of_view(spec), *_of_transport(spec), *_of_lights(spec, lights), *_of_groups(spec)]
 
 
 def group_key(spec: SceneSpec, index: int) -> str:
@@ -91,22 +88,16 @@ def _of_transport(spec: SceneSpec) -> Iterator[Doubt]:
         yield Doubt("transport.max_depth", f"max_depth = {depth} {follows[depth]}; 8 is usual")
 
 
-def _of_lights(spec: SceneSpec, beside: Path | None) -> Iterator[Doubt]:
+def _of_lights(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
     movable = [light for light in spec.lights if light.removal_probability < 1]
     moved = {shape for light in spec.lights for shape in light.shape_ids}
-    own = _own_lights(spec, beside) - moved
+    own = lights - moved
     if movable or any(spec.emitters.factor(name) > 0 for name in own):
         return
     if own:
         yield Doubt("emitters", "emitters switches off every light of the scene, and nothing else shines: it is black")
     else:
         yield Doubt("scene", "the scene has no light at all, so that every image is black; add one under [[lights]]")
-
-
-def _own_lights(spec: SceneSpec, beside: Path | None) -> frozenset[str]:
-    if spec.scene.builtin:
-        return BUILTIN_EMITTING[spec.scene.builtin]
-    return light_ids(find_scene(str(spec.scene.file), spec.name, beside))
 
 
 def _of_groups(spec: SceneSpec) -> Iterator[Doubt]:

@@ -32,7 +32,11 @@ def load_spec(path: str | Path, *, measured_again: bool = False) -> SceneSpec:
 
     Raises SpecError with one sentence that names the key, the value and the rule.
     """
-    file = find_spec(str(path))
+    return _read(find_spec(str(path)), measured_again=measured_again)[0]
+
+
+def _read(file: Path, *, measured_again: bool = False) -> tuple[SceneSpec, frozenset[str]]:
+    """The checked spec in a file, and the ids of its scene's lights."""
     if file.suffix.lower() in SCENE_SUFFIXES:
         raise SpecError(f"{file}: is a scene and no spec; `photonfarm scene import {file}` makes a spec of it")
     parse, language = (json.loads, "JSON") if file.suffix == ".json" else (tomllib.loads, "TOML")
@@ -48,20 +52,28 @@ def load_spec(path: str | Path, *, measured_again: bool = False) -> SceneSpec:
         raise SpecError(f"{file}: holds a {type(described).__name__}; the tables of a spec are required")
     if measured_again and isinstance(view := described.get("view"), dict):
         view.pop("free_space", None)
-    return parse_spec(described, where=str(file), beside=file.parent)
+    return parse_with_lights(described, where=str(file), beside=file.parent)
 
 
 def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = None) -> SceneSpec:
     """The checked spec in a parsed TOML or JSON document, its scene file found and digested."""
+    return parse_with_lights(described, where=where, beside=beside)[0]
+
+
+def parse_with_lights(
+    described: dict[str, Any], *, where: str, beside: Path | None = None
+) -> tuple[SceneSpec, frozenset[str]]:
+    """What `parse_spec` gives, and the ids of the scene's own lights; "" stands for those that have none."""
     spec = _validate({**described, "content": ""}, where)
     if spec.scene.file is None:
         content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
         known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
         _check_shapes(spec, known, where)
-        _check_emitters(spec, scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)], known, where)
+        lights = scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)]
+        _check_emitters(spec, lights, known, where)
     else:
         scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
-        content = scene.digest
+        content, lights = scene.digest, scene.lights
         _check_shapes(spec, scene.shape_ids, where)
         _check_lights(spec, scene.emitting, where)
         _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
@@ -71,7 +83,7 @@ def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = N
             f"{where}: view.free_space: was measured for other geometry, groups or boxes of views; "
             f"take it out, or run `photonfarm scene free-space {where} --write` again"
         )
-    return spec
+    return spec, lights
 
 
 def _validate(described: dict[str, Any], where: str) -> SceneSpec:
@@ -181,11 +193,14 @@ class NamedSpec:
     scenes: str | None
     """The folder that workers must have in PHOTONFARM_SCENES, if the scene file is found beside the spec alone: workers
     have the store, and not the spec's file."""
+    file: Path = Path()
+    lights: frozenset[str] = frozenset()  # ids of the scene's own lights; "" stands for those that have none
 
     @classmethod
     def load(cls, name: str) -> Self:
         """The spec of a name, as `load_spec` reads it; raises SpecError."""
-        spec = load_spec(name)
+        file = find_spec(name)
+        spec, lights = _read(file)
         is_found = any((folder / str(spec.scene.file)).is_file() for folder in _named_folders())
         folder = None if is_found else scene_folder(name, spec)
-        return cls(name, spec, str(folder) if folder else None)
+        return cls(name, spec, str(folder) if folder else None, file, lights)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,12 +71,12 @@ class Measured:
     samples: Samples
 
 
-def findings(spec: SceneSpec, beside: Path | None, measured: Measured) -> list[Finding]:
+def findings(spec: SceneSpec, lights: frozenset[str], measured: Measured) -> list[Finding]:
     """The findings, serious ones first; one for each key, and none that only follows from another."""
     found: dict[str, Finding] = {}
     cameras = measured.samples.cameras
     _add(found, _of_place(spec, measured))
-    _add(found, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, beside)))
+    _add(found, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, lights)))
     if not _VIEWS & found.keys():
         _add(found, _of_cameras(spec, cameras))
         if not _DARKNESS & found.keys() and cameras.placed_well.mean() >= PLACED_WELL:

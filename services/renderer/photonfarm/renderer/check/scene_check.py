@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 
 PICTURED = 240
 """The most shapes that get a picture: those of movable groups, and then the largest."""
@@ -37,16 +37,16 @@ class SceneCheck:
     seconds: float
 
 
-def check(spec: SceneSpec, beside: Path | None, log: Log) -> SceneCheck:
+def check(named: NamedSpec, log: Log) -> SceneCheck:
     """Check a spec; the backend must have been loaded. Raises SpecError and BackendError as loading does."""
     with WorkLog(log) as work:
-        return _checked(spec, beside, work)
+        return _checked(named, work)
 
 
-def _checked(spec: SceneSpec, beside: Path | None, work: WorkLog) -> SceneCheck:
-    begun = time.monotonic()
+def _checked(named: NamedSpec, work: WorkLog) -> SceneCheck:
+    begun, spec = time.monotonic(), named.spec
     work.begin(f"loading {spec.name}")
-    scene = LoadedScene.load(samples.small(spec), beside)
+    scene = LoadedScene.load(samples.small(spec), named.file.parent)
     group_of = groups_by_shape(spec)
     shapes = facts_of(scene.scene, group_of)
     boxes, still = scene.boxes, scene.still
@@ -62,7 +62,7 @@ def _checked(spec: SceneSpec, beside: Path | None, work: WorkLog) -> SceneCheck:
     rendered = samples.render(scene, spec, cloud, work)
     low, high = _around(boxes)
     measured = Measured(low, high, placed, rendered)
-    found = findings(spec, beside, measured)
+    found = findings(spec, named.lights, measured)
     return SceneCheck(spec, shapes, pictures, room, measured, drawn, found, time.monotonic() - begun)
 
 

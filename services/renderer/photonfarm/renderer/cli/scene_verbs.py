@@ -60,13 +60,13 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
     from photonfarm.renderer.scene import backend
     from photonfarm.shared.cli import show
     from photonfarm.shared.scene.spec_lines import SpecLines
-    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+    from photonfarm.shared.scene.spec_loading import NamedSpec
 
-    loaded, file = load_spec(spec), find_spec(spec)
+    named = NamedSpec.load(spec)
     backend.load()
     from photonfarm.renderer.check import page, scene_check
 
-    check, lines = scene_check.check(loaded, file.parent, partial(click.echo, err=True)), SpecLines.of(file)
+    check, lines = scene_check.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
     page.write(check, lines, out)
     if as_json:
         show.print_json([finding.document(lines) for finding in check.findings])

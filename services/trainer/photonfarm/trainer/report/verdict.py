@@ -35,22 +35,33 @@ class Verdict:
         """The verdict on the first entry, against the mean colour and against the network before its first step."""
         evaluation, first = contents.evaluation, contents.entries[0]
         errors, constant = first.row.held_out, contents.baselines.mean_colour
+        shown = _shown_ratio(errors, contents.baselines.mean_shown_colour)
         further = (
-            _won(errors, constant, contents.baselines.mean_shown_colour, evaluation.unit),
+            _won(errors, constant, shown, evaluation.unit),
             _since_start(errors.error.mean, contents.baselines.untrained.error.mean),
             _of_references(evaluation.references, first.row.metrics),
         )
-        return cls(*_against(first.name, errors, constant, evaluation.unit), further)
+        return cls(*_against(first.name, errors, constant, shown, evaluation.unit), further)
 
 
-def _against(name: str, errors: HeldOutErrors, constant: HeldOutErrors, unit: str) -> tuple[Kind, str]:
+def _shown_ratio(errors: HeldOutErrors, constant: HeldOutErrors) -> float:
+    """The ratio of the errors without light above white; 0 where this error is below what its samples can show."""
+    own, colour = (float(group_means(of.shown, of.units).mean()) for of in (errors, constant))
+    return max(own, 0.0) / colour if colour > 0 else 0.0
+
+
+def _against(name: str, errors: HeldOutErrors, constant: HeldOutErrors, shown: float, unit: str) -> tuple[Kind, str]:
+    """The verdict's kind and sentence.
+
+    Of the two ratios it says the larger one: a lamp in view makes the mean colour so wrong that all else looks good.
+    """
     error, colour, better = errors.error.mean, constant.error.mean, _better(errors, constant)
     if error <= 0:
         return "better", f"{name} predicts unseen {unit}s with no error that these views can show."
     if error >= colour:
         times = f"{error / colour:.3g} times that of one colour for every pixel"
         return "worse", f"{name} is worse than the mean colour: on unseen {unit}s its error is {times}."
-    share = _share(error / colour)
+    share = _share(max(error / colour, shown))
     if 2 * better.sum() < len(better):
         mean = f"only in the mean over all has it {share} that error"
         return "mixed", f"{name} is worse than the mean colour in most unseen {unit}s; {mean}."
@@ -68,15 +79,14 @@ def _better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]
     return own < other
 
 
-def _won(errors: HeldOutErrors, constant: HeldOutErrors, shown_constant: HeldOutErrors, unit: str) -> str:
-    better = _better(errors, constant)
-    shown, colour = (float(group_means(of.shown, of.units).mean()) for of in (errors, shown_constant))
-    share = f"{_share(shown / colour)} that of one colour" if shown < colour else "not below that of one colour"
-    blocks = f"over blocks of {BLOCK} × {BLOCK} pixels and without light above white, such as lamps in view"
-    return (
-        f"Its error is below the mean colour’s in {better.sum()} of {counted(len(better), unit)} that no training "
-        f"saw{f'; {blocks}, it is {share}' if shown > 0 else ''}."
-    )
+def _won(errors: HeldOutErrors, constant: HeldOutErrors, shown: float, unit: str) -> str:
+    better, ratio = _better(errors, constant), errors.error.mean / constant.error.mean
+    won = f"Its error is below the mean colour’s in {better.sum()} of {counted(len(better), unit)} that no training saw"
+    if not 0 < ratio < 1 or shown == 0:
+        return f"{won}."
+    cut = f"{_share(shown)} that of one colour" if shown < 1 else "not below that of one colour"
+    blocks = f"over blocks of {BLOCK} × {BLOCK} pixels and without light above white, such as lamps in view, {cut}"
+    return f"{won}; over all pixels it is {_share(ratio)} that error, {blocks}."
 
 
 def _since_start(error: float, start: float) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -34,8 +35,14 @@ TALL, WIDE = 0.88, 0.6
 SMALL = 0.1
 """What is shorter than this share of the room's height in two directions stands for nothing by itself."""
 
+SHEET = 0.01
+"""What is thinner than this share of the room's height is a part of something, such as the door of a cupboard."""
+
 FLOATS = 0.08
 """What touches nothing belongs to what stands nearer than this share of the room's height."""
+
+WITHIN = 0.5
+"""What has this share of its box within the box of another one of the same name is part of it, as a cushion is."""
 
 BUILT_IN, REACHES = 0.1, 0.02
 """What shares the first part of its surface with walls, or reaches by the second part of the room beyond its sides, is
@@ -77,6 +84,7 @@ def find_things(pieces: Pieces, surfaces: Surfaces, room: Room, objects: Mapping
         return []
     group = _joined(pieces, group, room, cell)
     group = _with_floating(pieces, group, room, cell)
+    group = _of_one_name(pieces, group, surfaces, room, names)
     built_in = _built_in(pieces, group, room, cell)
     things = []
     for number in range(int(group.max()) + 1):
@@ -146,6 +154,21 @@ def _with_floating(pieces: Pieces, group: Labels, room: Room, cell: float) -> La
     return _merged(group, np.array(joined, np.int64).reshape(-1, 2))
 
 
+def _of_one_name(pieces: Pieces, group: Labels, surfaces: Surfaces, room: Room, names: list[str]) -> Labels:
+    """Groups joined that stand, have one name, and of which one is mostly within the box of the other, (N,)."""
+    low, high = _bounds(pieces, group)
+    size = np.maximum(high - low, 1e-9)
+    stands = np.flatnonzero(_stand(low, room))
+    named = {number: _name(np.flatnonzero(group == number), pieces, surfaces, names) for number in stands}
+    pairs = []
+    for one, other in combinations(stands, 2):
+        if named[one] == named[other]:
+            shared = np.maximum(np.minimum(high[one], high[other]) - np.maximum(low[one], low[other]), 0)
+            if (shared / np.minimum(size[one], size[other])).prod() > WITHIN:
+                pairs.append((one, other))
+    return _merged(group, np.array(pairs, np.int64).reshape(-1, 2))
+
+
 def _built_in(pieces: Pieces, group: Labels, room: Room, cell: float) -> NDArray[np.bool_]:
     """Which groups share much of their surface with the room, above the floor, or reach into its walls, (T,)."""
     count, above = int(group.max()) + 1, room.floor + 2 * STANDS * room.height
@@ -189,7 +212,7 @@ def _thing(
     hangs = room.has_ceiling and high[2] > room.high[2] - STANDS * room.height and not stands
     inside = ((middle > room.low) & (middle < room.high)).all()
     large = (size[:2] > WIDE * room.size[:2]).any() or size[2] > TALL * room.height
-    small = np.sort(size)[1] < SMALL * room.height
+    small = np.sort(size)[1] < SMALL * room.height or size.min() < SHEET * room.height
     if not inside or large or small or not (stands or (hangs and emits)):
         return None
     return Thing(_name(members, pieces, surfaces, names), members, low, high, emits, bool(hangs))

@@ -14,7 +14,7 @@ _FURNITURE = re.compile(
     "pot|ottoman|piano|basket|ball|bear|dresser|drawer|fridge|pouf|cactus|bottle|bowl|cushion"
 )
 
-_NUMBER_AT_END = re.compile(r"[\W_]*\d+$")
+_NUMBERS_AT_END = re.compile(r"([\W_]*\d+)+$")
 _NOT_OF_A_NAME = re.compile(r"[^0-9a-z]+")
 
 
@@ -30,5 +30,5 @@ def is_furniture(name: str) -> bool:
 
 def group_name(name: str) -> str:
     """A name for a group: small letters and hyphens, without numbers at its end."""
-    small = _NUMBER_AT_END.sub("", re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name)).lower()
+    small = _NUMBERS_AT_END.sub("", re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name)).lower()
     return _NOT_OF_A_NAME.sub("-", small).strip("-")[:40] or "object"

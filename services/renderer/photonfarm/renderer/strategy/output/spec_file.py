@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -50,18 +50,51 @@ def put(text: str, settings: SpecTables, *, where: str) -> str:
     plain = text.removeprefix(BYTE_ORDER_MARK)
     mark = text[: len(text) - len(plain)]
     try:
-        document = tomlkit.parse(plain)
+        tomlkit.parse(plain)
+        for name, entries in settings.items():
+            part = _part_of(plain, name)
+            gap = "\n" if not plain[part].strip() and plain[: part.start].strip() else ""
+            plain = plain[: part.start] + gap + _put_table(plain[part], name, entries) + plain[part.stop :]
     except TOMLKitError as error:
         raise SpecError(f"{where}: is not valid TOML: {error}") from error
-    for name, entries in settings.items():
-        if name not in document:
-            document[name] = tomlkit.table()
-        table = cast(tomlkit.items.AbstractTable, document[name])
-        body = table.value.body  # new keys go before the comments at its end, which belong to what follows
-        place = max((i + 1 for i, (key, _) in enumerate(body) if key is not None), default=0)
-        comments, body[place:] = body[place:], []
-        for key, value in entries.items():
-            table[key] = value
-        body += comments
-    changed = tomlkit.dumps(document)
-    return mark + (re.sub(r"(?<!\r)\n", "\r\n", changed) if "\r\n" in plain else changed)
+    return mark + (re.sub(r"(?<!\r)\n", "\r\n", plain) if "\r\n" in text else plain)
+
+
+def _part_of(text: str, name: str) -> slice:
+    """The part of a document that holds a table, or its end.
+
+    tomlkit reads this part alone, as it moves comments in documents in which [[objects]] and [[lights]] alternate.
+    """
+    tables = list(_tables(text))
+    begins = [at for at, _ in tables] + [len(text)]
+    if name in tomlkit.parse(text[: begins[0]]):
+        return slice(0, begins[0])
+    own = [number for number, (_, key) in enumerate(tables) if key == name]
+    if not own:
+        return slice(len(text), len(text))
+    return slice(begins[own[0]], begins[own[-1] + 1])
+
+
+def _tables(text: str) -> Iterator[tuple[int, str]]:
+    """Where each table of a document begins, and the first key of its header."""
+    for header in re.finditer(r"^[ \t]*\[.*$", text, re.MULTILINE):
+        try:  # what stands in a list or a string of several lines is no header
+            tomlkit.parse(text[: header.start()])
+            (key,) = tomlkit.parse(header.group())
+        except (TOMLKitError, ValueError):
+            continue
+        yield header.start(), key
+
+
+def _put_table(text: str, name: str, entries: Mapping[str, int | float | dict[str, Any]]) -> str:
+    """The part of a document that holds a table, with new entries.
+
+    They come before the comments that end it, as those belong to what follows.
+    """
+    own = re.sub(r"(^[ \t\r]*(#.*)?(\n|\Z))*\Z", "", text, flags=re.MULTILINE)
+    document = tomlkit.parse(own)
+    if name not in document:
+        document[name] = tomlkit.table()
+    cast(tomlkit.items.AbstractTable, document[name]).update(entries)
+    written = tomlkit.dumps(document)
+    return written.rstrip("\r\n") + "\n" + text[len(own) :]

@@ -1,3 +1,4 @@
+import importlib
 import os
 import re
 import subprocess
@@ -63,3 +64,17 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
     monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
     monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
     return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: an empty one, without a Redis, and with modules of its own."""
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
+    monkeypatch.delenv("PHOTONFARM_SCENES", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    sys.modules.pop("mine", None)
+    importlib.invalidate_caches()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"

@@ -74,17 +74,15 @@ def test_status_with_a_redis_loads_neither_rq_nor_what_only_shards_need(
     assert (HEAVY | {"rq", "awscrt"}).isdisjoint(json.loads(done.stderr.splitlines()[-1]))
 
 
-def test_numpy_is_loaded_without_threads_and_all_is_as_before_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_garbage_is_collected_again_after_loading() -> None:
     code = """
-import gc, os, sys
+import gc
 from photonfarm.shared.cli.options import StorePlace
 StorePlace().convert("store", None, None)
-threads = len(os.listdir("/proc/self/task"))
-print("numpy" in sys.modules, threads, os.environ.get("OPENBLAS_NUM_THREADS"), gc.isenabled())
+print(gc.isenabled(), gc.get_freeze_count() > 0)
 """
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "1", "None", "True"]
+    assert done.stdout.split() == ["True", "True"]
 
 
 @pytest.mark.usefixtures("hears_ctrl_c")

@@ -63,8 +63,8 @@ def trained(scene: SceneStore, folder: Path) -> Path:
     (folder / "views").mkdir(parents=True)
     records = [
         {"kind": "validation", "step": step, "error": 1 / (step + 1), "standard_error": 0.1 / (step + 1),
-         "held_out": 2, "samples": 6, "seconds": {"train": float(step)}}
-        for step in (0, 50, 100)
+         "held_out": held_out, "samples": 6, "seconds": {"train": float(step)}}
+        for step, held_out in ((0, 1), (50, 2), (100, 2))
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
     (folder / "settings.json").write_text('{"max_steps": 200}')
@@ -192,6 +192,7 @@ def test_points_and_photons_are_those_of_the_sample(server: PageServer, scene: S
 def test_curves_and_predictions_are_those_of_the_run(server: PageServer, scene: SceneStore) -> None:
     (found,) = document(server, "/api/curves")
     assert [point[:3] for point in found["validations"]] == [[0, 0.0, 1.0], [50, 50.0, 1 / 51], [100, 100.0, 1 / 101]]
+    assert [point[5] for point in found["validations"]] == [1, 2, 2]
     assert (found["steps"], found["rows"], found["scene_id"]) == ([50, 100], [0, 1], scene.scene_id)
     assert picture(server, "/run/0/50.png")[0, 0].tolist() == [50, 90, 20]
 
@@ -326,7 +327,11 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             page.wait_for("document.querySelectorAll('.wall img').length === 6")
             page.wait_for(pictures_there)
             assert page.value("document.querySelectorAll('svg.plot circle').length") >= 12
-            assert run.name in page.value("document.body.innerText")
+            said = page.value("document.body.innerText")
+            assert f"{run.name}: 0.00990 at step 100, on 2 held-out samples" in said
+            assert "hollow ones were measured on fewer held-out samples" in " ".join(said.split())
+            told = "[...document.querySelectorAll('circle.hollow')].map((point) => point.textContent)"
+            assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out sample"], "by steps and by seconds"
             assert page.value("document.documentElement.scrollWidth") <= width
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")

@@ -109,7 +109,7 @@ class FarmPages:
 def _curves(run: RunFolder) -> dict[str, Any]:
     records, steps = list(run.records), _steps(run.folder)  # a copy, as another thread may add some
     validations = [
-        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
+        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"], r["held_out"]]
         for r in records
         if r.get("kind") == "validation"
     ]

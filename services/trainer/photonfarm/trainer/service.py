@@ -124,9 +124,13 @@ def _lead(
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
-        progress = RunProgress(settings.max_steps, settings.batch)
+        progress, begun = RunProgress(settings.max_steps, settings.batch), False
 
         def drawn(draws: int, samples: int) -> None:
+            nonlocal begun
+            if draws and not begun:
+                log(f"continues at step {draws // settings.batch} of run {folder}")
+            begun = True
             progress.drawn(draws, samples)
             on_draws(draws, samples)
 

@@ -23,9 +23,6 @@ if sys.platform == "linux":
 os.execv(sys.argv[2], sys.argv[2:])
 """
 
-_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
-"""The variable that numpy's wheels read when they are loaded."""
-
 
 def tied(command: Sequence[str]) -> list[str]:
     """The command, wrapped so that on Linux it gets SIGTERM when this process ends; the main thread must start it."""
@@ -51,14 +48,12 @@ def ended_by_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Load a verb's packages within the block, for a third less of its processor time; for once in a process.
+    """Load a verb's packages within the block, for less processor time; for once in a process.
 
     Garbage is not looked for meanwhile, and never among what there is then: loading makes hardly any, and what is
-    loaded stays. Numpy is loaded without the threads of its matrix products, which turn while they wait for work: we
-    have no use for them, and torch has its own. Our environment is afterwards as before.
+    loaded stays.
     """
-    before, collects = os.environ.get(_BLAS_THREADS), gc.isenabled()
-    os.environ[_BLAS_THREADS] = before or "1"
+    collects = gc.isenabled()
     gc.disable()
     try:
         yield
@@ -66,8 +61,6 @@ def loading() -> Iterator[None]:
         gc.freeze()
         if collects:
             gc.enable()
-        if before is None:
-            del os.environ[_BLAS_THREADS]
 
 
 @contextmanager

@@ -70,9 +70,14 @@ class TrainingProgress:
     @property
     def line(self) -> str:
         """All of it in words."""
-        steps = f"{self.step}/{self.steps}" if self.steps else str(self.step)
+        steps = counted(self.step, self.steps) if self.steps else str(self.step)
         ended = f", ended ({self.ended})" if self.ended else ""
         return f"training {self.run}: step {steps}{self.note}{ended}"
+
+
+def counted(step: int, steps: int) -> str:
+    """How many of the wanted steps are done; a run that is asked for fewer than it has keeps those that it has."""
+    return f"{step}/{steps}" if step <= steps else f"{step} ({steps} wanted)"
 
 
 class RunFolder:

@@ -6,7 +6,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import click
 import pytest
+
+from photonfarm.shared.cli.main import umbrella
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -53,6 +56,14 @@ def small_room_in() -> Callable[[Path], Path]:
 def small_room(small_room_in: Callable[[Path], Path], tmp_path: Path) -> Path:
     """The spec of the small room, in an empty folder."""
     return small_room_in(tmp_path)
+
+
+@pytest.fixture
+def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
+    """The command line, which does nothing but parse, and asks for no file. Raises UsageError."""
+    monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
+    monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
+    return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)
 
 
 @pytest.fixture

@@ -258,6 +258,8 @@ def test_a_service_that_is_stopped_while_it_waits_for_a_scene_has_done_what_it_w
     monkeypatch.setattr(service, "_only_scene", signalled)
     service.run(None, tmp_path / "store", run, "small", {}, log=told.append, on_record=told.append)
     assert any("no scene" in line for line in told)
+    with pytest.raises(IncompleteError):  # for whom "done" would mean that nobody need start it again
+        service.run(None, tmp_path / "store", run, "small", {}, until_complete=True, log=told.append)
 
 
 def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:

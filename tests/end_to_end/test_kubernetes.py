@@ -156,7 +156,7 @@ def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, pa
     (renderer,) = found["Deployment", "photonfarm-renderer"]["spec"]["template"]["spec"]["containers"]
     assert renderer["resources"]["limits"] == {"memory": "9Gi", "nvidia.com/gpu": 1}
     variables = {variable["name"]: variable["value"] for variable in renderer["env"]}
-    assert variables["PHOTONFARM_VARIANT"] == "cuda_ad_rgb"
+    assert variables["PHOTONFARM_DEVICE"] == "cuda"
     assert "graphics" in variables["NVIDIA_DRIVER_CAPABILITIES"]
     ((_, job),) = [item for item in found.items() if item[0][0] == "Job"]
     spec = job["spec"]["template"]["spec"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from photonfarm.shared.cli.options import json_option, names_redis, redis_option, request_options, store_option
+from photonfarm.shared.cli.options import (
+    device_option,
+    json_option,
+    names_redis,
+    redis_option,
+    request_options,
+    store_option,
+)
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
@@ -206,7 +214,9 @@ def redis_server(port: int) -> None:
 @click.argument("spec")
 @request_options
 @store_option
-@click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
+@click.option("--workers", type=click.IntRange(1),
+              help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]")  # fmt: skip
+@device_option
 @click.option(
     "--run",
     type=click.Path(path_type=Path, file_okay=False),
@@ -235,7 +245,8 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
     from photonfarm.shared.cli.show_up import FarmTalk
-    from photonfarm.shared.farm.up import run_farm, trainer_arguments
+    from photonfarm.shared.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, of_workers
+    from photonfarm.shared.farm.up import WORKERS, run_farm, trainer_arguments
 
     try:
         _check_arguments(["work", "--until-complete"], "photonfarm-renderer")
@@ -243,7 +254,9 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
             trainer = {name: options[name] for name in ("run", "train_steps")}
             arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
             _check_arguments(arguments, "photonfarm-trainer", "--train-steps 0 renders only")
-        run_farm(spec, store, request, FarmTalk(), **options)
+        devices = of_workers(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
+        options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
+        run_farm(spec, store, request, FarmTalk(), devices=devices, **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

@@ -122,6 +122,27 @@ def _refuse_password(url: str) -> None:
         )
 
 
+def device_option(command: Command) -> Command:
+    """`--device`, what renders; the verb and its child processes find it in the environment."""
+    from photonfarm.shared.farm.devices import AUTO, DEVICE_VARIABLE
+
+    return click.option(
+        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True, expose_value=False,
+        metavar="auto|cpu|cuda[:N]", callback=_hand_on_device,
+        help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
+        "where there is one that can.",
+    )(command)  # fmt: skip
+
+
+def _hand_on_device(ctx: click.Context, param: click.Parameter, name: str) -> None:
+    from photonfarm.shared.farm.devices import DEVICE_VARIABLE, NAMES
+
+    if not NAMES.fullmatch(name):
+        raise click.BadParameter(f"{name!r} is none of auto, cpu, cuda and cuda:N.")
+    if ctx.get_parameter_source(param.name or "") is not ParameterSource.DEFAULT:
+        os.environ[DEVICE_VARIABLE] = name
+
+
 def json_option(command: Command) -> Command:
     """`--json`: machine-readable results."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)

@@ -5,7 +5,7 @@
     ├── StoreError (OSError)       exit 4   a store, or other data, that cannot be read or written
     │   └── CorruptError           exit 4   stored bytes that are not what was committed
     ├── QueueError (OSError)       exit 5   no Redis, or one that refuses us
-    ├── BackendError (RuntimeError) exit 6  this machine cannot render, or import: Mitsuba, LLVM, scene files, Blender
+    ├── BackendError (RuntimeError) exit 6  this machine cannot render or import: Mitsuba, LLVM, card, scenes, Blender
     ├── SchedulerError (OSError)   exit 9   no SLURM, or one that refuses a job
     └── IncompleteError            exit 7   work that ended before it was done, samples that are not complete
         └── DivergedError          exit 8   training whose loss is no longer finite (in the trainer's `learner`)

@@ -15,6 +15,7 @@ import numpy as np
 from photonfarm.renderer.check import cameras
 from photonfarm.renderer.check.cameras import Cameras
 from photonfarm.renderer.measure import exposure, sample_costs
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture, display
 from photonfarm.shared.core.records import F32, BasePointCloud
@@ -129,9 +130,9 @@ def _configure(scene: LoadedScene, cloud: BasePointCloud, modification: Modifica
 
 
 def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    begun = time.process_time()
+    begun = backend.work_s()
     result = work()
-    return time.process_time() - begun, result
+    return backend.work_s() - begun, result
 
 
 def _costs(spec: SceneSpec, film: Film, half_spp: int, measured: Sequence[_Measured]) -> SampleCosts:

@@ -11,13 +11,14 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.cli.options import device_option, json_option, redis_option, store_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 
 
 @click.command()
 @store_option
 @redis_option
+@device_option
 @json_option
 def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Try each part on this machine, and say what to do about what does not work."""
@@ -34,6 +35,7 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
 @click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
               help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
+@device_option
 @ended_by_ctrl_c()
 def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
     """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
@@ -103,6 +105,7 @@ def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:
     metavar="SECONDS", help="End a job that takes longer; it is started up to five times. A worker that was "
     "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
 )  # fmt: skip
+@device_option
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
 def work(
@@ -114,7 +117,7 @@ def work(
     check: bool,
     **settings: Any,
 ) -> None:
-    """Render queued jobs into the store, on one core, until asked to stop; start one per core.
+    """Render queued jobs into the store, on one core or one card, until asked to stop; start one for each of them.
 
     With --share the store alone says what is missing; several workers may then render the same job near the end, and
     the first commit stays.

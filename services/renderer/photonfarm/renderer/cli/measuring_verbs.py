@@ -8,7 +8,7 @@ from functools import partial
 
 import click
 
-from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.cli.options import device_option, json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 from photonfarm.shared.core.waiting import WorkLog, waiting
 
@@ -20,6 +20,7 @@ from photonfarm.shared.core.waiting import WorkLog, waiting
 @click.option("--seconds", type=click.FloatRange(0, min_open=True),
               help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
@@ -47,6 +48,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
               help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
 @click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
               help="Random configurations to render, a view of each.")  # fmt: skip
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
@@ -70,6 +72,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 @click.command()
 @click.argument("spec")
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
@@ -107,6 +110,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:

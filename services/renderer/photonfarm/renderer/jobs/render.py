@@ -19,6 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.scene import backend
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
 from photonfarm.shared.core.keys import Key, seed_of, view_key
 from photonfarm.shared.core.records import (
@@ -95,8 +96,7 @@ def _ignored(phase: str, done: int, total: int) -> None:
 
 
 def load_scene(spec: SceneSpec) -> SceneRenderer:
-    """The scene of a spec, loaded into Mitsuba with a thread pool of one."""
-    from photonfarm.renderer.scene import backend
+    """The scene of a spec, loaded into Mitsuba on this process's device, with a thread pool of one."""
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
     backend.load(threads=1)
@@ -224,6 +224,8 @@ class ShardRenderer:
             redrawn=redrawn,
             worker=self._worker,
             versions=versions(),
+            device=backend.device().name,
+            driver=backend.device().driver,
         )
 
     def _scene(self, scene_id: str) -> _Loaded:

@@ -207,9 +207,9 @@ def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: 
 
 
 def _timed(work: Callable[[], T]) -> tuple[float, T]:
-    begun = time.process_time()
+    begun = backend.work_s()
     result = work()
-    return time.process_time() - begun, result
+    return backend.work_s() - begun, result
 
 
 def _median(values: list[float]) -> float:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.worker.settings import LOG_FORMAT, WorkerSettings
 from photonfarm.renderer.worker.supervisor import Supervisor
 from photonfarm.shared import queue
@@ -48,8 +49,10 @@ def run_worker(
     number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a second one at once.
     Further `settings` are those of WorkerSettings; `scene_id` may also be the beginning of an id, or a scene's name.
     Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves another store,
-    StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    StoreError, BackendError (before it waits for anything, if the device that should render is not there), and
+    IncompleteError if jobs have failed and nothing else is left to do.
     """
+    backend.device()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
     part = Share.parse(share) if isinstance(share, str) else share
     settings |= {"redis_url": redis_url, "share": part, "name": name or _default_name()}

@@ -49,6 +49,8 @@ class Figures:
     redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
     worker: str
     versions: Mapping[str, str]
+    device: str = markers.CPU  # what rendered; otherwise the name of a card
+    driver: str = ""  # the version of the card's driver
 
 
 Clock = Callable[[], datetime]

@@ -61,6 +61,7 @@ def small_room(small_room_in: Callable[[Path], Path], tmp_path: Path) -> Path:
 @pytest.fixture
 def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
     """The command line, which does nothing but parse, and asks for no file. Raises UsageError."""
+    monkeypatch.setenv("PHOTONFARM_DEVICE", "cpu")  # `--device` sets it, and the test's end restores it
     monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
     monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
     return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)

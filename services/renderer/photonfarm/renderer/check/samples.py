@@ -5,7 +5,6 @@ They are the first that `photonfarm submit` plans by default, a view of each, on
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

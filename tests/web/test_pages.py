@@ -25,6 +25,7 @@ from PIL import Image, PngImagePlugin
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.training import PROGRESS, WAITS
 from photonfarm.shared.farm.watch import FarmWatch
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import relative_variance
@@ -137,6 +138,15 @@ def test_the_state_is_that_of_store_and_run(server: PageServer, scene: SceneStor
     assert (found["queue"], found["failed_before"]) == (None, [])
     (training,) = found["trainings"]
     assert (training["run"], training["step"], training["steps"]) == (run.name, 100, 200)
+
+
+def test_what_training_does_is_said_once(scene: SceneStore, tmp_path: Path) -> None:
+    said = {"at_s": time.time(), "step": 100, "phase": WAITS, "left_s": 90.0}
+    (trained(scene, tmp_path / "run") / PROGRESS).write_text(json.dumps(said))
+    with served(Store(scene.folder.parent.parent), [tmp_path / "run"]) as serving:
+        (training,) = document(serving, "/api/state")["trainings"]
+    figures = ", 90 s left, held-out error 0.00990 ± 0.00099 on 2 samples"
+    assert (training["phase"], training["figures"]) == (WAITS, figures)
 
 
 def test_the_wall_has_what_landed_last_and_the_maps_where_it_was_seen_from(

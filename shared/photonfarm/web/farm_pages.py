@@ -52,7 +52,7 @@ class FarmPages:
             "workers": [{"name": name, **asdict(each)} for name, each in sorted(view.activities.items())],
             "waits": [str(wait) for wait in view.waits],
             "failed_before": [{"cause": cause.cause, "jobs": len(cause.jobs)} for cause in view.queue.kept],
-            "trainings": [asdict(training) | {"note": training.note} for training in view.trainings],
+            "trainings": [asdict(training) | {"figures": training.figures} for training in view.trainings],
         }
 
     # --------------------------------------------------------------------------------------------------------- samples

@@ -1,6 +1,7 @@
 """What `photonfarm up` refuses before it begins, and what it says of how far it is."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -55,11 +56,11 @@ def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tm
 
 def test_the_log_of_another_run_is_not_counted_where_nothing_is_trained(store: Store, tmp_path: Path) -> None:
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=3), shard_rows=4).scene_id)
-    record = {"kind": "validation", "step": 7, "error": 0.5, "standard_error": 0.1, "held_out": 3}
+    record = {"kind": "validation", "step": 7, "error": 0.5, "standard_error": 0.1, "held_out": 1}
     (tmp_path / "metrics.jsonl").write_text(json.dumps(record) + "\n")
     assert up._Farm(scene, tmp_path, 0).look() == up.FarmProgress((0, 3), (0, 0), 0, 0, "")
     trained = up._Farm(scene, tmp_path, 10).look()
-    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 3 samples")
+    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 1 sample")
 
 
 def test_a_run_that_has_more_steps_than_are_wanted_says_so(store: Store, tmp_path: Path) -> None:
@@ -85,6 +86,23 @@ def test_the_last_line_is_the_complete_one_also_where_a_process_fails(
     finally:
         worker.communicate(b"\n")
     assert capsys.readouterr().err.split(maxsplit=2)[2] == "samples 6/6\n"
+
+
+def test_what_is_in_hand_is_not_counted_again_at_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report of what is in hand comes before or after its commit; counted twice it halves the time left."""
+    now, lines = [0.0], list[str]()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    talk = FarmTalk()
+    monkeypatch.setattr(talk, "say", lines.append)
+    found = up.FarmProgress((0, 100), (0, 0), 0, 0, "")
+    with talk.progress(0) as show:
+        for second in range(1, 41):  # a sample per second, in jobs of four
+            now[0] = float(second)
+            committed = second // 4 * 4
+            in_hand = 4 if second % 4 == 0 else second % 4 if second % 4 > 1 else 0
+            show(replace(found, samples=(committed, 100), in_hand=in_hand), False)
+    (left,) = re.findall(r", (\d+) s left", lines[-1])
+    assert 50 <= int(left) <= 70
 
 
 def test_a_process_that_was_killed_is_told_apart_from_one_that_failed() -> None:

@@ -48,6 +48,7 @@ class FarmTalk:
             first = samples if found.samples[0] < found.samples[1] else passes  # what is in hand is of these
             for bar, (committed, planned) in ((samples, found.samples), (passes, found.passes)):
                 done = min(committed + found.in_hand * (bar == first), planned)
+                done = max(done, int(bars.tasks[bar].completed))  # rich counts what falls and rises again twice
                 bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
             bars.update(training, completed=found.step, total=max(found.step, steps))
             note = f"training{found.note}" if found.note else ""
@@ -80,4 +81,4 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
 def _bars() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S)
+    return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S, get_time=time.monotonic)

@@ -132,7 +132,8 @@ def run_farm(
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
-            talk.say(f"references: {added.planned} further passes planned, {added.planned_before} planned before")
+            there = f"passes that the samples have, or that were planned before: {added.planned_before}"
+            talk.say(f"references: {added.planned} further passes planned; {there}")
         opened = Store(store)
         scene = opened.scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows

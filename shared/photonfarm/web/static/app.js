@@ -74,7 +74,7 @@ function progress(state) {
       h("b", {}, run.step > run.steps ? count(run.step) : `${count(run.step)} of ${count(run.steps)}`),
       run.step > run.steps ? ` steps (${count(run.steps)} wanted)` : " steps")),
     track(Math.min(run.step, run.steps), run.steps),
-    h("div", { class: "figure" }, (run.ended ? `ended (${run.ended})` : run.phase ?? "not at work") + run.note)));
+    h("div", { class: "figure" }, (run.ended ? `ended (${run.ended})` : run.phase ?? "not at work") + run.figures)));
   const shown = rates[current]?.some((rate) => rate) ? [spark(rates[current], "samples per second"),
     h("p", { class: "note" }, "Throughput since this page was opened.")] : [];
   return card("half", "Progress", null, ...(scenes.length ? scenes : [h("p", { class: "note" }, "No scene is planned yet; ",

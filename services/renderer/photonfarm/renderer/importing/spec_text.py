@@ -60,8 +60,8 @@ class SpecText:
         )
         if self.free_space:
             self._say(
-                "After a change of [view] or of a box, run `photonfarm scene free-space SPEC --write` again, which "
-                "measures where cameras may stand."
+                "After a change of origin, look_at or near, or of a group's shapes or at, run "
+                "`photonfarm scene free-space SPEC --write` again, which measures where cameras may stand."
             )
         lengths = [self._number(length) for length in size]
         self._say(f"The room is about {lengths[0]} × {lengths[1]}, and {lengths[2]} high.")

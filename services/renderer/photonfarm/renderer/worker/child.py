@@ -136,7 +136,9 @@ class RenderWorker(QueueWorker):
         Raises StoreError if the store is gone: an empty folder in its place would seem to miss nothing.
         """
         self._store.check()
-        if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
+        only = self._settings.scene_id
+        found = queue.look(self._store, self.connection, scene_id=only, every_s=self._settings.idle_s)
+        if found == "queued" or (found == "waits" and not self._not_here):  # what is left may be nothing for this one
             return False
         self._store.sweep()
         if not self._settings.until_complete:

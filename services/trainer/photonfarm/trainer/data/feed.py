@@ -19,6 +19,9 @@ from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
 
+LOOK_SHARE = 0.05
+"""The most of the time that looks at the store may take: at millions of samples they come less often."""
+
 
 class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
@@ -130,8 +133,9 @@ class Feed:
         due = self._clock()
         while True:
             if self._clock() >= due:
+                began = self._clock()
                 self._poll()
-                due = self._clock() + self._settings.poll_seconds
+                due = self._clock() + max(self._settings.poll_seconds, (self._clock() - began) / LOOK_SHARE)
             try:
                 rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
             except queue.Empty:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Literal
 
@@ -11,8 +11,6 @@ from torch import Tensor
 
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.networks.inputs import map_tensors
-
-AUTO = "auto"
 
 FREE_SHARE = 0.25
 """The share of a card's memory that stays free with "auto".
@@ -30,14 +28,15 @@ class ResidentSamples:
 
     def __init__(self, device: torch.device, limit_gb: float | Literal["auto"]) -> None:
         """Keep up to `limit_gb` 10⁹ bytes; by "auto" none on a CPU, and on CUDA while `FREE_SHARE` of it is free."""
-        self._device, self._limit_gb = device, limit_gb
+        self._device = device
+        self._limit_bytes = None if limit_gb == "auto" else limit_gb * 1e9  # None: "auto"
         self._kept: dict[int, TrainingBatch] = {}  # batches of one sample, by row
         self._bytes = 0
 
     @property
     def keeps_any(self) -> bool:
         """Whether there is a limit above 0."""
-        return self._device.type == "cuda" if self._limit_gb == AUTO else self._limit_gb > 0
+        return self._device.type == "cuda" if self._limit_bytes is None else self._limit_bytes > 0
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -67,8 +66,8 @@ class ResidentSamples:
         return _joined([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
 
     def _has_room(self, needed: int) -> bool:
-        if self._limit_gb != AUTO:
-            return self._bytes + needed <= self._limit_gb * 1e9
+        if self._limit_bytes is not None:
+            return self._bytes + needed <= self._limit_bytes
         free, total = torch.cuda.mem_get_info(self._device)
         return free - needed >= FREE_SHARE * total
 
@@ -86,7 +85,7 @@ def _one(batch: TrainingBatch, place: int) -> TrainingBatch:
     return TrainingBatch((batch.rows[place],), (batch.units[place],), inputs, batch.target[place : place + 1])
 
 
-def _changed(change: Any, sample: TrainingBatch) -> TrainingBatch:
+def _changed(change: Callable[[Tensor], Tensor], sample: TrainingBatch) -> TrainingBatch:
     """The sample with `change` applied to its tensors."""
     return TrainingBatch(sample.rows, sample.units, map_tensors(change, sample.inputs), change(sample.target))
 

@@ -92,7 +92,7 @@ class Network(nn.Module):
         return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
 
     def synthesise(self, channels: Tensor) -> Tensor:
-        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, as convolutions of CPUs and tensor cores take them."""
+        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, as CPUs and tensor cores take them."""
         round_convolutions(channels.device, self.image_synthesis.precision)
         return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 

@@ -40,9 +40,17 @@ class DivergedError(IncompleteError):
 class KnownScene(Protocol):
     """What of a scene is known before any sample; a `Feed` knows it."""
 
-    spec: SceneSpec
-    geometry: Geometry
-    cloud: BasePointCloud
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    @property
+    def geometry(self) -> Geometry:
+        """Its triangles."""
+
+    @property
+    def cloud(self) -> BasePointCloud:
+        """Its base cloud."""
 
 
 class Learner:

@@ -102,9 +102,9 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
         watch.turn("start")
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
         resident = ResidentSamples(hooks.group.device(settings.device), settings.resident_gb)
-        with Feed(source, settings, hooks.clock, resident=resident) as feed:
-            with named_in_errors(**own), compiling(settings.compile):
-                return Session(feed, settings, run, watch, hooks).run()
+        fed = Feed(source, settings, hooks.clock, resident=resident)
+        with fed as feed, named_in_errors(**own), compiling(settings.compile):
+            return Session(feed, settings, run, watch, hooks).run()
 
 
 class Session:

@@ -14,6 +14,7 @@ from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
 from photonfarm.trainer.dry_run.cards import UTILISATION, on_cards
 from photonfarm.trainer.dry_run.dry_run import DryRun, rehearse
+from photonfarm.trainer.dry_run.live_memory import LiveMemory
 from photonfarm.trainer.dry_run.made_up import MadeUpScene
 from photonfarm.trainer.dry_run.printed import document, text
 from photonfarm.trainer.networks import ARCHITECTURES, image_of
@@ -71,6 +72,21 @@ def test_a_step_has_three_times_the_work_of_an_image() -> None:
         assert run.step_flops == 4 * run.work.flops
 
 
+def test_memory_counts_what_lives_at_once_and_not_what_is_left_out() -> None:
+    given = torch.zeros(1000)
+    with LiveMemory(but_for=[torch.Size([7])]) as memory:
+        one = given + 1  # 4000 bytes
+        assert one.view(10, 100).sum() == 1000  # 4 more, freed at once
+        two = torch.cat([one, one])  # 8000
+        del one
+        three = two.double()  # 16 000 while two is there
+        del two
+        torch.zeros(7).add_(1)
+        assert memory.peak_bytes == 24_000
+        assert three.sum() == 2000
+    assert 24_000 <= memory.peak_bytes < 24_100
+
+
 def test_memory_grows_with_pixels_batch_and_precision_and_the_state_is_five_times_the_weights() -> None:
     """Weights, gradients, Adam's two and the average; a count of steps for each tensor."""
     small, large = found(architecture="cnn"), found(32, architecture="cnn")
@@ -104,6 +120,7 @@ def test_hours_are_work_over_the_assumed_rate_and_cards_too_small_are_named() ->
     cards = {card.card: card for card in on_cards(3.6e21, 50e9)}
     assert cards["H100 SXM"].hours["bfloat16"] == pytest.approx(3.6e21 / (989e12 * UTILISATION["bfloat16"]) / 3600)
     assert cards["A100 SXM"].hours["float32"] == pytest.approx(3.6e21 / (19.5e12 * UTILISATION["float32"]) / 3600)
+    assert cards["RTX 4090"].hours["tf32"] == cards["RTX 4090"].hours["float32"]
     assert [card.card for card in cards.values() if not card.fits] == ["L4", "RTX 4090", "L40S"]
 
 

@@ -30,12 +30,13 @@ CARDS = (
     _card("H200 SXM", 141, 67, 495, 989),
 )
 
-UTILISATION: Mapping[Precision, float] = {"float32": 0.5, "tf32": 0.25, "bfloat16": 0.25}
+UTILISATION: Mapping[Precision, float] = {"float32": 0.5, "tf32": 0.35, "bfloat16": 0.25}
 """The assumed share of the peak rate that training reaches; none of it was measured on a card.
 
 Each of the U-Net's four levels has a quarter of the work. Outside, at 64 channels, a pixel has some 74 kFLOP a
 convolution for about 1 kB that is read and written in bfloat16, a quarter of what tensor cores of an H100 need to be
-busy; inside, convolutions are large enough. A narrower network, or a few small images, reaches less.
+busy; inside, convolutions are large enough. A narrower network, or a few small images, reaches less. No precision is
+taken to be slower than float32.
 """
 
 
@@ -46,17 +47,14 @@ class CardHours:
     card: str
     memory_gb: float
     fits: bool  # the estimated memory
-    hours: dict[str, float]  # of one card, by precision
+    hours: dict[Precision, float]  # of one card, by precision
 
 
 def on_cards(flops: float, needed_bytes: float) -> list[CardHours]:
     """The hours of each card for so many operations; `needed_bytes` is the memory of a step."""
-    return [
-        CardHours(
-            card.name,
-            card.memory_gb,
-            needed_bytes <= card.memory_gb * 1e9,
-            {name: flops / (rate * 1e12 * UTILISATION[name]) / 3600 for name, rate in card.tflops.items()},
-        )
-        for card in CARDS
-    ]
+    found = []
+    for card in CARDS:
+        rates = {name: 1e12 * peak * UTILISATION[name] for name, peak in card.tflops.items()}
+        hours = {name: flops / max(rate, rates["float32"]) / 3600 for name, rate in rates.items()}
+        found.append(CardHours(card.name, card.memory_gb, needed_bytes <= card.memory_gb * 1e9, hours))
+    return found

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
-from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights
+from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors
+from photonfarm.renderer.strategy.objective.purpose import Weigh
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
 
@@ -26,7 +27,7 @@ MOST_PAIRS = 32
 class _Record:
     """One candidate's measurements in one view."""
 
-    errors: list[float] = field(default_factory=list)  # relMSE of an image, by each pair
+    errors: list[float] = field(default_factory=list)  # of an image, by each pair
     times_s: list[float] = field(default_factory=list)
 
 
@@ -40,6 +41,7 @@ class Rounds:
         spp: int,
         seed: int,
         later: Mapping[Candidate, float],
+        weigh: Weigh,
         clock: Callable[[], float],
     ) -> None:
         self._views = views
@@ -47,6 +49,7 @@ class Rounds:
         self._spp = spp
         self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
         self._later = later
+        self._weigh = weigh
         self._clock = clock
         self._begun = clock()
         self.scouting_s = 0.0
@@ -62,7 +65,7 @@ class Rounds:
         turns = -(-SCOUTS // len(self._candidates))
         for view, render in enumerate(self._views):
             every = list(self._candidates) * turns
-            weights = view_weights([self._render(render, c, next(self._seeds[view])) for c in every])
+            weights = self._weigh([self._render(render, c, next(self._seeds[view])) for c in every])
             if weights is not None:
                 self.weights[view] = weights
                 for candidate in self._candidates:
@@ -122,14 +125,14 @@ class Rounds:
         return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
-        """The relMSE that counts, by pairs and views, (pairs, views)."""
+        """The error that counts, by pairs and views, (pairs, views)."""
         columns = []
         for view, record in self._records[candidate].items():
             columns.append(np.array(record.errors) - not_counted(self._shared[view])[: len(record.errors)])
         return np.stack(columns, axis=1)
 
     def shared(self) -> float:
-        """The uncounted relMSE of rare bright samples that all candidates share in an image."""
+        """The uncounted error of rare bright samples that all candidates share in an image."""
         return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
 
     def is_suspect(self, candidate: Candidate) -> bool:

@@ -50,6 +50,7 @@ def run(
     redis_url: str | None = None,
     *,
     scene_id: str | None = None,
+    until_complete: bool = False,
     log: Callable[[str], object],
     on_record: Callable[[dict[str, Any]], object] | None = None,
 ) -> None:
@@ -60,7 +61,8 @@ def run(
     this, and the other ranks train with it until it ends; all need the same folder. `log` takes sentences about the
     service, `on_record` each record of the run's log.
 
-    Raises IncompleteError if the time is over before there is anything to train on.
+    Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
+    signal stops it.
     """
     from photonfarm.trainer.data.store_source import StoreSource
     from photonfarm.trainer.runs.device import described
@@ -81,6 +83,8 @@ def run(
             scene_id = loaded.scene_id if loaded else scene_id
             beside = scene_folder(spec, loaded) if spec and loaded else None
             _lead(loaded, beside, scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
+        if until_complete and stop.is_set():
+            raise IncompleteError(f"{folder}: a signal stopped it; the same command continues it")
 
 
 def _lead(
@@ -123,9 +127,13 @@ def _lead(
         source, waited = StoreSource(store, scene_id), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
-        progress = RunProgress(settings.max_steps, settings.batch)
+        progress, begun = RunProgress(settings.max_steps, settings.batch), False
 
         def drawn(draws: int, samples: int) -> None:
+            nonlocal begun
+            if draws and not begun:
+                log(f"continues at step {draws // settings.batch} of run {folder}")
+            begun = True
             progress.drawn(draws, samples)
             on_draws(draws, samples)
 

@@ -8,9 +8,9 @@ from functools import partial
 
 import click
 
-from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.cli.options import device_option, json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import WorkLog, waiting
+from photonfarm.shared.core.waiting import WorkLog
 
 
 @click.command()
@@ -20,6 +20,7 @@ from photonfarm.shared.core.waiting import WorkLog, waiting
 @click.option("--seconds", type=click.FloatRange(0, min_open=True),
               help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
@@ -47,6 +48,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
               help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
 @click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
               help="Random configurations to render, a view of each.")  # fmt: skip
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
@@ -61,15 +63,16 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     backend.load(threads=1)
     from photonfarm.renderer.measure.exposure import propose
 
-    log = partial(click.echo, err=True)
-    with waiting(log, f"proposing an exposure for {loaded.name}"):
-        found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
+    with WorkLog(partial(click.echo, err=True)) as work:
+        work.begin(f"loading {loaded.name}")
+        found = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 
 @click.command()
 @click.argument("spec")
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
@@ -107,6 +110,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from photonfarm.renderer.jobs.render import versions
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.measurement import GRID, Measurement
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import make_key
@@ -35,13 +36,12 @@ def digest_here(*parts: str) -> str:
 
 
 def _machine() -> tuple[object, ...]:
-    """All that times depend on beside the scene and the code: processor, cores, variant, versions of the packages.
+    """All that times depend on beside the scene and the code: processor, cores, device, versions of the packages.
 
     The number of threads is not among them, as a pilot has one.
     """
-    import mitsuba
-
-    return _processor(), os.cpu_count(), mitsuba.variant(), sorted(versions().items())
+    device = backend.device()
+    return _processor(), os.cpu_count(), device.variant, device.name, sorted(versions().items())
 
 
 def _processor() -> str:

@@ -7,10 +7,10 @@ most rare bright samples are the same, and differences between candidates are du
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate
 from photonfarm.renderer.strategy.reasons import BLACK, reasons_for
@@ -46,7 +46,7 @@ def choose(
     seed: int = 0,
     keep: Sequence[Candidate] = (),
     later: Mapping[Candidate, float] | None = None,
-    clock: Callable[[], float] = time.process_time,
+    clock: Callable[[], float] = backend.work_s,
 ) -> Choice:
     """The candidate with the least error × time over some views; each of `renders` renders one view.
 

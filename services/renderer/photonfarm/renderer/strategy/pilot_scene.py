@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.sensor import AimedSensor
 from photonfarm.renderer.strategy.candidate import Candidate, Render
@@ -40,8 +40,8 @@ class PilotScene:
         return PilotScene(spec, None, LoadedScene(spec, self.loaded.scene))
 
     def clock(self) -> float:
-        """CPU seconds of this process without those of edits, which cost all candidates the same."""
-        return time.process_time() - self._editing_s
+        """The seconds of `backend.work_s` without those of edits, which cost all candidates the same."""
+        return backend.work_s() - self._editing_s
 
     def renders(self, count: int) -> list[Render]:
         """A function for each of some configurations; it renders one view of it."""
@@ -66,10 +66,10 @@ class PilotScene:
 
     def _apply(self, modification: Modification) -> None:
         if modification is not self._applied:
-            start = time.process_time()
+            start = backend.work_s()
             self.loaded.apply(modification)
             self._applied = modification
-            self._editing_s += time.process_time() - start
+            self._editing_s += backend.work_s() - start
 
 
 def _draw(spec: SceneSpec, count: int) -> Iterator[tuple[Modification, View]]:

@@ -18,7 +18,7 @@ def record(of: dict[str, Any]) -> None:
     """Print what people want to know of a record of a run's log, if anything."""
     if of["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in of["changes"].items())
-        click.echo(f"goes on from step {of['step']} with {changed}", err=True)
+        click.echo(f"settings changed at step {of['step']}: {changed}", err=True)
     if of["kind"] == "loss":
         click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
     if of["kind"] == "recovered":

@@ -111,6 +111,8 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     metavar="KEY=VALUE",
     help=f"Any setting, also those above, whose own options come first; may be repeated: {', '.join(KEYS)}.",
 )
+@click.option("--until-complete", is_flag=True,
+              help="End with exit code 7, not 0, if a signal stops it, so that schedulers start it again.")  # fmt: skip
 @click.option("--grid", is_flag=True, help="Search optimisers, rates and decays by short runs on a complete store.")
 @click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
@@ -120,8 +122,9 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
               help="With --dry-run: the side of images, instead of the spec's.")  # fmt: skip
 @json_option
 def train(
-    spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...], grid: bool,
-    summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool, **options: Any,
+    spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...],
+    until_complete: bool, grid: bool, summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool,
+    **options: Any,
 ) -> None:  # fmt: skip
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
 
@@ -149,4 +152,6 @@ def train(
     elif dry_run:
         show.dry_run(service.rehearse(spec, store, preset, changes, film), as_json)
     else:
-        service.run(spec, store, run, preset, changes, redis_url, log=log, on_record=show.record)
+        service.run(
+            spec, store, run, preset, changes, redis_url, until_complete=until_complete, log=log, on_record=show.record
+        )

@@ -10,14 +10,18 @@ from types import TracebackType
 from typing import Any, Self
 
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.hold_out import rows_held_out
+from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
 from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
+
+LOOK_SHARE = 0.05
+"""The most of the time that looks at the store may take: at millions of samples they come less often."""
 
 
 class Feed:
@@ -54,6 +58,8 @@ class Feed:
         self._arrived: list[tuple[int, bool]] = []
         self._complete = False
         self._plans: list[dict[str, Any]] = []
+        self._sides: set[bool] = set()  # whether samples so far are held out
+        self._units: set[Key] = set()  # what is held out as one, until some are and some are not
         self._here: set[int] = set()  # rows that are complete
         self._known: set[int] = set()  # rows that are or were complete
         self._error: BaseException | None = None
@@ -111,6 +117,11 @@ class Feed:
         with self._lock:
             return self._plans
 
+    def other_hold_out(self) -> float | None:
+        """A share that splits what has arrived, where the settings' one leaves one side empty; None if none does."""
+        with self._lock:
+            return enough(self._units, least=0.0)
+
     def _raise(self) -> None:
         if self._error is not None:
             raise self._error
@@ -128,8 +139,9 @@ class Feed:
         due = self._clock()
         while True:
             if self._clock() >= due:
+                began = self._clock()
                 self._poll()
-                due = self._clock() + self._settings.poll_seconds
+                due = self._clock() + max(self._settings.poll_seconds, (self._clock() - began) / LOOK_SHARE)
             try:
                 rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
             except queue.Empty:
@@ -147,9 +159,12 @@ class Feed:
             self._resident.forget(gone)
         self._here.update(rows)
         self._known.update(rows)
-        found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
+        units = units_of(self._source, rows)
+        held_out = are_held_out(units, self._settings.hold_out)
         with self._lock:
-            self._arrived.extend(found)
+            self._arrived.extend(zip(rows, held_out, strict=True))
+            self._sides.update(held_out)
+            self._units = set() if len(self._sides) > 1 else self._units.union(units)
             self._plans = list(self._source.plan_requests)
             self._complete = 0 < self._source.planned <= len(self._known)
         self._polled.set()

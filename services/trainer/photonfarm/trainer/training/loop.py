@@ -236,14 +236,19 @@ class Session:
         return bool(self._stream.held_out) and (self._step > 0 or self._stream.may_draw())
 
     def _check_split(self) -> None:
-        rule = f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.growth.rows)} samples planned"
+        """Raise SpecError, which names a share that would do, if all samples planned are on one side."""
+        if self._stream.held_out and self._stream.training_rows:
+            return
+        one = "configuration" if self._feed.spec.groups else "view"
+        fault = "all are held out, and none is left to train on"
         if not self._stream.held_out:
-            raise SpecError(
-                f"{rule} none is held out, and one is needed to validate on; raise it (--hold-out), or plan more "
-                "configurations"
-            )
-        if not self._stream.training_rows:
-            raise SpecError(f"{rule} all are held out, and none is left to train on; lower it, or plan more")
+            fault = "none is held out, and one is needed to validate on"
+        other = self._feed.other_hold_out()
+        remedy = f"plan more {one}s" if other is None else f"--hold-out {other:g} holds out one {one} of these"
+        raise SpecError(
+            f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.growth.rows)} samples planned {fault}; "
+            f"{remedy}"
+        )
 
     def _validate(self) -> None:
         """Log the held-out error of the predicting network, and compare it with the best before."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -16,6 +16,9 @@ from photonfarm.shared.store.io.storage import Storage, put_json
 COMMITTED = "committed"
 _DIGITS = 12
 _NAME = re.compile(rf"([0-9]{{{_DIGITS}}})\.json")
+
+CPU = "cpu"
+"""The device of jobs that a processor rendered, and of markers that name none."""
 
 _Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _ShardName = Annotated[str, Field(pattern=r"^plans/[0-9]{6,}/[a-z0-9_]+/c(\.[0-9]+)+$")]
@@ -38,6 +41,8 @@ class _Figures(_Stored):
     redrawn: Annotated[int, Field(ge=0)]
     worker: str
     versions: dict[str, str]  # of the packages that rendered
+    device: str = CPU  # what rendered: older markers do not say it, and are of processors
+    driver: str = ""
 
 
 class _Marker(_Stored):
@@ -48,7 +53,12 @@ class _Marker(_Stored):
 
 def name_of(scene: str, job: int) -> str:
     """The name of a job's marker; `scene` is the scene's folder."""
-    return f"{scene}/{COMMITTED}/{job:0{_DIGITS}d}.json"
+    return f"{scene}/{COMMITTED}/{file_of(job)}"
+
+
+def file_of(job: int) -> str:
+    """The file of a job's marker, in the folder of markers."""
+    return f"{job:0{_DIGITS}d}.json"
 
 
 def place(
@@ -104,4 +114,9 @@ def jobs(storage: Storage, scene: str) -> set[int]:
     """The jobs of a scene that have a marker; costs one listing."""
     with store_errors("list the markers", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{COMMITTED}")
+    return jobs_named(names)
+
+
+def jobs_named(names: Iterable[str]) -> set[int]:
+    """The jobs of those names in a folder of markers that are names of markers."""
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}

@@ -10,7 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+import redis
 
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import NamedSpec
@@ -45,7 +47,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["train", "--help"], HEAVY | {"numpy", "redis", "rq"}),
         (["scene", "plan", "--help"], HEAVY | {"numpy", "redis", "rq", "pydantic"}),
         (["scene", "show", "room"], HEAVY | {"redis", "rq"}),
-        (["status"], HEAVY | {"redis", "rq"}),  # nothing listens there
+        (["status"], HEAVY | {"redis", "rq", "awscrt"}),  # nothing listens there
         (["store", "find"], HEAVY | {"redis", "rq"}),
         (["submit", "room", "--dry-run", "--no-measure"], HEAVY),
     ],
@@ -60,6 +62,27 @@ def test_a_verb_loads_only_what_it_needs_and_starts_soon(store: Path, command: l
     assert done.returncode == 0, done.stderr
     assert needless.isdisjoint(json.loads(done.stderr.splitlines()[-1]))
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < MOST_CPU_S
+
+
+def test_status_with_a_redis_loads_neither_rq_nor_what_only_shards_need(
+    store: Path, common_redis: EmbeddedRedis, connection: redis.Redis
+) -> None:
+    environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": common_redis.url}
+    command = [sys.executable, "-c", CODE, "status"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert "0 queued" in done.stdout
+    assert (HEAVY | {"rq", "awscrt"}).isdisjoint(json.loads(done.stderr.splitlines()[-1]))
+
+
+def test_garbage_is_collected_again_after_loading() -> None:
+    code = """
+import gc
+from photonfarm.shared.cli.options import StorePlace
+StorePlace().convert("store", None, None)
+print(gc.isenabled(), gc.get_freeze_count() > 0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
 
 
 @pytest.mark.usefixtures("hears_ctrl_c")

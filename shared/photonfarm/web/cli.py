@@ -1,4 +1,4 @@
-"""The verb `web`."""
+"""The verbs `web` and `serve-metrics`."""
 
 from __future__ import annotations
 
@@ -6,66 +6,93 @@ import logging
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.shared.cli.options import names_redis, redis_option, store_option
-from photonfarm.shared.farm.running_farm import WEB_PORT
+from photonfarm.shared.cli.options import Command, names_redis, redis_option, store_option
+from photonfarm.shared.farm.running_farm import METRICS_PORT, WEB_PORT
+
+if TYPE_CHECKING:
+    from photonfarm.shared.farm.watch import FarmWatch
+    from photonfarm.web.server import Routes
+
+
+def _watch_options(command: Command) -> Command:
+    """The options that say which farm is watched, and where that is served."""
+    options = (
+        store_option,
+        redis_option,
+        click.option("--run", "runs", type=click.Path(path_type=Path, file_okay=False), multiple=True,
+                     help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or "
+                     "run]"),
+        click.option("--host", default="localhost", show_default=True,
+                     help="The address to listen on; whoever reaches any other one sees all that is served."),
+        click.option("--name", "names", multiple=True,
+                     help="A name, beside the host's, by which others may ask; may be repeated."),
+    )  # fmt: skip
+    found: Any = command
+    for option in reversed(options):
+        found = option(found)
+    return found
 
 
 @click.command()
-@store_option
-@redis_option
-@click.option(
-    "--run",
-    "runs",
-    type=click.Path(path_type=Path, file_okay=False),
-    multiple=True,
-    help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
-)
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=WEB_PORT,
-    show_default=True,
-    help="If it is taken, a free one is taken instead.",
-)
-@click.option(
-    "--host",
-    default="localhost",
-    show_default=True,
-    help="The address to listen on; whoever reaches any other one sees all that the store holds.",
-)
-@click.option(
-    "--name", "names", multiple=True, help="A name, beside the host's, by which browsers may ask; may be repeated."
-)
-def web(
-    store: str | Path, redis_url: str, runs: tuple[Path, ...], port: int, host: str, names: tuple[str, ...]
-) -> None:  # fmt: skip
+@_watch_options
+@click.option("--port", type=click.IntRange(0, 65535), default=WEB_PORT, show_default=True,
+              help="If it is taken, a free one is taken instead.")  # fmt: skip
+def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any) -> None:
     """Serve pages that show the farm while it works: samples, noise, queue, workers, training, predictions.
 
-    They only read, and fetch nothing from elsewhere. Ends on Ctrl-C.
+    They only read, and fetch nothing from elsewhere. /metrics is for Prometheus. Ends on Ctrl-C.
     """
-    from photonfarm.shared.core.errors import StoreError
     from photonfarm.shared.core.processes import free_port
+    from photonfarm.web.farm_pages import FarmPages
+    from photonfarm.web.routes import page_routes
+
+    pages = FarmPages(store, _watch(store, redis_url, runs))
+    _serve(page_routes(pages), "", **where | {"port": free_port(where["port"])})
+
+
+@click.command("serve-metrics")
+@_watch_options
+@click.option("--port", type=click.IntRange(0, 65535), default=METRICS_PORT, show_default=True, help="0: a free one.")
+def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any) -> None:
+    """Serve /metrics for Prometheus: samples, core time, queue, workers, failures, training.
+
+    `web` serves the same beside its pages. Ends on Ctrl-C.
+    """
+    from photonfarm.web.kept import Kept
+    from photonfarm.web.routes import metric_routes
+
+    _serve(metric_routes(Kept(_watch(store, redis_url, runs).look).get), "metrics", **where)
+
+
+def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWatch:
+    """The farm that the options name. Raises StoreError without a store."""
     from photonfarm.shared.farm.running_farm import running_farm
     from photonfarm.shared.farm.watch import FarmWatch
     from photonfarm.shared.store import Store
-    from photonfarm.web.farm_pages import FarmPages
+
+    opened = Store(store)
+    if not runs and running_farm(opened) is None:
+        runs = (Path("run"),)
+    return FarmWatch(opened, redis_url, runs, named_redis=names_redis())
+
+
+def _serve(routes: Routes, path: str, *, host: str, port: int, names: tuple[str, ...]) -> None:
+    """Serve until Ctrl-C, and print the address. Raises StoreError if nothing can listen there."""
+    from photonfarm.shared.core.errors import StoreError
     from photonfarm.web.server import PageServer
 
     logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    opened = Store(store)
-    if not runs and running_farm(opened) is None:
-        runs = (Path("run"),)
-    pages = FarmPages(store, FarmWatch(opened, redis_url, runs, named_redis=names_redis()))
     try:
-        server = PageServer(pages, host, free_port(port), names)
+        server = PageServer(routes, host, port, names)
     except OSError as error:
         raise StoreError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from error
     with server:
-        click.echo(f"http://{host}:{server.server_address[1]}/")
+        click.echo(f"http://{host}:{server.server_address[1]}/{path}")
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -1,64 +1,27 @@
-"""What the pages say of a farm: its progress, its trainings and its samples, as JSON documents and files.
-
-Looks at the farm are shared by all browsers, and each is kept for a hundred times as long as it took: so whoever looks,
-and however large the store is, looking takes about a hundredth of a core.
-"""
+"""What the pages say of a farm: its progress, its trainings and its samples, as JSON documents and files."""
 
 from __future__ import annotations
 
 import re
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from photonfarm.shared.farm.status import NoQueue
 from photonfarm.shared.farm.training import VIEWS, RunFolder
 from photonfarm.shared.farm.watch import FarmView, FarmWatch
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.write.plans import plan_of
-from photonfarm.web.samples import NotThereError, SceneSamples
-
-LEAST_S = 2.0
-"""The least seconds between two looks."""
-
-SHARE = 0.01
-"""The most of a core that looks take, on average."""
+from photonfarm.web.kept import Kept
+from photonfarm.web.samples import SceneSamples
+from photonfarm.web.server import NotThereError
 
 CURVE_POINTS = 300
 """The most points of a curve."""
 
 STEP = re.compile(r"step-([0-9]{8})\.png")
-
-T = TypeVar("T")
-
-
-class Kept(Generic[T]):
-    """A value that is made anew now and then, so that making it takes at most SHARE of the time."""
-
-    def __init__(
-        self,
-        make: Callable[[], T],
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        work: Callable[[], float] = time.thread_time,
-    ) -> None:
-        """Take the function that makes it; `work` counts the seconds of a core that this takes."""
-        self._make, self._clock, self._work = make, clock, work
-        self._lock = threading.Lock()
-        self._due = 0.0
-        self._value: T | None = None
-
-    def get(self) -> T:
-        """The value, made anew if that is due; raises what making it raises."""
-        with self._lock:
-            if self._value is None or self._clock() >= self._due:
-                began = self._work()
-                self._value = self._make()
-                self._due = self._clock() + max(LEAST_S, (self._work() - began) / SHARE)
-            return self._value
 
 
 class FarmPages:
@@ -73,6 +36,10 @@ class FarmPages:
         self._walls: dict[str, Kept[list[int]]] = {}
         self._lock = threading.Lock()
 
+    def view(self) -> FarmView:
+        """The farm as it was looked at last, seconds ago."""
+        return self._view.get()
+
     def state(self) -> dict[str, Any]:
         """How far the farm is."""
         view = self._view.get()
@@ -83,9 +50,9 @@ class FarmPages:
             "scenes": [asdict(scene) | {"missing": scene.missing} for scene in view.scenes],
             "queue": queue and {"queued": queue.queued, "running": queue.running, "workers": queue.workers},
             "workers": [{"name": name, **asdict(each)} for name, each in sorted(view.activities.items())],
-            "waits": view.waits,
+            "waits": [str(wait) for wait in view.waits],
             "failed_before": [{"cause": cause.cause, "jobs": len(cause.jobs)} for cause in view.queue.kept],
-            "trainings": [asdict(training) | {"note": training.note} for training in view.trainings],
+            "trainings": [asdict(training) | {"figures": training.figures} for training in view.trainings],
         }
 
     # --------------------------------------------------------------------------------------------------------- samples
@@ -142,7 +109,7 @@ class FarmPages:
 def _curves(run: RunFolder) -> dict[str, Any]:
     records, steps = list(run.records), _steps(run.folder)  # a copy, as another thread may add some
     validations = [
-        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
+        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"], r["held_out"]]
         for r in records
         if r.get("kind") == "validation"
     ]

@@ -17,6 +17,7 @@ from photonfarm.shared.plan.sample_costs import relative_variance
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.store import SceneReader, Store, StoredSample
 from photonfarm.web import images
+from photonfarm.web.server import NotThereError
 
 WALL = 24
 """The samples on the wall of those that landed last."""
@@ -32,10 +33,6 @@ OPENED = 4
 
 MOST_PASSES = 64
 """The most passes that a reference is merged from here."""
-
-
-class NotThereError(LookupError):
-    """There is no such sample or picture."""
 
 
 class SceneSamples:

@@ -1,4 +1,4 @@
-"""The server of the pages: GET and HEAD of what the table of routes has, and nothing else.
+"""The server of the pages and the metrics: GET and HEAD of what the table of routes has, and nothing else.
 
 It serves one machine's user, so it listens on this machine alone unless told otherwise, and answers only to names of
 its own, so that no other site's page can ask it (by a name that leads here).
@@ -12,21 +12,11 @@ import re
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from photonfarm.shared.core.errors import PhotonfarmError
-from photonfarm.web.farm_pages import FarmPages
-from photonfarm.web.samples import NotThereError
 
-STATIC = Path(__file__).parent / "static"
-KINDS = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml",
-    ".js": "text/javascript; charset=utf-8",
-}
 IDLE_S = 30.0
 """How long a browser may leave a connection idle."""
 
@@ -40,40 +30,18 @@ HEADERS = {
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
-PNG, JPEG, JSON, BYTES = "image/png", "image/jpeg", "application/json", "application/octet-stream"
-_SCENE, _ROW = "([0-9a-f]{32})", "([0-9]{1,12})"
+JSON = "application/json"
 
 Answer = tuple[str, bytes]  # its type and its content
+
+Routes = list[tuple[re.Pattern[str], bool, Callable[..., Answer]]]
+"""What is served: patterns of paths, whether an answer stays the same, and functions of the patterns' groups."""
 
 log = logging.getLogger(__name__)
 
 
-def routes(pages: FarmPages) -> list[tuple[re.Pattern[str], bool, Callable[..., Answer]]]:
-    """What is served: patterns of paths, whether an answer stays the same, and functions of the patterns' groups."""
-
-    def document(make: Callable[..., Any]) -> Callable[..., Answer]:
-        return lambda *groups: (JSON, json.dumps(make(*groups), allow_nan=False, default=str).encode())
-
-    def file(path: Path) -> Callable[[], Answer]:
-        return lambda: (KINDS[path.suffix], path.read_bytes())
-
-    table: list[tuple[str, bool, Callable[..., Answer]]] = [
-        ("/", False, file(STATIC / "index.html")),
-        *((f"/{path.name}", False, file(path)) for path in sorted(STATIC.iterdir()) if path.suffix in KINDS),
-        ("/api/state", False, document(pages.state)),
-        ("/api/curves", False, document(pages.curves)),
-        (f"/api/wall/{_SCENE}", False, document(pages.wall)),
-        (f"/api/sample/{_SCENE}/{_ROW}", False, document(lambda scene, row: pages.about(scene, int(row)))),
-        (f"/sample/{_SCENE}/{_ROW}/thumbnail.jpg", True, lambda s, row: (JPEG, pages.samples(s).thumbnail(int(row)))),
-        (f"/sample/{_SCENE}/{_ROW}/points", True, lambda s, row: (BYTES, pages.samples(s).points(int(row)))),
-        (f"/sample/{_SCENE}/{_ROW}/photons", True, lambda s, row: (BYTES, pages.samples(s).photons(int(row)))),
-        (f"/sample/{_SCENE}/{_ROW}/reference.png", False,
-         lambda s, row: (PNG, pages.samples(s).picture(int(row), "reference"))),
-        (f"/sample/{_SCENE}/{_ROW}/([a-z_]{{1,20}}).png", True,
-         lambda s, row, name: (PNG, pages.samples(s).picture(int(row), name))),
-        ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
-    ]  # fmt: skip
-    return [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
+class NotThereError(LookupError):
+    """There is no such sample or picture."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -137,13 +105,13 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves the pages of a farm until `shutdown`."""
+    """Serves what its routes have until `shutdown`."""
 
     daemon_threads = True
 
-    def __init__(self, pages: FarmPages, host: str, port: int, names: tuple[str, ...] = ()) -> None:
+    def __init__(self, routes: Routes, host: str, port: int, names: tuple[str, ...] = ()) -> None:
         """Listen; raises OSError if that is impossible. It answers to `names` besides its host's and this machine's."""
-        self.routes = routes(pages)
+        self.routes = routes
         self.names = {*LOCAL_NAMES, host.lower(), *(name.lower() for name in names)}
         super().__init__((host, port), _Handler)
 

@@ -44,12 +44,15 @@ def test_the_room_is_found_and_all_that_stands_in_it_also_two_chairs_of_one_mesh
 
 
 @pytest.mark.parametrize(("name", "count"), [("Stool.2", 1), ("Basket", 2)])
-def test_parts_of_one_name_that_do_not_touch_are_one_thing(gltf: Any, tmp_path: Path, name: str, count: int) -> None:
+def test_parts_of_one_name_are_one_thing_without_touching_and_a_sheet_is_none(
+    gltf: Any, tmp_path: Path, name: str, count: int
+) -> None:
     shell = trimesh.creation.box(bounds=[[0, 0, 0], [5, 2.6, 4]])
     outer = trimesh.creation.box(bounds=[[3, 0, 2], [3.6, 0.6, 2.6]])
     inner = trimesh.creation.box(bounds=[[3.1, 0, 2.1], [3.5, 0.5, 2.5]])
+    sheet = trimesh.creation.box(bounds=[[1, 0, 1], [1.01, 0.8, 1.6]])
     shell.invert()
-    for own, mesh in (("Shell", shell), ("Stool.1", outer), (name, inner)):
+    for own, mesh in (("Shell", shell), ("Stool.1", outer), (name, inner), ("Sheet", sheet)):
         gltf.node(own, gltf.mesh(mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")))
     _, things, _, _ = proposed(gltf.write(), tmp_path)
     assert len(things) == count

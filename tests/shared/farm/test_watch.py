@@ -113,7 +113,8 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
         queue.report_idle(connection, worker, "the disk is full", {scene.scene_id: "room.xml is missing"}, ttl_s=60)
     queue.record_failure(connection, queue.job_name(scene.scene_id, 0), "ValueError: 7 is odd")
     found = list(waits.waits(queue_of(store, common_redis.url), {scene.scene_id: "small"}, 8))
-    assert found == [
+    assert [(wait.kind, wait.count) for wait in found] == [("scene_left", 1), ("worker_paused", 2), ("job_failed", 1)]
+    assert [str(wait) for wait in found] == [
         "small: left by 2 of 2 workers: room.xml is missing",
         "2 workers take no jobs: the disk is full",
         "1 job failed: ValueError: … is odd",

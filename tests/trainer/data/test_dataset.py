@@ -186,6 +186,24 @@ def test_a_row_taken_back_between_two_looks_at_the_store_is_left_out_as_well(rep
         assert feed.take().rows == (0,)
 
 
+def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = repaired
+    source, looks = StoreSource(scene.storage.root, scene.scene_id), []
+    plain = source.refresh
+
+    def slow() -> Any:
+        looks.append(time.monotonic())
+        time.sleep(0.2)
+        return plain()
+
+    monkeypatch.setattr(source, "refresh", slow)
+    with Feed(source, tiny(poll_seconds=0.01)) as feed:
+        time.sleep(1.5)
+        feed.ask([0])
+        assert feed.take().rows == (0,), "batches do not wait for the next look"
+    assert len(looks) == 1, "the next one is due 4 s after the first"
+
+
 def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothing(
     repaired, commit, tiny, run: Path
 ) -> None:

@@ -1,4 +1,4 @@
-"""The verbs `scene`, `submit`, `top-up`, `status` and `up`, which need neither Mitsuba nor torch."""
+"""The verbs `scene`, `submit`, `top-up`, `reconcile`, `status`, `redis` and `up`: without Mitsuba and without torch."""
 
 from __future__ import annotations
 
@@ -176,6 +176,26 @@ def status(
         show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named)
         show_status.trainings(trainings)
     check_read(scenes)
+
+
+@click.command()
+@store_option
+@redis_option
+@json_option
+def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
+    """Queue every job that is planned, and neither committed nor queued, rendered now or failed.
+
+    Idle workers do this by themselves. It is for farms that may have no worker: a timer runs it, and workers are
+    started for what is queued. A job whose worker died is queued again once its heartbeat has run out; failed jobs
+    wait for an hour, or for `submit`.
+    """
+    from photonfarm.shared import queue
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.store import Store
+
+    opened = Store(store)
+    with queue.connect(redis_url) as connection:
+        show.queued(queue.reconcile(opened, connection), as_json)
 
 
 @click.command("redis")

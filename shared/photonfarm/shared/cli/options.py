@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
+from photonfarm.shared.core.processes import loading
+
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
@@ -25,7 +27,8 @@ class StorePlace(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The Path or the URL; fails for a URL that is not that of a bucket."""
-        from photonfarm.shared.store.io.storage import SCHEMES, is_url
+        with loading():
+            from photonfarm.shared.store.io.storage import SCHEMES, is_url
 
         if re.match(r"(s3|gs|az):/?[^/]", str(value)):
             self.fail(f"{value!r} is no URL of a bucket; write {str(value)[:2]}://BUCKET/PREFIX.", param, ctx)
@@ -75,11 +78,31 @@ def redis_option(command: Command) -> Command:
 def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
     if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
         _refuse_password(url)
-    if not (file := os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")):
+    if (file := password_file()) is None:
         return url
     from photonfarm.shared.queue import with_password_of
 
-    return with_password_of(Path(file), url)
+    return with_password_of(file, url)
+
+
+def optional_redis_option(help_text: str) -> Callable[[Command], Command]:
+    """`--redis URL` without a default, as `queue_url`; the file of its password is not read."""
+    return click.option(
+        "--redis", "queue_url", envvar="PHOTONFARM_REDIS_URL", show_envvar=True, callback=_without_password,
+        help=help_text,
+    )  # fmt: skip
+
+
+def _without_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
+    if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
+    return url or None
+
+
+def password_file() -> Path | None:
+    """The file that holds the password of Redis, if a variable names one."""
+    file = os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")
+    return Path(file) if file else None
 
 
 def names_redis() -> bool:

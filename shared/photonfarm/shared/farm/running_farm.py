@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 WEB_PORT = 8420
 """The port of the pages, unless it is taken."""
 
+METRICS_PORT = 8421
+"""The port of `serve-metrics`."""
+
 
 @dataclass(frozen=True, slots=True)
 class RunningFarm:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,8 @@ class TrainingProgress:
     left_s: float | None = None  # until the last step, at the pace so far
     validation: dict[str, Any] | None = None  # the last record of one
     ended: str | None = None  # why, if the run has ended
+    loss: float | None = None  # the last one that was logged
+    seconds: dict[str, float] = field(default_factory=dict)  # so far, by what they were spent on
 
     @property
     def error(self) -> str:
@@ -55,21 +58,32 @@ class TrainingProgress:
         found = self.validation
         if found is None:
             return ""
-        return f"held-out error {stated(found['error'], found['standard_error'])} on {found['held_out']} samples"
+        samples = "1 sample" if found["held_out"] == 1 else f"{found['held_out']} samples"
+        return f"held-out error {stated(found['error'], found['standard_error'])} on {samples}"
+
+    @property
+    def figures(self) -> str:
+        """How long training still takes, and its last error, each after a comma."""
+        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
+        return "".join(f", {part}" for part in (left, self.error) if part)
 
     @property
     def note(self) -> str:
-        """What training does, how long that still takes, and its last error, each after a comma."""
-        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
-        doing = self.phase if self.phase != TRAINS else None
-        return "".join(f", {part}" for part in (doing, left, self.error) if part)
+        """What holds training up, and its figures, each after a comma."""
+        doing = f", {self.phase}" if self.phase and self.phase != TRAINS else ""
+        return doing + self.figures
 
     @property
     def line(self) -> str:
         """All of it in words."""
-        steps = f"{self.step}/{self.steps}" if self.steps else str(self.step)
+        steps = counted(self.step, self.steps) if self.steps else str(self.step)
         ended = f", ended ({self.ended})" if self.ended else ""
         return f"training {self.run}: step {steps}{self.note}{ended}"
+
+
+def counted(step: int, steps: int) -> str:
+    """How many of the wanted steps are done; a run that is asked for fewer than it has keeps those that it has."""
+    return f"{step}/{steps}" if step <= steps else f"{step} ({steps} wanted)"
 
 
 class RunFolder:
@@ -99,6 +113,8 @@ class RunFolder:
             said.get("left_s"),
             validation,
             ended,
+            next((loss for each in reversed(self.records) if (loss := _loss(each)) is not None), None),
+            next((each["seconds"] for each in reversed(self.records) if isinstance(each.get("seconds"), dict)), {}),
         )
 
     def _read_log(self) -> None:
@@ -159,6 +175,13 @@ def _record(line: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return found if isinstance(found, dict) else {}
+
+
+def _loss(record: dict[str, Any]) -> float | None:
+    """The loss that a record of the log holds; None if it holds none, or one that is no number."""
+    loss = record.get("loss")
+    trains = record.get("kind") == "train" and isinstance(loss, float) and math.isfinite(loss)
+    return loss if trains else None
 
 
 def _read_json(file: Path) -> dict[str, Any]:

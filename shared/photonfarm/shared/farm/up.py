@@ -132,7 +132,8 @@ def run_farm(
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
-            talk.say(f"references: {added.planned} further passes planned, {added.planned_before} planned before")
+            there = f"passes that the samples have, or that were planned before: {added.planned_before}"
+            talk.say(f"references: {added.planned} further passes planned; {there}")
         opened = Store(store)
         scene = opened.scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
@@ -148,7 +149,7 @@ def run_farm(
         trained = run if train_steps else None
         stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, talk))
-        preview = ["preview", spec, "--out", str(out / "preview.html")]
+        preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
             farm = _Farm(scene, run, train_steps, partial(queue_now, opened, redis.url))
             _watch(running, farm, redis, talk)
@@ -287,13 +288,13 @@ class _Farm:
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
         named = {self.scene.scene_id: self.scene.spec.name}
-        activities = status.activities if status else {}
-        missing = found.planned_samples - found.committed_samples
+        missing = found.planned_samples - found.usable_samples
+        activities = status.activities if status and missing else {}  # a report may be seconds old
         return FarmProgress(
             samples, passes, trained.step, self.steps, trained.note,
-            min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
+            min(sum(each.samples for each in activities.values()), found.planned_samples - found.committed_samples),
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
-            tuple(waits(self._queue, named, 0)),
+            tuple(map(str, waits(self._queue, named, 0))),
         )  # fmt: skip
 
     def _status(self) -> QueueStatus | None:
@@ -308,13 +309,14 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, ta
     with talk.progress(farm.steps) as show:
         while True:
             redis.keep_running()
-            alive = any(process.poll() is None for process in running.values())
-            show(farm.look(), not alive)
-            for name, process in running.items():
-                if process.poll():
+            codes = {name: process.poll() for name, process in running.items()}
+            alive = None in codes.values()
+            show(farm.look(), not alive or any(codes.values()))
+            for name, code in codes.items():
+                if code:
                     log = farm.run / f"{name}.log"
-                    said = f"{name} {_end(process.returncode)}; {log} says: {_tail(log)}. What is rendered and trained"
-                    if process.returncode == SpecError.exit_code:  # the same command would be refused again
+                    said = f"{name} {_end(code)}; {log} says: {_tail(log)}. What is rendered and trained"
+                    if code == SpecError.exit_code:  # the same command would be refused again
                         raise IncompleteError(f"{said} is kept")
                     raise IncompleteError(f"{said} is kept, and the same command goes on from there")
             if not alive:

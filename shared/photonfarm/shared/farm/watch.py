@@ -15,7 +15,7 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.running_farm import RunningFarm, running_farm
 from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress
-from photonfarm.shared.farm.waits import waits
+from photonfarm.shared.farm.waits import Wait, waits
 from photonfarm.shared.queue import Activity, RenderArguments
 from photonfarm.shared.store import SceneStore, Store
 
@@ -59,7 +59,8 @@ class FarmView:
     trainings: list[TrainingProgress]
     running: RunningFarm | None  # a `photonfarm up` of this machine that is at work on the store
     named_redis: bool  # the user has named it; else none need be there, as `photonfarm up` brings its own
-    waits: list[str]  # what waits for what, in sentences
+    waits: list[Wait]  # what waits for what
+    at_s: float  # when it was looked at, in seconds since 1970
 
     @property
     def activities(self) -> dict[str, Activity]:
@@ -116,9 +117,8 @@ class FarmWatch:
         trainings = [run.look() for run in self._runs]
         names = {scene.scene_id: scene.name for scene in scenes}
         why = list(waits(queue, names, sum(scene.missing for scene in scenes), trainings))
-        return FarmView(
-            sorted(scenes, key=lambda scene: scene.scene_id), queue, trainings, running, self._named_redis, why
-        )
+        by_id = sorted(scenes, key=lambda scene: scene.scene_id)
+        return FarmView(by_id, queue, trainings, running, self._named_redis, why, time.time())
 
     def _look_at(self, scene: SceneStore, activities: Sequence[Activity], workers: int) -> SceneView:
         seen = self._seen.setdefault(scene.scene_id, _Seen())

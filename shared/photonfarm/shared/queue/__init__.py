@@ -14,9 +14,15 @@ rq:photonfarm:paused:<worker name>  why a worker takes no jobs
 rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
 rq:photonfarm:doing:<worker name>   what a worker is doing, and how far it is
 rq:photonfarm:reconcile             lock of the process that fills the queue
+rq:photonfarm:looked:<scene id, or all>  what the last look at the store found, for seconds
 rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
 rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.queue.connection import connect, has_password, with_password_of
 from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
@@ -39,11 +45,31 @@ from photonfarm.shared.queue.failures import (
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
 from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import FUNCTION, OVERDUE, QUEUE, STARTS, RenderArguments, job_name
-from photonfarm.shared.queue.kept_failures import keep_failure, kept_failures
-from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, QueueStatus, queue_status, reconcile
-from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
+from photonfarm.shared.queue.kept_failures import jobs_left_alone, keep_failure, keep_submission, kept_failures
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.share import Share
+from photonfarm.shared.queue.status import QueueStatus, queue_status
 from photonfarm.shared.queue.worker_activity import Activity, clear_activity, report_activity
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, look, reconcile
+    from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
+else:
+    _WITH_RQ = {
+        "QUEUE_LIMIT": "reconciliation",
+        "look": "reconciliation",
+        "reconcile": "reconciliation",
+        "QueueWorker": "rq_adapter",
+        "RenderJob": "rq_adapter",
+        "open_queue": "rq_adapter",
+    }
+
+    def __getattr__(name: str) -> Any:
+        """What needs RQ, which is loaded only when it is asked for: `status` asks for none of it."""
+        if name not in _WITH_RQ:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_WITH_RQ[name]}"), name)
+
 
 __all__ = [
     "ALIVE",
@@ -65,6 +91,7 @@ __all__ = [
     "QueueWorker",
     "RenderArguments",
     "RenderJob",
+    "Share",
     "beat",
     "bury",
     "causes",
@@ -83,8 +110,11 @@ __all__ = [
     "hosts",
     "job_name",
     "job_of_worker",
+    "jobs_left_alone",
     "keep_failure",
+    "keep_submission",
     "kept_failures",
+    "look",
     "open_queue",
     "overdue",
     "put_back",

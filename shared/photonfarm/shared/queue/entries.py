@@ -6,10 +6,13 @@ Scripts drop what is no name of a job before it is fetched.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.job import MAX_NAME
-from photonfarm.shared.queue.rq_adapter import RenderJob, RenderQueue
+
+if TYPE_CHECKING:
+    from photonfarm.shared.queue.rq_adapter import RenderJob, RenderQueue
 
 _NAMES = f"""
 local names = {{}}

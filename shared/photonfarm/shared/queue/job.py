@@ -10,6 +10,9 @@ from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.models import Frozen, sentences
 
 QUEUE = "photonfarm"
+QUEUE_KEY = f"rq:queue:{QUEUE}"
+"""The list in which RQ keeps the names of the queued jobs."""
+
 FUNCTION = "photonfarm.renderer.jobs.render.render_shard"
 """The one function that a job runs; a string, since submitting needs no renderer."""
 

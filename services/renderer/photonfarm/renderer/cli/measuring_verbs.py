@@ -10,7 +10,7 @@ import click
 
 from photonfarm.shared.cli.options import device_option, json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import WorkLog, waiting
+from photonfarm.shared.core.waiting import WorkLog
 
 
 @click.command()
@@ -63,9 +63,9 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     backend.load(threads=1)
     from photonfarm.renderer.measure.exposure import propose
 
-    log = partial(click.echo, err=True)
-    with waiting(log, f"proposing an exposure for {loaded.name}"):
-        found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
+    with WorkLog(partial(click.echo, err=True)) as work:
+        work.begin(f"loading {loaded.name}")
+        found = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 

@@ -15,20 +15,23 @@ from photonfarm.shared.core.waiting import waiting
 
 
 @click.command()
-@click.argument("spec")
+@click.argument("scene", metavar="SPEC_OR_SCENE")
 @store_option
 @click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
-def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
-    """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
+def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
+    """Write a contact sheet of a scene's samples: plans of what stands where, A, B, albedo, normal, depth, photons.
+
+    SPEC_OR_SCENE is a spec's file, or names a scene of the store by its id, how that begins, or its name.
+    """
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: the sheet is a page; name it like preview.html", param_hint="--out")
     from photonfarm.renderer.tools.preview import write_contact_sheet
-    from photonfarm.shared.scene.spec_loading import load_spec
-    from photonfarm.shared.store.read.other_scenes import scene_of
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import scene_or_spec
     from photonfarm.shared.store.read.reader import SceneReader
 
-    write_contact_sheet(SceneReader(store, scene_of(store, spec, load_spec(spec))), count, out)
+    write_contact_sheet(SceneReader(store, scene_or_spec(Store(store), scene).scene_id), count, out)
     click.echo(out)
 
 

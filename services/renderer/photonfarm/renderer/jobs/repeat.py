@@ -32,7 +32,7 @@ from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.read.find import is_spec_file, scene_or_spec
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import SceneMatch
-from photonfarm.shared.store.write.commit import as_stored
+from photonfarm.shared.store.write.rounding import as_stored
 
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that a pass is written as."""

@@ -20,7 +20,6 @@ from typing import Any
 
 import numcodecs.blosc  # type: ignore[import-untyped]
 import numpy as np
-from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError
@@ -235,14 +234,21 @@ def _copy(content: NDArray[np.uint8], memory: NDArray[np.uint8]) -> bytes:
     for start in range(0, len(memory), _PIECE_BYTES):
         piece = memory[start : start + _PIECE_BYTES]
         np.copyto(piece, content[start : start + _PIECE_BYTES])
-        checksum = crc32c(piece, checksum)
+        checksum = _crc32c(piece, checksum)
     return checksum.to_bytes(_CRC_BYTES, "little")
 
 
 def _crc(data: bytes | memoryview | NDArray[np.uint8]) -> bytes:
-    """The CRC-32C of contiguous bytes, as it is stored.
+    """The CRC-32C of contiguous bytes, as it is stored."""
+    return _crc32c(data).to_bytes(_CRC_BYTES, "little")
+
+
+def _crc32c(data: bytes | memoryview | NDArray[np.uint8], before: int = 0) -> int:
+    """The CRC-32C of contiguous bytes, after others with the checksum `before`.
 
     Of the kept libraries with this checksum, the AWS runtime's is ten times as fast as google-crc32c (60 against 6 GB/s
-    in the cache) and lets other threads run meanwhile.
+    in the cache) and lets other threads run meanwhile. It takes 30 ms to load, which `status` never does.
     """
-    return int(crc32c(data)).to_bytes(_CRC_BYTES, "little")
+    from awscrt.checksums import crc32c  # type: ignore[import-untyped]
+
+    return int(crc32c(data, before))

@@ -35,6 +35,9 @@ TALL, WIDE = 0.88, 0.6
 SMALL = 0.1
 """What is shorter than this share of the room's height in two directions stands for nothing by itself."""
 
+SHEET = 0.01
+"""What is thinner than this share of the room's height is a part of something, such as the door of a cupboard."""
+
 FLOATS = 0.08
 """What touches nothing belongs to what stands nearer than this share of the room's height."""
 
@@ -209,7 +212,7 @@ def _thing(
     hangs = room.has_ceiling and high[2] > room.high[2] - STANDS * room.height and not stands
     inside = ((middle > room.low) & (middle < room.high)).all()
     large = (size[:2] > WIDE * room.size[:2]).any() or size[2] > TALL * room.height
-    small = np.sort(size)[1] < SMALL * room.height
+    small = np.sort(size)[1] < SMALL * room.height or size.min() < SHEET * room.height
     if not inside or large or small or not (stands or (hangs and emits)):
         return None
     return Thing(_name(members, pieces, surfaces, names), members, low, high, emits, bool(hangs))

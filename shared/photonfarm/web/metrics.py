@@ -1,0 +1,208 @@
+"""A farm as metrics for Prometheus: what `status --watch` shows, as numbers.
+
+Counters are what the store and the logs of runs hold, so that they go on where another process serves them. A repair
+takes samples back; Prometheus then believes that a counter has begun anew.
+
+Labels take few values, whatever strangers write into Redis: scenes are those of the store, runs those that the user
+names, and failures are grouped by the class of their error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, get_args
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from photonfarm.shared.farm.status import NoQueue, StoreQueue
+from photonfarm.shared.farm.training import TRAINS, WAITS, TrainingProgress
+from photonfarm.shared.farm.waits import WaitKind
+from photonfarm.shared.farm.watch import FarmView, SceneView
+from photonfarm.web.server import Answer
+
+MOST_ERRORS = 10
+"""The most classes of errors that failures are told apart by; the others are `OTHER`."""
+
+OTHER = "other"
+
+_ERROR = re.compile(r"([A-Za-z_]\w{0,59}): ", re.ASCII)
+"""The class of an error at the beginning of a failure's cause."""
+
+STATES = ("trains", "waits", "works", "ended", "absent")
+"""The states of a trainer: at its steps, without samples, at something else, at its end, or not there."""
+
+Labels = tuple[str, ...]
+
+
+class FarmMetrics(Collector):
+    """The metrics of a farm, made when they are asked for."""
+
+    def __init__(self, look: Callable[[], FarmView]) -> None:
+        """Take the function that gives the farm; who asks often should get the same view for some seconds."""
+        self._look = look
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+
+    def answer(self) -> Answer:
+        """The metrics in Prometheus's text format. Raises StoreError if the store is gone."""
+        return CONTENT_TYPE_PLAIN_0_0_4, generate_latest(self._registry)
+
+    def describe(self) -> Sequence[Metric]:
+        """Nothing: names are known without a look at the farm, as no other collector is in the registry."""
+        return ()
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the metrics of the farm as it is now."""
+        view = self._look()
+        yield _gauge("look_timestamp_seconds", "When the farm was looked at, in seconds since 1970.", {(): view.at_s})
+        yield from _of_scenes([scene for scene in view.scenes if not scene.error])
+        unreadable = sum(bool(scene.error) for scene in view.scenes)
+        yield _gauge("scenes_unreadable", "Scenes of the store that cannot be read.", {(): unreadable})
+        yield from _of_queue(view.queue)
+        yield from _of_trainings(_named(view.trainings))
+        waits = Counter({(kind,): 0 for kind in get_args(WaitKind)})
+        for wait in view.waits:
+            waits[(wait.kind,)] += wait.count
+        yield _gauge("waits", "What waits: scenes, workers, failed jobs, samples, trainers.", waits, "kind")
+
+
+def _of_scenes(scenes: Sequence[SceneView]) -> Iterator[Metric]:
+    names = "scene", "scene_id"
+    of = {(_text(scene.name), scene.scene_id): scene for scene in scenes}
+    by_pass = [((*labels, which), counts) for labels, scene in of.items()
+               for which, counts in (("first", scene.samples), ("further", scene.passes))]  # fmt: skip
+    yield _counter(
+        "samples_committed", "Committed samples: first passes of views, and further ones.",
+        {labels: counts[0] for labels, counts in by_pass}, *names, "pass",
+    )  # fmt: skip
+    yield _gauge(
+        "samples_planned", "Planned samples: first passes of views, and further ones.",
+        {labels: counts[1] for labels, counts in by_pass}, *names, "pass",
+    )  # fmt: skip
+    yield _gauge(
+        "samples_in_hand", "Samples that are rendered, in jobs that are not committed yet.",
+        {labels: scene.in_hand for labels, scene in of.items()}, *names,
+    )  # fmt: skip
+    committed = {labels: scene.jobs[0] for labels, scene in of.items()}
+    yield _counter("jobs_committed", "Committed render jobs.", committed, *names)
+    planned = {labels: scene.jobs[1] for labels, scene in of.items()}
+    yield _gauge("jobs_planned", "Planned render jobs.", planned, *names)
+    sizes = {labels: scene.size_bytes for labels, scene in of.items()}
+    yield _counter("committed_bytes", "Bytes of committed jobs, without guides.", sizes, *names)
+    core_s = {labels: scene.core_s for labels, scene in of.items()}
+    yield _counter("render_core_seconds", "Processor time that committed jobs took, without guides.", core_s, *names)
+
+
+def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
+    yield _gauge("queue_up", "Whether the queue's Redis answers, 1 or 0.", {(): int(isinstance(queue, StoreQueue))})
+    failed = _failures(queue)
+    yield _gauge(
+        "failed_jobs", "Failed jobs by the class of their error: deferred for an hour, failed for good until a retry, "
+        "or kept by the store alone.", failed, "error", "state",
+    )  # fmt: skip
+    if isinstance(queue, NoQueue):
+        return
+    status = queue.status
+    jobs: dict[Labels, float] = {("waiting",): status.queued, ("started",): status.running}
+    for state in ("deferred", "failed"):
+        jobs[(state,)] = sum(count for (_, of), count in failed.items() if of == state)
+    yield _gauge("queue_jobs", "Jobs of the queue by state.", jobs, "state")
+    paused = status.idle_reports.paused.keys()
+    rendering = len(status.activities.keys() - paused)
+    idle = max(status.workers - rendering - len(paused), 0)
+    workers: dict[Labels, float] = {("rendering",): rendering, ("paused",): len(paused), ("idle",): idle}
+    yield _gauge("workers", "Live workers: with a job, taking none, or without one.", workers, "state")
+
+
+def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
+    """The numbers of failed jobs by error and state; few errors, each the class before a cause's first colon."""
+    found: Counter[Labels] = Counter()
+    for cause in () if isinstance(queue, NoQueue) else queue.causes:
+        found[_error(cause.cause), "failed"] += cause.set_aside
+        found[_error(cause.cause), "deferred"] += len(cause.jobs) - cause.set_aside
+    for cause in queue.kept:
+        found[_error(cause.cause), "kept"] += len(cause.jobs)
+    by_error: Counter[str] = Counter()
+    for (error, _), count in found.items():
+        by_error[error] += count
+    told = {error for error, _ in by_error.most_common(MOST_ERRORS)}
+    grouped: Counter[Labels] = Counter()
+    for (error, state), count in found.items():
+        grouped[error if error in told else OTHER, state] += count
+    return dict(grouped)
+
+
+def _error(cause: str) -> str:
+    """The class of an error, by a failure's cause, which strangers may have written."""
+    found = _ERROR.match(cause)
+    return found[1] if found else OTHER
+
+
+def _of_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
+    steps = {run: each.step for run, each in of.items()}
+    yield _gauge("trainer_step", "The step that training is at.", steps, "run")
+    planned = {run: each.steps for run, each in of.items() if each.steps}
+    yield _gauge("trainer_steps_planned", "The steps after which training ends.", planned, "run")
+    losses = {run: each.loss for run, each in of.items() if each.loss is not None}
+    yield _gauge("trainer_loss", "The training loss that was logged last.", losses, "run")
+    for name, key, about in (
+        ("error", "error", "The held-out error of the last validation."),
+        ("standard_error", "standard_error", "The standard error of the held-out error."),
+        ("samples", "held_out", "The samples that the last validation was on."),
+    ):
+        found = {run: each.validation.get(key) for run, each in of.items() if each.validation is not None}
+        numbers = {run: value for run, value in found.items() if isinstance(value, int | float)}
+        yield _gauge(f"trainer_heldout_{name}", about, numbers, "run")
+    spent = {
+        (*run, _text(activity)): seconds
+        for run, each in of.items()
+        for activity, seconds in each.seconds.items()
+        if isinstance(seconds, int | float) and math.isfinite(seconds)
+    }
+    yield _counter(
+        "trainer_seconds", "Seconds of training so far, by what they were spent on.", spent, "run", "activity"
+    )
+    states = {(*run, state): float(state == _state(each)) for run, each in of.items() for state in STATES}
+    yield _gauge("trainer_state", "1 for the state that the trainer is in, 0 for the others.", states, "run", "state")
+
+
+def _state(training: TrainingProgress) -> str:
+    if training.phase is None:
+        return "ended" if training.ended else "absent"
+    return {TRAINS: "trains", WAITS: "waits"}.get(training.phase, "works")
+
+
+def _named(trainings: Sequence[TrainingProgress]) -> dict[Labels, TrainingProgress]:
+    """Runs by a label each: the name of the folder, with a number behind it where several are called so."""
+    found: dict[Labels, TrainingProgress] = {}
+    for training in trainings:
+        name, number = _text(training.run), 1
+        while (label := name if number == 1 else f"{name} {number}",) in found:
+            number += 1
+        found[label,] = training
+    return found
+
+
+def _text(name: str) -> str:
+    """A name as UTF-8 holds it: names of folders may be other bytes."""
+    return name.encode(errors="replace").decode()
+
+
+def _gauge(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
+    return _filled(GaugeMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
+
+
+def _counter(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
+    return _filled(CounterMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, values: dict[Any, Any]) -> Metric:
+    for labels, value in values.items():
+        family.add_metric(labels, value)
+    return family

@@ -1,0 +1,54 @@
+"""A farm with something of all that can be watched."""
+
+import json
+from pathlib import Path
+
+import pytest
+import redis
+import store_samples as samples
+
+from photonfarm.shared import queue
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.farm.watch import FarmWatch
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneStore, Store
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """Four jobs of two samples, two of them committed."""
+    found = store.scene(store.plan(samples.small_spec(), Request(modifications=8), shard_rows=2).scene_id)
+    found.write_base(*samples.base())
+    for job in range(2):
+        samples.commit(found, job, samples.outputs(found, job))
+    return found
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """The folder of a run that has been validated."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    spent = {"train": 15.0, "wait_data": 4.0}
+    records = [
+        {"kind": "train", "step": 40, "loss": 0.25, "seconds": {"train": 12.0}},
+        {"kind": "validation", "step": 50, "error": 0.5, "standard_error": 0.125, "held_out": 3, "seconds": spent},
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
+    (folder / "settings.json").write_text('{"max_steps": 200}')
+    return folder
+
+
+@pytest.fixture
+def farm(scene: SceneStore, run: Path, store: Store, connection: redis.Redis, common_redis: EmbeddedRedis) -> FarmWatch:
+    """A farm with a queue, three workers, failures of each state and a run."""
+    queue.reconcile(store, connection)
+    name = queue.job_name(scene.scene_id, 2)
+    for worker, job in (("ada", name), ("bob", None), ("eve", None)):
+        queue.beat(connection, worker, "elsewhere", job, ttl_s=60, process=1)
+    queue.report_activity(connection, "ada", queue.Activity("renders samples", 1, 2, 1, name), ttl_s=60)
+    queue.report_idle(connection, "bob", "the disk is full", {scene.scene_id: "room.xml is missing"}, ttl_s=60)
+    for _ in range(queue.FAILURES_ALLOWED):
+        queue.record_failure(connection, name, "ValueError: 7 is odd")
+    queue.record_failure(connection, queue.job_name(scene.scene_id, 3), "StoreError: no")
+    return FarmWatch(store, common_redis.url, [run])

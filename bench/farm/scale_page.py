@@ -145,9 +145,9 @@ MENDED = """## Mended
 Nothing of it changes the store's format, or what a commit guarantees; each has a test that counts operations.
 
 - **Waiting workers.** Each idle worker listed all markers every two seconds, and read all of Redis' keys three to nine
-  times: listings by workers × markers, and commands by the square of the workers. Now one looks, and Redis keeps for
-  two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once more
-  for itself. (`test_queue_look.py`)
+  times: listings by workers × markers, and commands that grew faster than the workers. Now one looks, and Redis keeps
+  for two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once
+  more for itself. (`test_queue_look.py`)
 - **The whole plan in every worker.** A worker read all inputs of all plans and kept them. Now it reads the chunks of
   65 536 rows that its job lies in, and keeps two of each input (`plan_rows`). Whoever fills the queue reads the chunks
   of what it queues, so that damage still keeps jobs from being queued. (`test_plan_rows.py`)
@@ -156,7 +156,7 @@ Nothing of it changes the store's format, or what a commit guarantees; each has 
   something cannot be read. (`test_followed_markers.py`)
 - **Looks in a folder** still list everything, and so does the arithmetic on all rows after news. Trainer and `--ahead`
   now wait twenty times as long as a look took, so that looks take a twentieth of the time at most; they take more than
-  that from some 2·10^6 samples on. (`test_dataset.py`, `test_trainer_pace.py`)
+  that from some 10^6 samples on. (`test_dataset.py`, `test_trainer_pace.py`)
 
 ## Not mended, and not measured
 

@@ -121,7 +121,8 @@ class Rounds:
     def _time_later(self, candidate: Candidate) -> float:
         return self._time(candidate) * self._later.get(candidate, 1.0)
 
-    def _missed(self, candidate: Candidate) -> float:
+    def missed(self, candidate: Candidate) -> float:
+        """The part of a candidate's error that is inferred from light that others found."""
         return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
@@ -137,24 +138,28 @@ class Rounds:
 
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
-        inferred = self._missed(candidate)
+        inferred = self.missed(candidate)
         return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
 
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
-        return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
+        return float((self._seen(candidate).mean() + self.missed(candidate)) * self._time_later(candidate))
+
+    def errors(self, candidate: Candidate) -> RelativeErrors:
+        """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
+        seen = self._seen(candidate)
+        own, plain = seen + self.missed(candidate), self._seen(PLAIN)[: len(seen)] + self.missed(PLAIN)
+        return RelativeErrors(images=self.images(candidate), own=_by_views(own), plain=_by_views(plain))
 
     def measured(self, candidate: Candidate) -> MeasuredCandidate:
-        """The error × time against plain path tracing, over the images that both rendered with equal seeds."""
-        seen, inferred = self._seen(candidate), self._missed(candidate)
-        plain = self._seen(PLAIN)[: len(seen)] + self._missed(PLAIN)
-        errors = RelativeErrors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
+        """The error × time against plain path tracing."""
+        errors = self.errors(candidate)
         cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
         relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
         return MeasuredCandidate(
             candidate=candidate,
             errors=errors,
-            missed=inferred,
+            missed=self.missed(candidate),
             time_s=self._time(candidate),
             relative_cost=cost,
             spread=None if relative is None else cost * relative,

@@ -1,11 +1,12 @@
 """What breaks first as a farm grows to 10 million samples, a thousand workers and 10 TB. Nothing is rendered.
 
     python -m bench.farm.scale [--samples N …] [--workers N …] [--bucket N …] [--plans N …]
-                               [--before FILE] [--folder DIR] [--out DIR]
+                               [--before FILE] [--kept FILE] [--folder DIR] [--out DIR]
 
 Stores, plans, queue, workers, Redis and S3 server are real. Markers of most jobs come from a generator, and workers
 commit images of 8 × 8 pixels that cost nothing. Costs are fitted over sizes that fit this machine, and extrapolated.
-`--before` names the figures of an earlier run, to be set beside these. Exit code 0.
+`--before` names the figures of an earlier run, to be set beside these; `--kept` those that stand for what is not
+measured now (with `--samples --bucket --plans`, say, all but the workers). Exit code 0.
 """
 
 from __future__ import annotations
@@ -71,6 +72,21 @@ def measure(options: argparse.Namespace) -> Found:
     return dict(found)
 
 
+def kept(options: argparse.Namespace) -> tuple[Found, str]:
+    """What of the figures in --kept is not measured now, and the commit that they were measured at."""
+    if options.kept is None:
+        return {}, ""
+    earlier, commit = read(options.kept)
+    now = {name for name in MEASURED if getattr(options, name)}
+    left = {step: sizes for step, sizes in earlier.items() if part_of(step) not in now}
+    return {step: {size: dict(values) for size, values in sizes.items()} for step, sizes in left.items()}, commit
+
+
+def part_of(step: str) -> str:
+    """The name in MEASURED of what measures a step."""
+    return "bucket" if step.startswith("bucket ") else step if step in MEASURED else "samples"
+
+
 def read(file: Path) -> tuple[Measured, str]:
     """The measurements of an earlier run, and the commit that it was made at."""
     document = json.loads(file.read_text(encoding="utf-8"))
@@ -87,13 +103,17 @@ def main() -> int:
     parser.add_argument("--plans", type=int, nargs="*", default=PLANS)
     parser.add_argument("--workers", type=int, nargs="*", default=WORKERS)
     parser.add_argument("--before", type=Path, default=BEFORE, help="figures of an earlier run (scale_before.json)")
+    parser.add_argument(
+        "--kept", type=Path, help="figures of an earlier run, kept for what is not measured in this one"
+    )
     parser.add_argument("--folder", type=Path, help="for the stores, which are removed (a temporary one)")
     options = parser.parse_args()
-    measured = measure(options)
+    known, known_at = kept(options)
+    measured = {**known, **measure(options)}
     now = grown(measured)
     earlier = read(options.before) if options.before.exists() else None
     before = {each.cost: each for each in grown(earlier[0])} if earlier else {}
-    values = {"measured": measured, "growth": [asdict(each) for each in now]}
+    values = {"kept_from_commit": known_at, "measured": measured, "growth": [asdict(each) for each in now]}
     results.write("scale", page(now, before, earlier[1] if earlier else ""), values, options.out)
     return 0
 

@@ -18,7 +18,7 @@ def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str) -> str
     """The page; `before` are the same costs at an earlier commit."""
     tables = "\n\n".join(_table(axis, now, before) for axis in ORDERED if any(e.cost.axis == axis for e in now))
     product = f"the product at commit {commit.partition(' ')[0]}, measured by this bench"
-    earlier = f" In brackets is what was before [what is mended](#mended): {product}." if before else ""
+    earlier = f"\nIn brackets is what was before [what is mended](#mended): {product}." if before else ""
     return f"""# What breaks first
 
 Ten million samples (10 TB of `{SPEC}`), a thousand workers, a thousand plans: which cost is the first that nobody can

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from pathlib import Path
@@ -76,3 +77,11 @@ def test_the_page_sets_what_was_before_beside_what_is_now(tmp_path: Path) -> Non
     assert "1.00 ± 0.00 (2.00 ± 0.00)" in text
     assert "never" not in text.split("## Files")[0]
     assert "| 32 | 312,500 |" in text
+
+
+def test_what_is_not_measured_again_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "scale.json"
+    steps = {step: {"4": {"core_s": 1.0}} for step in ("plan", "bucket news", "plans", "workers")}
+    file.write_text(json.dumps({"measured": steps, "commit": "abc"}))
+    options = argparse.Namespace(kept=file, samples=[], bucket=[], plans=[4, 16], workers=[4])
+    assert scale.kept(options) == ({step: {4.0: {"core_s": 1.0}} for step in ("plan", "bucket news")}, "abc")

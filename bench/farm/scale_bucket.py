@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from bench.farm.scale_store import MISSING_EVERY, SHARD_ROWS, SPEC
+from bench.farm.scale_store import SHARD_ROWS, SPEC, missing_of
 from bench.harness import results
 
 PUTS_AT_ONCE = 32
@@ -25,7 +25,7 @@ Costs = dict[str, float]
 
 
 class Requests:
-    """Requests by kind: list, get, head, put."""
+    """Requests by kind (list, get, head, put), and all of them (requests)."""
 
     def __init__(self) -> None:
         """Begin with none."""
@@ -40,7 +40,8 @@ class Requests:
         """The requests that an action makes."""
         self.counts.clear()
         action()
-        return {kind: float(count) for kind, count in self.counts.items()}
+        found = {kind: float(count) for kind, count in self.counts.items()}
+        return {**found, "requests": sum(found.values())}
 
 
 def measured(folder: Path, samples: int) -> dict[str, Costs]:
@@ -74,7 +75,7 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
 def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -> dict[str, Costs]:
     from photonfarm.shared.plan.request import Request
     from photonfarm.shared.scene.spec_loading import NamedSpec
-    from photonfarm.shared.store import SceneReader, SceneStore, Store
+    from photonfarm.shared.store import SceneReader, Store
     from photonfarm.shared.store.format import markers
 
     spec = NamedSpec.load(SPEC).spec
@@ -84,7 +85,8 @@ def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -
     found["plan"] = requests.of(lambda: store.plan(spec, request, shard_rows=SHARD_ROWS))
     scene = store.scene(spec.scene_id)
     jobs = scene.jobs()
-    done = [job for job in range(jobs) if job % MISSING_EVERY != MISSING_EVERY - 1]
+    missing = missing_of(jobs)
+    done = sorted({*range(jobs)} - {*missing})
     _put_markers([markers.name_of(scene.name, job) for job in done], url, direct)
 
     def first_job() -> None:
@@ -99,11 +101,20 @@ def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -
     reader = SceneReader(url, spec.scene_id)
     found["start"] = requests.of(reader.refresh)
     found["refresh"] = requests.of(reader.refresh)
-    found["pace"] = requests.of(lambda: SceneStore.progress(fresh))
-    missing = sorted(set(range(jobs)) - set(done))[-1:]
-    _put_markers([markers.name_of(scene.name, job) for job in missing], url, direct)
+    pace = _pace(url)
+    pace()
+    found["pace"] = requests.of(pace)
+    _put_markers([markers.name_of(scene.name, missing[-1])], url, direct)
     found["news"] = requests.of(reader.refresh)
     return found
+
+
+def _pace(url: str) -> Callable[[], object]:
+    """The looks of a worker with --ahead at what is committed."""
+    from photonfarm.renderer.worker.backpressure import TrainerPace
+    from photonfarm.shared.store import Store
+
+    return TrainerPace(Store(url), None, 1.5)._progress  # type: ignore[arg-type]  # it asks Redis elsewhere
 
 
 def _put_markers(names: list[str], url: str, direct: dict[str, str]) -> None:

@@ -15,7 +15,7 @@ TARGETS: dict[Axis, float] = {"samples": 1e7, "workers": 1e3, "plans": 1e3}
 """The farm that is asked about."""
 
 LIST_PATIENCE = 10.0
-"""Requests for one listing that a look each second can await: an answer takes some 0.1 s."""
+"""Requests that a look each second can await: an answer takes some 0.1 s."""
 
 S3_PER_S = 5500.0
 """Requests per second that S3 answers below one prefix, by its documentation."""
@@ -171,36 +171,36 @@ COSTS = (
     ),
     Cost(
         "bucket missing",
-        "list",
+        "requests",
         "samples",
-        "bucket: all that is missing, at the end and where the queue is filled: LISTs",
+        "bucket: all that is missing, at the end and where the queue is filled: requests",
         "",
         300.0,
         "30 s at 0.1 s each",
     ),
     Cost(
         "bucket refresh",
-        "list",
+        "requests",
         "samples",
-        "bucket: a reader's look without news, once a second: LISTs",
+        "bucket: a reader's look without news, once a second: requests",
         "",
         LIST_PATIENCE,
         "1 s at 0.1 s each",
     ),
     Cost(
         "bucket news",
-        "list",
+        "requests",
         "samples",
-        "bucket: a reader's look after a new marker: LISTs",
+        "bucket: a reader's look after a new marker: requests",
         "",
         LIST_PATIENCE,
         "as above",
     ),
     Cost(
         "bucket pace",
-        "list",
+        "requests",
         "samples",
-        "bucket: a worker's look with --ahead, each 5 s: LISTs",
+        "bucket: a worker's look with --ahead, each 5 s: requests",
         "",
         S3_PER_S * AHEAD_LOOK_S / TARGETS["workers"],
         "5500 a second in all, with 1000 workers",
@@ -250,7 +250,7 @@ COSTS = (
         "all wait for the last job: listings of all markers",
         "/s",
         17.0,
-        "313 LISTs each, 5500 a second in all",
+        "313 requests each, 5500 a second in all",
     ),
     Cost("plans", "open_read", "plans", "a worker before its first job: files read", "", 10_000.0, "as bytes above"),
     Cost(

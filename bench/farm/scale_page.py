@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from bench.farm.scale_costs import TARGETS, Axis, Cost, Grown, first_to_break
-from bench.farm.scale_store import SHARD_ROWS, SPEC
+from bench.farm.scale_store import FAILED, SHARD_ROWS, SPEC
 from bench.farm.scale_workers import COMMITTED, JOB_S
 from bench.harness import results
 
@@ -17,26 +17,30 @@ SAMPLE_BYTES = 1.0e6
 def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str) -> str:
     """The page; `before` are the same costs at an earlier commit."""
     tables = "\n\n".join(_table(axis, now, before) for axis in ORDERED if any(e.cost.axis == axis for e in now))
-    product = f"the product at commit {commit.split()[0]}, measured by this bench"
-    earlier = f"; in brackets, before what is told under [Mended](#mended): {product}" if before else ""
+    product = f"the product at commit {commit.partition(' ')[0]}, measured by this bench"
+    earlier = f" In brackets is what was before [what is mended](#mended): {product}." if before else ""
     return f"""# What breaks first
 
 Ten million samples (10 TB of `{SPEC}`), a thousand workers, a thousand plans: which cost is the first that nobody can
-bear? Costs are measured at sizes that fit this machine and fitted by constant + factor · size ^ exponent{earlier}.
-*Borne* is what we say can still be borne, and why; *ends at* is the size from which on it is more.
+bear? Costs are measured at sizes that fit this machine, and fitted by constant + factor · size ^ exponent. *Borne* is
+what we say can still be borne, and why; *ends at* is the size from which on it is more.{earlier}
 
 {_verdict(now, before)}
 
 {tables}
 
 Processor seconds are of one core of this machine, which others used as well; operations are counted. Exponents have
-their 95 % interval. Where a cost is all but constant over the sizes, its mean is given. Stores over samples are of
-`{SPEC}`, in jobs of {SHARD_ROWS}, without guides (with them, there is a second folder of markers, and listings are
-twice as long); one job in twenty is missing. Their markers come from a generator, in the format of a commit, and the
-shards that they name are not there. Workers are real ones (queue, heartbeat, commit, markers), many to a process, whose
-images of 8 × 8 pixels take {JOB_S:g} s a job, asleep; at the end all of them wait for a job that somebody else holds,
-in a store of {COMMITTED} jobs and more. Commands include those within scripts. Requests to a bucket are counted on the
-way to a real S3 server of this machine.
+their 95 % interval. Where a cost is all but constant over the sizes, its mean is given.
+
+Stores over samples are of `{SPEC}`, in jobs of {SHARD_ROWS}, without guides (with them, there is a second folder of
+markers, and listings are twice as long); the last twentieth of the jobs is missing, and {FAILED} others, as if they had
+failed. Their markers come from a generator, in the format of a commit, and the shards that they name are not there.
+What a worker reads grows up to a chunk of 65 536 rows of each input, which the smallest stores do not fill, and no
+further. Requests to a bucket are counted on the way to a real S3 server of this machine.
+
+Workers are real ones (queue, heartbeat, commit, markers), many to a process, whose images of 8 × 8 pixels take
+{JOB_S:g} s a job, asleep; at the end all of them wait for a job that somebody else holds, in a store of {COMMITTED}
+jobs and more. Commands include those within scripts.
 
 ## Files
 
@@ -141,9 +145,9 @@ MENDED = """## Mended
 Nothing of it changes the store's format, or what a commit guarantees; each has a test that counts operations.
 
 - **Waiting workers.** Each idle worker listed all markers every two seconds, and read all of Redis' keys three to nine
-  times: listings by workers × markers, and commands by the square of the workers. Now one looks, and Redis keeps for
-  two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once more
-  for itself. (`test_queue_look.py`)
+  times: listings by workers × markers, and commands that grew faster than the workers. Now one looks, and Redis keeps
+  for two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once
+  more for itself. (`test_queue_look.py`)
 - **The whole plan in every worker.** A worker read all inputs of all plans and kept them. Now it reads the chunks of
   65 536 rows that its job lies in, and keeps two of each input (`plan_rows`). Whoever fills the queue reads the chunks
   of what it queues, so that damage still keeps jobs from being queued. (`test_plan_rows.py`)
@@ -152,7 +156,7 @@ Nothing of it changes the store's format, or what a commit guarantees; each has 
   something cannot be read. (`test_followed_markers.py`)
 - **Looks in a folder** still list everything, and so does the arithmetic on all rows after news. Trainer and `--ahead`
   now wait twenty times as long as a look took, so that looks take a twentieth of the time at most; they take more than
-  that from some 2·10^6 samples on. (`test_dataset.py`, `test_trainer_pace.py`)
+  that from some 10^6 samples on. (`test_dataset.py`, `test_trainer_pace.py`)
 
 ## Not mended, and not measured
 

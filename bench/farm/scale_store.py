@@ -1,7 +1,8 @@
 """What a store of so many samples costs those who open it: one process for each step, nothing rendered.
 
 The plan, the queue and the readers are those of the product. Markers are written by `plans.Markers`, in their format
-and without the syncs of a commit, and the shards that they name are not there. One job in twenty is missing.
+and without the syncs of a commit, and the shards that they name are not there. The last jobs are missing, and some
+others.
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from photonfarm.shared.store.io.local import LocalStorage
 
 SPEC = "room"
 SHARD_ROWS = 32
-MISSING_EVERY = 20
-"""Every so many jobs one is missing."""
+LAST = 0.05
+"""The share of the jobs that are missing at the end: jobs are committed about in the order of their numbers."""
+
+FAILED = 3
+"""The jobs that are missing among the others, at even distances, as if they had failed."""
 
 FURTHER = 1000
 """The samples of the submission that follows."""
@@ -51,6 +55,12 @@ def timed(action: Callable[[], Any]) -> Costs:
     return {**costs, **{name: float(count) for name, count in operations.items()}}
 
 
+def missing_of(jobs: int) -> list[int]:
+    """The jobs that are left without a marker, in order."""
+    last = jobs - max(int(jobs * LAST), 1)
+    return [*range(last // (2 * FAILED), last, max(last // FAILED, 1)), *range(last, jobs)]
+
+
 def _store(folder: Path) -> Any:
     from photonfarm.shared.store import Store
 
@@ -76,9 +86,8 @@ def plan(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 def mark(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """Markers of all jobs but some."""
     markers = Markers(folder / "store")
-    for job in range(markers.jobs):
-        if job % MISSING_EVERY != MISSING_EVERY - 1:
-            markers.place(job)
+    for job in sorted({*range(markers.jobs)} - {*missing_of(markers.jobs)}):
+        markers.place(job)
     (committed,) = folder.glob("store/scenes/*/committed")
     return {"markers": len(list(committed.iterdir())), "jobs": markers.jobs}
 
@@ -98,7 +107,7 @@ def worker(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     def begin() -> Any:
         store = _store(folder)
         scene = store.scenes()[0]
-        job = min(MISSING_EVERY - 1, scene.jobs() - 1)
+        job = scene.jobs() - 1
         return store, scene.is_done(job), scene.job_rows(job)
 
     return timed(begin)
@@ -138,11 +147,10 @@ def reader(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     from photonfarm.shared.store import SceneReader
 
     markers = Markers(folder / "store")
-    scene_id, last = markers.scene.scene_id, min(MISSING_EVERY, markers.jobs) - 1
+    scene_id, last = markers.scene.scene_id, markers.jobs - 1
     followed = SceneReader(folder / "store", scene_id)
     path = markers.scene.storage.local(f"{markers.scene.name}/committed/{last:012d}.json")
     del markers.plan, markers.scene
-    path.unlink(missing_ok=True)
     start = timed(followed.refresh)
     idle = timed(followed.refresh)
     Markers(folder / "store").place(last)

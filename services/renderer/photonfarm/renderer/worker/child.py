@@ -138,12 +138,11 @@ class RenderWorker(QueueWorker):
         self._store.check()
         only = self._settings.scene_id
         found = queue.look(self._store, self.connection, scene_id=only, every_s=self._settings.idle_s)
-        if found == "queued" or (found == "waits" and not self._not_here):  # what is left may be nothing for this one
+        if found == "queued" or (found == "waits" and not self._outcomes.not_here):  # what is left may not be for it
             return False
         self._store.sweep()
         if not self._settings.until_complete:
             return False
-        only = self._settings.scene_id
         missing, unreadable = missing_jobs(self._store, () if only is None else (only,))
         failed = queue.queue_status(self.connection).failed
         reasons = {name: failure.reason for name, failure in failed.items()}

@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 PROJECTS := shared services/renderer services/trainer
 
-.PHONY: setup demo test test-slow test-compose check docs lock clean
+.PHONY: setup demo test test-slow test-compose test-slurm test-kubernetes check docs lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -34,6 +34,20 @@ test-slow: $(STAMP)
 # The compose file, run for real; needs a Docker engine.
 test-compose: $(STAMP)
 	PHOTONFARM_TEST_COMPOSE=1 $(BIN)/python -m pytest -s tests/end_to_end/test_compose.py
+
+# photonfarm slurm on a SLURM of two nodes, which the test starts: as root, with Debian's slurmctld, slurmd, slurm-client
+# and munge installed. A quarter of an hour, as SLURM lets requeued jobs wait.
+test-slurm: $(STAMP)
+	PHOTONFARM_TEST_SLURM=1 $(BIN)/python -m pytest -s tests/end_to_end/test_slurm.py
+
+# The chart and the kustomize files, validated by helm and kubectl and run for real by Podman (docs/kubernetes.md); what
+# is not found is skipped.
+test-kubernetes: $(VENV)/.kubernetes-ready
+	PHOTONFARM_TEST_KUBERNETES=1 $(BIN)/python -m pytest -sv tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
+
+$(VENV)/.kubernetes-ready: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[kubernetes]'
+	@touch $@
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -87,4 +87,6 @@ def room() -> trimesh.Scene:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("name the file to write: python make_room.py my-room.glb")
     room().export(sys.argv[1])

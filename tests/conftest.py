@@ -19,6 +19,9 @@ from photonfarm.shared.store import Store
 # other tests the cores that these share, and images then take four times as long.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+# Tests of equal bytes are of processors, also on a machine with a card; tests of cards ask for one.
+os.environ.setdefault("PHOTONFARM_DEVICE", "cpu")
+
 
 @pytest.fixture(scope="session")
 def analytic() -> ModuleType:

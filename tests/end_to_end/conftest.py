@@ -1,3 +1,4 @@
+import importlib
 import os
 import re
 import subprocess
@@ -5,7 +6,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import click
 import pytest
+
+from photonfarm.shared.cli.main import umbrella
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -52,3 +56,26 @@ def small_room_in() -> Callable[[Path], Path]:
 def small_room(small_room_in: Callable[[Path], Path], tmp_path: Path) -> Path:
     """The spec of the small room, in an empty folder."""
     return small_room_in(tmp_path)
+
+
+@pytest.fixture
+def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
+    """The command line, which does nothing but parse, and asks for no file. Raises UsageError."""
+    monkeypatch.setenv("PHOTONFARM_DEVICE", "cpu")  # `--device` sets it, and the test's end restores it
+    monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
+    monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
+    return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder: an empty one, without a Redis, and with modules of its own."""
+    monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
+    monkeypatch.delenv("PHOTONFARM_SCENES", raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    sys.modules.pop("mine", None)
+    importlib.invalidate_caches()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,23 @@ def test_a_plan_submitted_from_the_host_is_rendered_by_three_workers_and_trained
     assert len(password) == 64
     assert password not in compose("logs", "--no-color", data=data)
     assert password not in compose("exec", "-T", "redis", "sh", "-c", "cat /proc/[0-9]*/cmdline", data=data)
+    (port,) = s3_server.free_ports(1)
+    compose("--profile", "web", "up", "-d", "web", data=data, PHOTONFARM_WEB_PORT=str(port))
+    assert "<title>photonfarm" in fetched(f"http://localhost:{port}/", deadline)
+    metrics = fetched(f"http://localhost:{port}/metrics", deadline)
+    assert 'photonfarm_samples_committed_total{pass="first",scene="room"' in metrics
+
+
+def fetched(url: str, deadline: float) -> str:
+    """What a page says, as soon as its server answers."""
+    while True:
+        try:
+            with urllib.request.urlopen(url, timeout=20) as answer:
+                return answer.read().decode()
+        except OSError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(1)
 
 
 def assert_is_guarded(container: dict[str, Any]) -> None:

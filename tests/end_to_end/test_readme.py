@@ -9,7 +9,6 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +19,6 @@ import pytest
 import store_samples as samples
 import torch
 
-from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store
 from photonfarm.trainer.training.unbiasedness import judged
@@ -120,14 +118,6 @@ def commands(line: str) -> list[list[str]]:
 def in_passing(text: str) -> list[list[str]]:
     """The arguments of each `photonfarm` with a verb between backticks."""
     return [arguments.split() for arguments in re.findall(r"`photonfarm ([a-z][^`]*)`", text)]
-
-
-@pytest.fixture
-def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
-    """The command line, which does nothing but parse, and asks for no file. Raises UsageError."""
-    monkeypatch.setattr(click.Command, "invoke", lambda *_: None)
-    monkeypatch.setattr(click.Path, "convert", lambda _, value, *__: value)
-    return lambda arguments: umbrella.main(arguments, prog_name="photonfarm", standalone_mode=False)
 
 
 @pytest.mark.parametrize("page", PAGES)

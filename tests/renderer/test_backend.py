@@ -3,6 +3,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nvidia_driver
 import pytest
 
 from photonfarm.renderer.scene import backend
@@ -48,6 +49,34 @@ def test_an_unknown_variant_is_refused_with_those_that_exist() -> None:
 def test_a_variant_that_the_integrator_cannot_use_is_refused() -> None:
     done = run(LOAD, PHOTONFARM_VARIANT="scalar_rgb")
     assert "BackendError: photonfarm.renderer.bdpt" in done.stderr
+
+
+def test_a_variant_of_another_device_than_the_one_named_is_refused() -> None:
+    for device, variant in (("cpu", "cuda_ad_rgb"), ("cuda", "llvm_ad_rgb")):
+        done = run(LOAD, PHOTONFARM_DEVICE=device, PHOTONFARM_VARIANT=variant)
+        assert f"BackendError: PHOTONFARM_VARIANT = {variant!r}" in done.stderr
+
+
+def test_one_card_is_shown_to_mitsuba_and_llvm_is_not_looked_for(tmp_path: Path) -> None:
+    """With a driver that lists cards and can do nothing else, so that Mitsuba refuses it in the end."""
+    code = """
+import os
+from photonfarm.renderer.scene import backend
+from photonfarm.shared.core.errors import BackendError
+found = backend.device()
+print(found.variant, found.name, found.card.number, backend.paths_at_once())
+try:
+    backend.load(1)
+except BackendError as error:
+    print(error)
+print(os.environ["CUDA_VISIBLE_DEVICES"], os.environ["CUDA_DEVICE_ORDER"])
+"""
+    driver = str(nvidia_driver.made(tmp_path))
+    libraries = {"DRJIT_LIBCUDA_PATH": driver, "DRJIT_LIBOPTIX_PATH": driver, "DRJIT_LIBLLVM_PATH": "/nowhere"}
+    done = run(code, PHOTONFARM_DEVICE="cuda:1", CUDA_VISIBLE_DEVICES="4,6", **libraries)
+    chosen, refused, shown = done.stdout.splitlines()
+    assert (chosen, shown) == ("cuda_ad_rgb Test Card B 1 16777216", "6 PCI_BUS_ID")
+    assert "'cuda_ad_rgb' cannot be used here" in refused
 
 
 def test_versions_that_crash_are_not_chosen_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

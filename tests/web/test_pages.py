@@ -25,6 +25,7 @@ from PIL import Image, PngImagePlugin
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.farm.training import PROGRESS, WAITS
 from photonfarm.shared.farm.watch import FarmWatch
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import relative_variance
@@ -63,8 +64,8 @@ def trained(scene: SceneStore, folder: Path) -> Path:
     (folder / "views").mkdir(parents=True)
     records = [
         {"kind": "validation", "step": step, "error": 1 / (step + 1), "standard_error": 0.1 / (step + 1),
-         "held_out": 2, "samples": 6, "seconds": {"train": float(step)}}
-        for step in (0, 50, 100)
+         "held_out": held_out, "samples": 6, "seconds": {"train": float(step)}}
+        for step, held_out in ((0, 1), (50, 2), (100, 2))
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
     (folder / "settings.json").write_text('{"max_steps": 200}')
@@ -139,6 +140,15 @@ def test_the_state_is_that_of_store_and_run(server: PageServer, scene: SceneStor
     assert (training["run"], training["step"], training["steps"]) == (run.name, 100, 200)
 
 
+def test_what_training_does_is_said_once(scene: SceneStore, tmp_path: Path) -> None:
+    said = {"at_s": time.time(), "step": 100, "phase": WAITS, "left_s": 90.0}
+    (trained(scene, tmp_path / "run") / PROGRESS).write_text(json.dumps(said))
+    with served(Store(scene.folder.parent.parent), [tmp_path / "run"]) as serving:
+        (training,) = document(serving, "/api/state")["trainings"]
+    figures = ", 90 s left, held-out error 0.00990 ± 0.00099 on 2 samples"
+    assert (training["phase"], training["figures"]) == (WAITS, figures)
+
+
 def test_the_wall_has_what_landed_last_and_the_maps_where_it_was_seen_from(
     server: PageServer, scene: SceneStore
 ) -> None:
@@ -192,6 +202,7 @@ def test_points_and_photons_are_those_of_the_sample(server: PageServer, scene: S
 def test_curves_and_predictions_are_those_of_the_run(server: PageServer, scene: SceneStore) -> None:
     (found,) = document(server, "/api/curves")
     assert [point[:3] for point in found["validations"]] == [[0, 0.0, 1.0], [50, 50.0, 1 / 51], [100, 100.0, 1 / 101]]
+    assert [point[5] for point in found["validations"]] == [1, 2, 2]
     assert (found["steps"], found["rows"], found["scene_id"]) == ([50, 100], [0, 1], scene.scene_id)
     assert picture(server, "/run/0/50.png")[0, 0].tolist() == [50, 90, 20]
 
@@ -326,7 +337,11 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             page.wait_for("document.querySelectorAll('.wall img').length === 6")
             page.wait_for(pictures_there)
             assert page.value("document.querySelectorAll('svg.plot circle').length") >= 12
-            assert run.name in page.value("document.body.innerText")
+            said = page.value("document.body.innerText")
+            assert f"{run.name}: 0.00990 at step 100, on 2 held-out samples" in said
+            assert "hollow ones were measured on fewer held-out samples" in " ".join(said.split())
+            told = "[...document.querySelectorAll('circle.hollow')].map((point) => point.textContent)"
+            assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out sample"], "by steps and by seconds"
             assert page.value("document.documentElement.scrollWidth") <= width
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")

@@ -52,7 +52,7 @@ class FarmPages:
             "workers": [{"name": name, **asdict(each)} for name, each in sorted(view.activities.items())],
             "waits": [str(wait) for wait in view.waits],
             "failed_before": [{"cause": cause.cause, "jobs": len(cause.jobs)} for cause in view.queue.kept],
-            "trainings": [asdict(training) | {"note": training.note} for training in view.trainings],
+            "trainings": [asdict(training) | {"figures": training.figures} for training in view.trainings],
         }
 
     # --------------------------------------------------------------------------------------------------------- samples
@@ -109,7 +109,7 @@ class FarmPages:
 def _curves(run: RunFolder) -> dict[str, Any]:
     records, steps = list(run.records), _steps(run.folder)  # a copy, as another thread may add some
     validations = [
-        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"]]
+        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"], r["held_out"]]
         for r in records
         if r.get("kind") == "validation"
     ]

@@ -1,162 +1,22 @@
-"""Machines whose clocks differ by a year: nothing is lost, numbered or ordered by what a machine takes for the time.
+"""A store whose machines have clocks a year apart: nothing is lost, numbered or ordered by what these tell."""
 
-A machine with a wrong clock is a process whose C library tells another time: time namespaces leave the time of day
-alone, so that a few lines of C are loaded before it, which Python, Redis' client, RQ and Zarr all ask, and not only
-those that call `time.time`. Files are stamped by the file system, whose clock is right, as a file server's would be.
-"""
-
-import json
 import os
-import shutil
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import store_samples as samples
+from skewed_clock import SKEWS, YEAR_S, Machine, root_of, rows_read
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import beat, connect, hosts, queue_status, reconcile
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
-
-YEAR_S = 365 * 86400
-ENDED_S = 60.0  # for a process to end that nobody talks to any more
-SKEWS = pytest.mark.parametrize("skew_s", [YEAR_S, -YEAR_S], ids=["a year ahead", "a year behind"])
-
-CLOCK = r"""
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <stdlib.h>
-#include <sys/time.h>
-#include <time.h>
-
-static long skew(void) { const char *told = getenv("CLOCK_SKEW_S"); return told ? atol(told) : 0; }
-
-int clock_gettime(clockid_t clock, struct timespec *now) {
-    static int (*plain)(clockid_t, struct timespec *);
-    if (!plain) plain = dlsym(RTLD_NEXT, "clock_gettime");
-    int result = plain(clock, now);
-    if (!result && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE)) now->tv_sec += skew();
-    return result;
-}
-
-int gettimeofday(struct timeval *restrict now, void *restrict zone) {
-    struct timespec precise;
-    int result = clock_gettime(CLOCK_REALTIME, &precise);
-    now->tv_sec = precise.tv_sec;
-    now->tv_usec = precise.tv_nsec / 1000;
-    return result;
-}
-
-time_t time(time_t *now) {
-    struct timespec precise;
-    clock_gettime(CLOCK_REALTIME, &precise);
-    if (now) *now = precise.tv_sec;
-    return precise.tv_sec;
-}
-"""
-
-MACHINE = """
-import contextlib, io, json, sys, traceback
-from pathlib import Path
-from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import beat, connect, queue_status, reconcile
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.plan.top_up import TopUp
-sys.path.append(sys.argv[1])
-import analytic_scene as analytic
-
-names = dict(globals())
-for line in sys.stdin:
-    code, root, url = json.loads(line)
-    said, error = io.StringIO(), ""
-    try:
-        with contextlib.redirect_stdout(said):
-            exec(code, {**names, "root": root, "url": url, "store": Store(root)})
-    except Exception:
-        error = traceback.format_exc()
-    print(json.dumps([said.getvalue().strip(), error]), flush=True)
-"""
-
-
-@pytest.fixture(scope="module")
-def clock(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The library that tells another time."""
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        pytest.skip("no C compiler, of which a wrong clock is made")
-    folder = tmp_path_factory.mktemp("clock")
-    (folder / "clock.c").write_text(CLOCK)
-    subprocess.run(
-        [compiler, "-shared", "-fPIC", "-O1", "-o", folder / "clock.so", folder / "clock.c", "-ldl"], check=True
-    )
-    return folder / "clock.so"
-
-
-Machine = Callable[..., str]
-
-
-@pytest.fixture(scope="module")
-def machine(clock: Path, analytic: ModuleType) -> Iterator[Machine]:
-    """Function (skew in seconds, store, code, URL of Redis) → what the code prints on the machine with that skew."""
-    machines: dict[int, subprocess.Popen[str]] = {}
-
-    def started(skew_s: int) -> subprocess.Popen[str]:
-        told = os.environ | {"LD_PRELOAD": str(clock), "CLOCK_SKEW_S": str(skew_s)}
-        command = [sys.executable, "-c", MACHINE, str(analytic.FOLDER)]
-        return subprocess.Popen(command, env=told, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-
-    def at(skew_s: int, root: Path, code: str, url: str = "") -> str:
-        if skew_s not in machines:
-            machines[skew_s] = started(skew_s)
-        talk = machines[skew_s]
-        assert talk.stdin is not None
-        assert talk.stdout is not None
-        with suppress(BrokenPipeError):  # it has ended: there is no line then
-            talk.stdin.write(json.dumps([code, str(root), url]) + "\n")
-            talk.stdin.flush()
-        line = talk.stdout.readline()
-        assert line, f"the machine {skew_s} s off has ended by itself, with return code {talk.wait(ENDED_S)}"
-        said, error = json.loads(line)
-        assert not error, error
-        return str(said)
-
-    try:
-        yield at
-        for process in machines.values():
-            process.communicate(timeout=ENDED_S)  # closes what it listens to, which ends it
-        assert {skew_s: process.returncode for skew_s, process in machines.items()} == dict.fromkeys(machines, 0)
-    finally:
-        for process in machines.values():
-            with process:  # waits
-                process.kill()
-
-
-@pytest.fixture
-def scene(planned: Callable[..., SceneStore]) -> SceneStore:
-    """Four jobs of two samples."""
-    return planned(4)
-
-
-def root_of(scene: SceneStore) -> Path:
-    return scene.folder.parent.parent
-
-
-def rows_read(scene: SceneStore) -> list[int]:
-    reader = SceneReader(root_of(scene), scene.scene_id)
-    return [reader.read(row).row for row in reader.refresh().tolist()]
 
 
 @SKEWS
@@ -342,95 +202,3 @@ def test_repairs_of_machines_a_year_apart_are_numbered_in_their_order_and_lose_n
         assert (root / f"quarantine/{number:06d}" / file.relative_to(root)).read_bytes() == content
         assert machine(-skew_s, root, RENDER.format(jobs=[job])) == "True"
     assert len(rows_read(scene)) == 8
-
-
-# ---------------------------------------------------------------------------------------------------------------- Redis
-
-
-@SKEWS
-def test_a_heartbeat_ends_by_the_servers_clock(
-    machine: Machine, scene: SceneStore, redis_server: EmbeddedRedis, skew_s: int
-) -> None:
-    connection = connect(redis_server.url)
-    code = "beat(connect(url), 'ada', 'elsewhere', 'a-job', ttl_s={ttl_s})"
-    machine(skew_s, root_of(scene), code.format(ttl_s=60), redis_server.url)
-    assert hosts(connection) == {"elsewhere"}
-    left_ms = [connection.pttl(key) for key in connection.keys("*") if b"a-job" in key or b"ada" in key]
-    assert len(left_ms) == 2
-    assert all(30_000 < left <= 60_000 for left in left_ms)
-    machine(skew_s, root_of(scene), code.format(ttl_s=0.2), redis_server.url)
-    time.sleep(0.3)
-    assert hosts(connection) == set()
-
-
-@SKEWS
-def test_who_is_alive_here_is_alive_for_a_machine_with_a_wrong_clock_and_who_is_dead_is_dead(
-    machine: Machine, scene: SceneStore, redis_server: EmbeddedRedis, skew_s: int
-) -> None:
-    """Its reconciliation queues again what nobody renders, and nothing else."""
-    connection, url = connect(redis_server.url), redis_server.url
-    assert reconcile(Store(root_of(scene)), connection) == 4
-    queued = machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url)
-    assert queued == "0"
-    connection.flushall()
-    beat(connection, "ada", "here", f"{scene.scene_id}-1", ttl_s=60)
-    beat(connection, "bob", "here", f"{scene.scene_id}-2", ttl_s=0.1)
-    time.sleep(0.2)
-    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url) == "3"
-    told = machine(skew_s, root_of(scene), "print(queue_status(connect(url)).workers)", url)
-    assert told == "1"
-
-
-@pytest.fixture
-def skewed_worker(
-    clock: Path, analytic: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """`analytic_scene.start_worker` with a skew; all of them are ended with the test."""
-    started = []
-
-    def start(skew_s: int, *arguments: Any, **settings: Any) -> subprocess.Popen[bytes]:
-        with monkeypatch.context() as changed:
-            changed.setenv("LD_PRELOAD", str(clock))
-            changed.setenv("CLOCK_SKEW_S", str(skew_s))
-            started.append(analytic.start_worker(*arguments, **settings))
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.slow
-def test_workers_a_year_apart_share_a_queue_and_one_that_dies_is_replaced(
-    analytic: ModuleType,
-    planned: Callable[..., SceneStore],
-    skewed_worker: Callable[..., subprocess.Popen[bytes]],
-    clean_bytes: Callable[[int], dict[str, bytes]],
-    stored_bytes: Callable[[SceneStore], dict[str, bytes]],
-    redis_server: EmbeddedRedis,
-    tmp_path: Path,
-) -> None:
-    scene = planned(16)
-    root, connection = root_of(scene), connect(redis_server.url)
-    logs = {skew_s: tmp_path / f"log{skew_s}" for skew_s in (YEAR_S, -YEAR_S)}
-    running = [
-        skewed_worker(
-            skew_s, root, redis_server.url, analytic.command(0.1), log, until_complete=True, name=f"worker{skew_s}"
-        )
-        for skew_s, log in logs.items()
-    ]
-    analytic.wait_for(lambda: len(_workers(scene)) == 2, 120)
-    os.kill(analytic.child_of(running[0]), 9)
-    assert [process.wait(240) for process in running] == [0, 0]
-    assert scene.missing_jobs() == []
-    assert queue_status(connection).failed == {}
-    Store(root).sweep(stray_age_s=0)
-    assert stored_bytes(scene) == clean_bytes(16)
-    assert len(rows_read(scene)) == 32
-    times = [json.loads(path.read_bytes())["figures"]["wall_s"] for path in (scene.folder / "committed").iterdir()]
-    assert all(0 < seconds < 60 for seconds in times), "a job's seconds are those of a clock that runs evenly"
-
-
-def _workers(scene: SceneStore) -> set[str]:
-    return {scene.marker(job)["figures"]["worker"] for job in scene.committed_jobs()}

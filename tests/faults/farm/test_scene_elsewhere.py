@@ -40,8 +40,8 @@ def test_files_that_come_later_are_found_by_a_worker_that_is_at_work(
 ) -> None:
     code = """
 import runpy, sys
-from photonfarm.renderer.worker import child as worker_child
-worker_child.NOT_HERE_S = 3.0
+from photonfarm.renderer.worker import outcomes
+outcomes.NOT_HERE_S = 3.0
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

@@ -57,7 +57,9 @@ def test_the_spec_is_commented_and_the_scene_lies_beside_it(
     result = run("source/room.gltf", "--out", "my/den.toml", "--json")
     made = json.loads(result.stdout)
     assert Path(made["spec"]) == Path("my/den.toml")
-    assert "Made by `photonfarm scene import` from room.gltf" in Path("my/den.toml").read_text()
+    text = " ".join(Path("my/den.toml").read_text().replace("\n# ", " ").split())
+    assert "Made by `photonfarm scene import` from room.gltf" in text
+    assert "run `photonfarm scene free-space SPEC --write` again" in text
     shutil.move("my", tmp_path / "elsewhere")
     shutil.rmtree(tmp_path / "here")
     assert load_spec(tmp_path / "elsewhere/den.toml").name == "den"

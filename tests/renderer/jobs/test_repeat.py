@@ -88,6 +88,31 @@ def test_what_differs_by_rounding_and_what_differs_by_more_have_their_exit_codes
     assert found.comparison.is_equal == (factor == 1)
 
 
+def test_what_a_card_rendered_is_not_said_to_be_repeatable_to_the_bit(
+    analytic: ModuleType, analytic_store: SceneStore
+) -> None:
+    class Other(analytic.AnalyticScene):  # type: ignore[name-defined, misc]
+        """The scene as a processor renders it."""
+
+        def render_halves(self, view: Any, seeds: Any) -> Any:
+            return super().render_halves(view, seeds) * np.float32(1 + 1e-3)
+
+    (marker,) = analytic_store.folder.glob("committed/*.json")
+    content = json.loads(marker.read_text())
+    assert (content["figures"]["device"], content["figures"]["driver"]) == ("cpu", "")
+    for figures, repeats, on_card in (
+        ({"device": "NVIDIA H100", "driver": "550.54"}, False, True),
+        ({"device": "cpu", "driver": ""}, True, False),
+        ({}, True, False),  # as an older photonfarm wrote it
+    ):
+        rest = {name: value for name, value in content["figures"].items() if name not in ("device", "driver")}
+        marker.write_text(json.dumps({**content, "figures": {**rest, **figures}}))
+        found = again(analytic_store, 1, load=Other)
+        assert found.comparison is not None
+        assert (found.exit_code, found.comparison.repeats_bytes) == (1, repeats)
+        assert ("rendered on NVIDIA H100, here on cpu" in found.line()) == on_card
+
+
 def test_a_pass_is_written_as_an_archive_an_image_with_layers_or_a_picture(
     analytic: ModuleType, analytic_store: SceneStore, tmp_path: Path
 ) -> None:

@@ -16,6 +16,7 @@ from photonfarm.renderer.measure.exposure import Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.pictures import display_values
+from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 
@@ -67,14 +68,14 @@ def cornell(**film: int) -> SceneSpec:
 
 def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: None) -> None:
     told: list[str] = []
-    found = propose(cornell(), None, told.append, target=0.4, frames=16)
+    found = propose(cornell(), None, WorkLog(told.append), target=0.4, frames=16)
     assert told[0] == "rendering 16 views of cornell, 32 × 32, 2 × 8 spp"
     assert found.scene_id == cornell().scene_id
     assert found.low < found.exposure < (found.high or 0)
     scene = LoadedScene.load(exposure.shrunk(cornell(), exposure.SIDE).model_copy(update={"exposure": 1.0}))
-    halves = np.stack(list(exposure._rendered(scene, 16, 32, told.append)))  # more samples
+    halves = np.stack(list(exposure._rendered(scene, 16, 32, Steps(16))))  # more samples
     assert display_values(np.float32(found.exposure) * halves.mean(axis=1)).mean() == pytest.approx(0.4, abs=0.004)
-    again = propose(cornell().model_copy(update={"exposure": 9.0}), None, told.append, target=0.4, frames=16)
+    again = propose(cornell().model_copy(update={"exposure": 9.0}), None, WorkLog(told.append), target=0.4, frames=16)
     assert again.exposure == found.exposure  # whatever the spec says
     assert (again.present, found.present) == (9.0, 3.0)
     assert again.present_mean > found.present_mean
@@ -85,7 +86,7 @@ def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -
     away = described.view.model_copy(update={"look_at": described.view.look_at.model_copy(
         update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})})  # fmt: skip
     with pytest.raises(SpecError, match="stays below 0"):
-        propose(described.model_copy(update={"view": away}), None, lambda _: None, frames=2)
+        propose(described.model_copy(update={"view": away}), None, WorkLog(lambda _: None), frames=2)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from photonfarm.renderer.cli.measuring_verbs import scene_cost
 from photonfarm.renderer.measure import sample_costs as measuring
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
@@ -72,7 +73,8 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     applied: list[Modification] = []
     rendered: list[tuple[Any, ...]] = []
     monkeypatch.setattr(room, "base", lambda: (None, cloud))
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(process_time=lambda: clock[0], monotonic=lambda: clock[0]))
+    monkeypatch.setattr(backend, "work_s", lambda: clock[0])
+    monkeypatch.setattr(measuring, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(room, "apply", configured)
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))

@@ -14,7 +14,9 @@ backend.load(threads=1)
 from photonfarm.renderer.strategy import cache, plan  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.comparison import RelativeErrors  # noqa: E402
+from photonfarm.renderer.strategy.image_cost import ImageCost  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, CandidateRow, Measurement  # noqa: E402
+from photonfarm.renderer.strategy.objective.purpose import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
@@ -62,10 +64,15 @@ def measurement(*rows: CandidateRow) -> Measurement:
     """The measurement of a spec with (1, 1) and 2 samples per pixel."""
     default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
+        purpose=Purpose.IMAGES, configuration_s=0.0, view_s=0.0,
         film=Film(width=16, height=16), spp=2, half_s=0.1, views=3, max_depth=3,
         modelled=("lights: 1 area",), left_out=(), rows=rows or default, shared=0.0, filled=(1.0, 0.9, 0.8),
         near=((1.0, 0.9, 0.8),), power=((0.7, 0.295, 0.005),), asked_s=60.0, spent_s=5.0, compiling_s=1.0,
     )  # fmt: skip
+
+
+def digest(spec: SceneSpec) -> str:
+    return cache.digest(spec, Purpose.IMAGES)
 
 
 def text_of(found: TransportPlan) -> str:
@@ -94,6 +101,55 @@ def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -
     assert found.at_equal_cost[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
 
 
+def test_what_a_sample_takes_beside_its_halves_counts_for_training() -> None:
+    """In 0.1 s (1, 1) has 2 samples, which take all of it, and (0, 1) has a single one, which takes 0.07 s.
+
+    For images these are 0.08·0.07/1 against 0.06·0.10/2. With 0.4 s more for each half-estimate they are 0.08·0.47/1
+    against 0.06·0.50/2: what is saved by fewer samples is little of a sample's time.
+    """
+    rows = row(PLAIN, 0.2, 0.02, 0.04), row(LIGHT, 0.08, 0.0, 0.07), row(JOINED, 0.06, 0.02, 0.04)
+    alone = measurement(*rows)
+    beside = alone.model_copy(update={"purpose": Purpose.TRAINING, "configuration_s": 0.5, "view_s": 0.3})
+    for found, ratio in ((alone, 0.0056 / 0.003), (beside, 0.0376 / 0.015)):
+        compared = plan_of(spec_with(), found, cached=False).at_equal_cost
+        assert compared[LIGHT].relative_cost / compared[JOINED].relative_cost == pytest.approx(ratio)
+
+
+def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
+    times = {"purpose": Purpose.TRAINING, "configuration_s": 0.5, "view_s": 0.3}
+    found = plan_of(spec_with(), measurement().model_copy(update=times), cached=False)
+    text = text_of(found)
+    assert lines(found)[1].startswith("for training: ")
+    assert "a sample takes 500.0 ms for its configuration and 300.0 ms for its view" in text
+    assert "half_spp    loss  " in text
+    assert "relMSE" not in text
+    assert found.document()["for"] == "training"
+    assert found.halves_overhead is None
+
+
+def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
+    """Two images of 3 samples take 0.5 + 6·0.25 s in one launch."""
+    assert 2 * ImageCost(0.5, 0.25).of_a_half().time_s(3) == 2.0
+
+
+def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    spec, images = spec_with(), measurement()
+    training = images.model_copy(update={"purpose": Purpose.TRAINING, "view_s": 0.5})
+    cache.keep(spec, images)
+    assert cache.find(spec, Purpose.TRAINING) is None
+    cache.keep(spec, training)
+    assert cache.find(spec, Purpose.TRAINING) == training
+    assert cache.find(spec, Purpose.IMAGES) == images
+
+
+def test_the_guides_whose_time_belongs_to_a_sample_enter_the_digest_for_training_alone() -> None:
+    spec = spec_with()
+    more = spec.model_copy(update={"guides": spec.guides.model_copy(update={"light_samples": 9})})
+    assert cache.digest(more, Purpose.IMAGES) == cache.digest(spec, Purpose.IMAGES)
+    assert cache.digest(more, Purpose.TRAINING) != cache.digest(spec, Purpose.TRAINING)
+
+
 @pytest.mark.parametrize("seed", range(200))
 def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -104,13 +160,16 @@ def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int
     transport = {"connections": now.connections, "light_ratio": now.light_ratio, "half_spp": int(rng.integers(1, 9))}
     half_s = next(r for r in rows if r.candidate == now).cost.time_s(transport["half_spp"])
     found = measurement(*rows).model_copy(update={"half_s": half_s})
+    if seed % 2:  # for training, where samples take more than their half-estimates
+        beside = dict(zip(("configuration_s", "view_s"), half_s * np.exp(rng.normal(0, 1, 2)), strict=True))
+        found = found.model_copy(update={"purpose": Purpose.TRAINING, **beside})
     first = plan_of(spec_with(**transport), found, cached=False)
     written = spec_with(**first.settings["transport"])
     again = plan_of(written, found, cached=True)
     assert (again.candidate, again.half_spp) == (first.candidate, first.half_spp)
     assert "transport" not in again.changes
     assert _knows(found, written)
-    assert cache.digest(written) == cache.digest(first.spec)
+    assert digest(written) == digest(first.spec)
 
 
 @pytest.mark.parametrize(
@@ -130,18 +189,18 @@ def test_settings_are_kept_unless_others_are_significantly_better(error: float, 
     if changed:
         assert (found.candidate, list(found.changes)) == (LIGHT, ["transport", "photons"])
         assert verdict.startswith(
-            "change them: 1.67 ± 0.10 times as fast to the same error as the spec's settings, light"
+            "for images: change them: 1.67 ± 0.10 times as fast to the same error as the spec's settings, light"
         )
     else:
         assert (found.candidate, found.half_spp, list(found.changes)) == (JOINED, 2, ["photons"])
-        assert verdict == "no significant gain over the spec's settings: keep them"
+        assert verdict == "for images: no significant gain over the spec's settings: keep them"
         assert "light ratio 1 without connections was measured 1." in text_of(found)
 
 
 def test_the_best_settings_are_kept_as_the_best() -> None:
     spec = spec_with(connections=0, light_ratio=1.0)
     assert lines(plan_of(spec, measurement(), cached=False))[1] == (
-        "the spec's settings are the best measured: keep them"
+        "for images: the spec's settings are the best measured: keep them"
     )
 
 
@@ -237,13 +296,11 @@ def test_a_value_and_its_error_have_the_same_decimal_place(value: float, spread:
 
 def test_what_a_plan_decides_does_not_enter_its_digest_and_all_else_does() -> None:
     spec = spec_with()
-    assert cache.digest(spec_with(connections=0, light_ratio=4.0, half_spp=9)) == cache.digest(spec)
-    assert cache.digest(spec.model_copy(update={"photons": spec.photons.model_copy(update={"depth": 1})})) == (
-        cache.digest(spec)
-    )
-    assert cache.digest(spec_with(max_depth=4)) != cache.digest(spec)
+    assert digest(spec_with(connections=0, light_ratio=4.0, half_spp=9)) == digest(spec)
+    assert digest(spec.model_copy(update={"photons": spec.photons.model_copy(update={"depth": 1})})) == (digest(spec))
+    assert digest(spec_with(max_depth=4)) != digest(spec)
     other_film = parse_spec({**tomllib.loads(SPEC), "film": {"width": 24, "height": 16}}, where="spec")
-    assert cache.digest(other_film) != cache.digest(spec)
+    assert digest(other_film) != digest(spec)
 
 
 @pytest.mark.parametrize(
@@ -252,22 +309,22 @@ def test_what_a_plan_decides_does_not_enter_its_digest_and_all_else_does() -> No
 def test_what_was_measured_elsewhere_is_not_taken_for_what_was_measured_here(
     where: Any, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = cache.digest(spec_with())
+    here = digest(spec_with())
     elsewhere = {"_processor": "a slower one", "cpu_count": 999, "versions": {"mitsuba": "0"}, "_revision": b"0"}
     monkeypatch.setattr(where, name, lambda: elsewhere[name])
-    assert cache.digest(spec_with()) != here
+    assert digest(spec_with()) != here
 
 
 def test_a_measurement_that_cannot_be_read_is_as_good_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     spec, found = spec_with(), measurement()
-    assert cache.find(spec) is None
+    assert cache.find(spec, Purpose.IMAGES) is None
     file = cache.keep(spec, found)
-    assert cache.find(spec) == found
+    assert cache.find(spec, Purpose.IMAGES) == found
     whole = file.read_bytes()
     for broken in (whole[:100], b"", b"\xff\xfe", b"{}", whole.replace(b'"views": 3', b'"views": "many"')):
         file.write_bytes(broken)
-        assert cache.find(spec) is None
+        assert cache.find(spec, Purpose.IMAGES) is None
 
 
 # -------------------------------------------------------------------------------------------------- the command itself
@@ -291,7 +348,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("box.toml", "--seconds", "2", "--json")
+    code, out, err = run("box.toml", "--seconds", "4", "--json")
     assert code == 0
     assert f"measuring {len(GRID)} settings" in err
     first = json.loads(out)
@@ -300,7 +357,7 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     }
     assert (tmp_path / "box.toml").read_text() == SPEC
 
-    code, out, err = run("box.toml", "--seconds", "2", "--json", "--write")
+    code, out, err = run("box.toml", "--seconds", "4", "--json", "--write")
     assert (code, json.loads(out)["cached"]) == (0, True)
     assert json.loads(out)["settings"] == first["settings"]
     for table in ("transport", "photons"):
@@ -316,6 +373,8 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
 
     code, out, _ = run("box.toml", "--seconds", "1", "--json", "--again")
     assert (code, json.loads(out)["cached"]) == (0, False)
+    assert json.loads(out)["for"] == "training"
+    assert min(json.loads(out)["measurement"][part] for part in ("configuration_s", "view_s")) > 0
 
 
 @pytest.fixture
@@ -323,12 +382,17 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The seconds of each pilot, in place of the pilots."""
     seconds: list[float] = []
 
-    def measure(spec: SceneSpec, beside: Path | None, asked_s: float, log: Any) -> Measurement:
+    def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, asked_s: float, log: Any) -> Measurement:
         seconds.append(asked_s)
-        return measurement().model_copy(update={"asked_s": asked_s})
+        return measurement().model_copy(update={"asked_s": asked_s, "purpose": purpose})
 
     monkeypatch.setattr(plan, "measure", measure)
     return seconds
+
+
+def test_each_purpose_has_a_pilot_of_its_own(run: Run, asked: list[float]) -> None:
+    said = [json.loads(run("box.toml", "--json", *more)[1])["for"] for more in ([], ["--for", "images"], [])]
+    assert (said, len(asked)) == (["training", "images", "training"], 2)
 
 
 def test_a_short_pilot_does_not_serve_for_the_default(run: Run, asked: list[float]) -> None:

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import WorkLog, time_left
+from photonfarm.shared.core.waiting import Steps, WorkLog
 
 
 def test_what_is_done_is_said_again_with_how_far_it_is() -> None:
@@ -25,9 +25,46 @@ def test_what_is_done_is_said_again_with_how_far_it_is() -> None:
     assert len(lines) == said, "nothing is said after the end"
 
 
-def test_the_time_left_follows_from_the_steps_that_are_done() -> None:
-    assert time_left(0, 8, time.monotonic()) == "0 of 8"
-    assert time_left(2, 8, time.monotonic() - 10).startswith("2 of 8, about 30 s")
+def test_the_time_left_follows_from_the_steps_that_are_done_and_never_rises_while_one_is_in_hand() -> None:
+    now = [0.0]
+    steps = Steps(8, clock=lambda: now[0])
+    now[0] = 10.0
+    assert (steps.left_s, steps.words()) == (None, "0 of 8")
+    steps.reach(2)
+    assert steps.words() == "2 of 8, about 30 s left"
+    left = []
+    for now[0] in (12.0, 14.0, 19.0, 60.0):
+        left.append(steps.left_s)
+    assert left == [28.0, 26.0, 21.0, 20.0], "those in hand last longer than expected, and the rest not more"
+    steps.reach(8)
+    assert steps.words() == "8 of 8, about 0 s left"
+
+
+def test_slow_first_steps_say_how_long_the_rest_takes_at_most_and_do_not_count_afterwards() -> None:
+    now = [0.0]
+    steps = Steps(8, slow=2, clock=lambda: now[0])
+    now[0] = 60.0
+    steps.reach(1)
+    assert steps.words() == "1 of 8, at most 7 min left"
+    now[0] = 64.0
+    steps.reach(2)
+    now[0] = 67.0
+    steps.reach(3)
+    assert steps.words() == "3 of 8, about 15 s left"
+
+
+def test_what_a_budget_leaves_no_time_for_does_not_count() -> None:
+    now = [0.0]
+    steps = Steps(8, slow=2, most_s=lambda: 50.0 - now[0], clock=lambda: now[0])
+    now[0] = 40.0
+    steps.reach(1)
+    assert steps.words() == "1 of 8, at most 40 s left", "the second step begins in any case, and the first took 40 s"
+    now[0] = 44.0
+    steps.reach(2)
+    assert steps.words() == "2 of 8, at most 6 s left"
+    now[0] = 47.0
+    steps.reach(3)
+    assert steps.words() == "3 of 8, about 3 s left"
 
 
 @pytest.mark.usefixtures("hears_ctrl_c")

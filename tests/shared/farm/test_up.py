@@ -1,6 +1,8 @@
 """What `photonfarm up` refuses before it begins, and what it says of how far it is."""
 
 import json
+import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,10 +13,12 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.cli.show_up import progress_line
+from photonfarm.shared.cli.show_up import FarmTalk, progress_line
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.farm import up
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.status import StoreQueue
+from photonfarm.shared.farm.training import RunFolder
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.queue import Activity, IdleReports, QueueStatus
@@ -52,11 +56,53 @@ def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tm
 
 def test_the_log_of_another_run_is_not_counted_where_nothing_is_trained(store: Store, tmp_path: Path) -> None:
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=3), shard_rows=4).scene_id)
-    record = {"kind": "validation", "step": 7, "error": 0.5, "standard_error": 0.1, "held_out": 3}
+    record = {"kind": "validation", "step": 7, "error": 0.5, "standard_error": 0.1, "held_out": 1}
     (tmp_path / "metrics.jsonl").write_text(json.dumps(record) + "\n")
     assert up._Farm(scene, tmp_path, 0).look() == up.FarmProgress((0, 3), (0, 0), 0, 0, "")
     trained = up._Farm(scene, tmp_path, 10).look()
-    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 3 samples")
+    assert (trained.step, trained.note) == (7, ", held-out error 0.50000 ± 0.10000 on 1 sample")
+
+
+def test_a_run_that_has_more_steps_than_are_wanted_says_so(store: Store, tmp_path: Path) -> None:
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=3), shard_rows=4).scene_id)
+    (tmp_path / "metrics.jsonl").write_text(json.dumps({"kind": "end", "step": 2097, "reason": "steps"}) + "\n")
+    (tmp_path / "settings.json").write_text('{"max_steps": 2000}')
+    assert progress_line(up._Farm(scene, tmp_path, 2000).look()) == "samples 0/3  steps 2097 (2000 wanted)"
+    assert RunFolder(tmp_path).look().line.endswith(": step 2097 (2000 wanted), ended (steps)")
+
+
+def test_the_last_line_is_the_complete_one_also_where_a_process_fails(
+    store: Store, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=6), shard_rows=4).scene_id)
+    (tmp_path / "trainer.log").write_text("no\n")
+    trainer = subprocess.Popen([sys.executable, "-c", "raise SystemExit(8)"])
+    worker = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    samples.commit_all(scene)
+    trainer.wait()
+    try:
+        with pytest.raises(IncompleteError):
+            up._watch({"worker": worker, "trainer": trainer}, up._Farm(scene, tmp_path, 0), redis_server, FarmTalk())
+    finally:
+        worker.communicate(b"\n")
+    assert capsys.readouterr().err.split(maxsplit=2)[2] == "samples 6/6\n"
+
+
+def test_what_is_in_hand_is_not_counted_again_at_its_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report of what is in hand comes before or after its commit; counted twice it halves the time left."""
+    now, lines = [0.0], list[str]()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    talk = FarmTalk()
+    monkeypatch.setattr(talk, "say", lines.append)
+    found = up.FarmProgress((0, 100), (0, 0), 0, 0, "")
+    with talk.progress(0) as show:
+        for second in range(1, 41):  # a sample per second, in jobs of four
+            now[0] = float(second)
+            committed = second // 4 * 4
+            in_hand = 4 if second % 4 == 0 else second % 4 if second % 4 > 1 else 0
+            show(replace(found, samples=(committed, 100), in_hand=in_hand), False)
+    (left,) = re.findall(r", (\d+) s left", lines[-1])
+    assert 50 <= int(left) <= 70
 
 
 def test_a_process_that_was_killed_is_told_apart_from_one_that_failed() -> None:

@@ -131,6 +131,31 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
             limited.set("rq:large", b"x" * (2 << 20))
 
 
+LENGTH = """
+local kind = redis.call('TYPE', KEYS[1]).ok
+return redis.call(kind == 'zset' and 'ZCARD' or 'LLEN', KEYS[1])
+"""
+"""The length of a list or a sorted set, by a script of the commands that KEDA's own uses."""
+
+
+def test_an_autoscaler_may_count_what_waits_and_what_was_started(
+    guarded: tuple[int, Path], store: Store, scene: SceneStore
+) -> None:
+    port, password = guarded
+    with connect(with_password_of(password, f"redis://127.0.0.1:{port}/0")) as limited:
+        jobs = open_queue(limited)
+        lengths = limited.register_script(LENGTH)
+        waiting, started = jobs.key, jobs.started_job_registry.key
+        limited.delete(waiting, started, jobs.intermediate_queue_key)
+        assert [lengths(keys=[key]) for key in (waiting, started)] == [0, 0]
+        reconcile(store, limited)
+        limited.zadd(started, {f"{NAME}:execution": time.time() + 60})
+        assert [lengths(keys=[key]) for key in (waiting, started)] == [len(jobs), 1]
+        assert len(jobs) > 0
+        limited.delete(waiting, started)
+        queue.release(limited, store)
+
+
 def test_the_health_check_of_the_compose_file_shows_the_password_to_nobody(
     guarded: tuple[int, Path], tmp_path: Path
 ) -> None:

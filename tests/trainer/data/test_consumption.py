@@ -124,6 +124,10 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
         thread.join(60)
         assert consumed_samples(connect(server.url), [scene.scene_id]) == {scene.scene_id: 6}
     assert said[-1] == "ended at step 3: steps"
+    assert said[-2].startswith("step 3/3, ")
+    assert not any("continues" in line for line in said)
+    train(store, scene.scene_id, run, redis_url=server.url, log=said.append, **settings)
+    assert f"continues at step 3 of run {run}" in said
     assert (run / "tensorboard").is_dir() == (find_spec("tensorboard") is not None)
     with pytest.raises(IncompleteError):
         service.check(run)

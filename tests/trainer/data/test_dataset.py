@@ -127,7 +127,7 @@ def test_an_error_of_the_source_reaches_the_one_who_takes(make_source, tiny) -> 
 def test_rows_are_told_as_they_arrive_and_when_all_have(make_source, tiny) -> None:
     with Feed(make_source(10, per_look=4), tiny()) as feed:
         rows, complete = feed.arrivals()
-        assert [row for row, _ in rows] == [0, 1, 2, 3][: len(rows)]
+        assert [row for row, _ in rows] == list(range(len(rows)))
         while not complete:
             more, complete = feed.arrivals()
             rows += more

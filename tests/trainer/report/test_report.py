@@ -18,7 +18,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
+from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
@@ -29,12 +29,11 @@ from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
-from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import gathered
 from photonfarm.trainer.report.dataset_card import DatasetCard
-from photonfarm.trainer.report.frame_times import FrameTime, frame_time, points_used
+from photonfarm.trainer.report.frame_times import FrameTime
 from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from photonfarm.trainer.report.tables import Table
@@ -326,49 +325,6 @@ def test_a_run_s_versions_are_those_it_was_trained_with_and_threads_count_as_cor
     run = replace(run, settings=run.settings.model_copy(update={"device": "cuda"}))
     assert replace(story, run=run).step_core_s(point) == point.train_s
     assert replace(story, run=run).on_gpu
-
-
-def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measured, tmp_path) -> None:
-    """The renderer does not know the analytic scene, and ends with an error."""
-    store, runs, _ = measured
-    figures = report_of(store, runs[:1], tmp_path / "out")
-    assert figures["evaluation"]["rows"][0]["frame_seconds"] is None
-    assert "`photonfarm measure-frames` ended with exit code" in (tmp_path / "out/report.md").read_text()
-
-
-def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measured) -> None:
-    _, (transport, denoiser), _ = measured
-    parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 1.6, 0.2, 0.4, 0.8), strict=True)}
-    surface = np.zeros((1, 8, 8), np.uint8)
-    kept = np.array([1, 4])
-    costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, kept=kept, render_s=np.array([[5.0], [2.0]]))
-    network = Seconds(1.0, 0.9, 1.1)
-    assert frame_time(TrainedRun.load(transport), network, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
-    of_denoiser = frame_time(TrainedRun.load(denoiser), network, costs)
-    assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
-    assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
-    settings = TrainedRun.load(transport).settings
-    assert frame_time(ReadyPredictor("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
-    with_photons = replace(
-        TrainedRun.load(transport),
-        settings=settings.model_copy(
-            update={"network": settings.network.model_copy(update={"architecture": "light_transport_photons"})}
-        ),
-    )
-    assert frame_time(with_photons, network, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
-
-
-def test_points_are_charged_as_many_as_a_network_uses(measured) -> None:
-    _, (transport, denoiser), _ = measured
-    runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
-    assert points_used(runs) is points_used(runs[1:]) is None, "it uses all, or there is none that uses any"
-
-    def with_points(count: int) -> TrainedRun:
-        settings = runs[0].settings
-        network = settings.network.model_copy(update={"points": count})
-        return replace(runs[0], settings=settings.model_copy(update={"network": network}))
-
-    assert points_used([with_points(64), with_points(128), runs[1]]) == 128
 
 
 def test_runs_are_called_by_what_tells_them_apart(measured) -> None:

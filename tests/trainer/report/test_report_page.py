@@ -60,6 +60,9 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
     assert "with 1/20 of " in with_lamps.sentence, "of both ratios the one that says less"
     assert "it is 1/500 of that error" in with_lamps.further[0]
     assert "1/20 of that of one colour" in with_lamps.further[0]
+    by_lamps_alone = judged(contents, errors(3, 3), errors(50, 50), shown=errors(2, 2))
+    assert by_lamps_alone.kind == "mixed"
+    assert "has 1/17 of that error" in by_lamps_alone.sentence, "no share above 1"
     worse = judged(contents, errors(3.6, 3.6, 0.1, 0.1, 3.6, 3.6), colour)
     assert worse.kind == "worse"
     assert "worse than the mean colour" in worse.sentence

@@ -7,9 +7,14 @@ import pytest
 
 from photonfarm.shared.core.frame_costs import Surface
 from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.trainer.report.views import caption as caption_of
 from photonfarm.trainer.report.worst_cases import (
+    ALL,
     KINDS,
+    MIRRORS,
+    NEAR,
     HeldOutView,
+    WorstCase,
     caption,
     kinds,
     shadow_edges,
@@ -63,11 +68,20 @@ def test_one_view_may_be_the_worst_of_several_kinds_and_a_kind_that_no_view_show
 
 
 def test_a_caption_names_all_kinds_that_a_view_is_the_worst_of() -> None:
-    assert caption(["near surfaces"]) == "Worst view of near surfaces"
+    assert caption(["near surfaces"]) == "worst view of near surfaces"
     assert caption(KINDS) == (
-        "Worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows, thin objects "
+        "worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows, thin objects "
         "and all pixels"
     )
+
+
+def test_the_view_of_median_error_is_not_called_the_worst_of_all_pixels() -> None:
+    """Few views are shown of a small store, and the one of median error may be the only one, or the worst in a part."""
+    worst = [WorstCase(MIRRORS, 3, 0.1, 0.2), WorstCase(ALL, 3, 1.0, 0.1), WorstCase(NEAR, 5, 0.1, 0.1)]
+    assert caption_of(worst, 3, is_median=True) == "View of median error; worst view of mirrors and clear glass; row 3"
+    assert caption_of(worst[1:], 3, is_median=True) == "View of median error; row 3"
+    assert caption_of(worst, 3) == "Worst view of mirrors and clear glass and all pixels; row 3"
+    assert (caption_of(worst, 5), caption_of(worst, 7)) == ("Worst view of near surfaces; row 5", "Row 7")
 
 
 def test_without_the_renderer_s_surfaces_the_other_kinds_are_found() -> None:

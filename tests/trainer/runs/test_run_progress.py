@@ -34,6 +34,16 @@ def test_phase_and_time_left_follow_the_session() -> None:
     assert "validates for 6 s" in progress.line()
 
 
+def test_the_last_line_is_of_the_last_step(run: Path) -> None:
+    said: list[str] = []
+    run.mkdir()
+    for samples in (0, 24):
+        progress = RunProgress(20, batch=4)
+        with followed(progress, run, said.append):
+            progress.drawn(4 * samples, samples)
+    assert said == ["step 24 (20 wanted), 24 samples have arrived"], "and none where nothing has arrived"
+
+
 def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

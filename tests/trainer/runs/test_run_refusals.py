@@ -1,6 +1,7 @@
 """What a training run refuses, and what it says: other settings, other versions, damaged files, a folder in use."""
 
 import json
+import re
 import shutil
 from typing import Any
 
@@ -112,8 +113,15 @@ def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source
 
 @pytest.mark.parametrize("hold_out", [1e-06, 0.999999], ids=["nothing to validate on", "nothing to train on"])
 def test_a_hold_out_that_leaves_one_side_empty_is_refused(make_source, tiny, run, hold_out: float) -> None:
-    with pytest.raises(SpecError, match=f"hold_out = {hold_out}"):
+    with pytest.raises(SpecError, match=f"hold_out = {hold_out}") as refused:
         train(make_source(8), tiny(hold_out=hold_out), run)
+    (works,) = re.findall(r"--hold-out (\S+) holds out one", str(refused.value))
+    assert train(make_source(8), tiny(hold_out=float(works), max_steps=1), run.with_name("other")).step == 1
+
+
+def test_a_single_configuration_needs_more(make_source, tiny, run) -> None:
+    with pytest.raises(SpecError, match="none is held out, and one is needed to validate on; plan more"):
+        train(make_source(1), tiny(hold_out=1e-6), run)
 
 
 def test_a_run_has_one_trainer_at_a_time(make_source, tiny, run) -> None:

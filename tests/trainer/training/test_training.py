@@ -215,7 +215,7 @@ def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tin
     changed = [record for record in metrics_log.read(run / METRICS) if record["kind"] == "changes"]
     wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
     assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]
-    said = "goes on from step 5 with learning_rate = 0.001 (before 0.0005), max_steps = 7 (before 5)"
+    said = "settings changed at step 5: learning_rate = 0.001 (before 0.0005), max_steps = 7 (before 5)"
     assert capsys.readouterr().err.splitlines().count(said) == 1
     train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run)
     assert [r["kind"] for r in metrics_log.read(run / METRICS)].count("changes") == 1
@@ -258,6 +258,8 @@ def test_a_service_that_is_stopped_while_it_waits_for_a_scene_has_done_what_it_w
     monkeypatch.setattr(service, "_only_scene", signalled)
     service.run(None, tmp_path / "store", run, "small", {}, log=told.append, on_record=told.append)
     assert any("no scene" in line for line in told)
+    with pytest.raises(IncompleteError):  # for whom "done" would mean that nobody need start it again
+        service.run(None, tmp_path / "store", run, "small", {}, until_complete=True, log=told.append)
 
 
 def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:

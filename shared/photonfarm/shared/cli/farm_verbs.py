@@ -1,7 +1,8 @@
-"""The verbs `scene`, `submit`, `top-up`, `status` and `up`, which need neither Mitsuba nor torch."""
+"""The verbs `scene`, `submit`, `top-up`, `reconcile`, `status`, `redis` and `up`: without Mitsuba and without torch."""
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from photonfarm.shared.cli.options import json_option, names_redis, redis_option, request_options, store_option
+from photonfarm.shared.cli.options import (
+    device_option,
+    json_option,
+    names_redis,
+    redis_option,
+    request_options,
+    store_option,
+)
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
@@ -170,6 +178,26 @@ def status(
     check_read(scenes)
 
 
+@click.command()
+@store_option
+@redis_option
+@json_option
+def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
+    """Queue every job that is planned, and neither committed nor queued, rendered now or failed.
+
+    Idle workers do this by themselves. It is for farms that may have no worker: a timer runs it, and workers are
+    started for what is queued. A job whose worker died is queued again once its heartbeat has run out; failed jobs
+    wait for an hour, or for `submit`.
+    """
+    from photonfarm.shared import queue
+    from photonfarm.shared.cli import show
+    from photonfarm.shared.store import Store
+
+    opened = Store(store)
+    with queue.connect(redis_url) as connection:
+        show.queued(queue.reconcile(opened, connection), as_json)
+
+
 @click.command("redis")
 @click.option("--port", type=click.IntRange(1, 65535), default=6379, show_default=True, help="Of this machine alone.")
 def redis_server(port: int) -> None:
@@ -186,7 +214,9 @@ def redis_server(port: int) -> None:
 @click.argument("spec")
 @request_options
 @store_option
-@click.option("--workers", type=click.IntRange(1), default=2, show_default=True, help="Render workers, a core each.")
+@click.option("--workers", type=click.IntRange(1),
+              help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]")  # fmt: skip
+@device_option
 @click.option(
     "--run",
     type=click.Path(path_type=Path, file_okay=False),
@@ -215,7 +245,8 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
     from photonfarm.shared.cli.show_up import FarmTalk
-    from photonfarm.shared.farm.up import run_farm, trainer_arguments
+    from photonfarm.shared.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, of_workers
+    from photonfarm.shared.farm.up import WORKERS, run_farm, trainer_arguments
 
     try:
         _check_arguments(["work", "--until-complete"], "photonfarm-renderer")
@@ -223,7 +254,9 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
             trainer = {name: options[name] for name in ("run", "train_steps")}
             arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
             _check_arguments(arguments, "photonfarm-trainer", "--train-steps 0 renders only")
-        run_farm(spec, store, request, FarmTalk(), **options)
+        devices = of_workers(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
+        options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
+        run_farm(spec, store, request, FarmTalk(), devices=devices, **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

@@ -35,7 +35,7 @@ def umbrella(ctx: click.Context, config: Path) -> None:
 
     Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
     to stdout, all other messages go to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5
-    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 130 Ctrl-C, 1 anything else.
+    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 9 SLURM, 130 Ctrl-C, 1 anything else.
     """
     named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
     if named or config.is_file():

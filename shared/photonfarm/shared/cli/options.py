@@ -78,11 +78,31 @@ def redis_option(command: Command) -> Command:
 def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
     if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
         _refuse_password(url)
-    if not (file := os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")):
+    if (file := password_file()) is None:
         return url
     from photonfarm.shared.queue import with_password_of
 
-    return with_password_of(Path(file), url)
+    return with_password_of(file, url)
+
+
+def optional_redis_option(help_text: str) -> Callable[[Command], Command]:
+    """`--redis URL` without a default, as `queue_url`; the file of its password is not read."""
+    return click.option(
+        "--redis", "queue_url", envvar="PHOTONFARM_REDIS_URL", show_envvar=True, callback=_without_password,
+        help=help_text,
+    )  # fmt: skip
+
+
+def _without_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
+    if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
+    return url or None
+
+
+def password_file() -> Path | None:
+    """The file that holds the password of Redis, if a variable names one."""
+    file = os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")
+    return Path(file) if file else None
 
 
 def names_redis() -> bool:
@@ -100,6 +120,32 @@ def _refuse_password(url: str) -> None:
             "history; give the URL without it, and put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE "
             "names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as `redis` in the configuration file.)"
         )
+
+
+def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--device`, what renders; the verb and its child processes find it in the environment."""
+    from photonfarm.shared.farm.devices import AUTO, DEVICE_VARIABLE
+
+    @wraps(command)
+    def on_device(*arguments: Any, device: str, **options: Any) -> Any:
+        if click.get_current_context().get_parameter_source("device") is not ParameterSource.DEFAULT:
+            os.environ[DEVICE_VARIABLE] = device
+        return command(*arguments, **options)
+
+    return click.option(
+        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True,
+        metavar="auto|cpu|cuda[:N]", callback=_device,
+        help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
+        "where there is one that can.",
+    )(on_device)  # fmt: skip
+
+
+def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
+    from photonfarm.shared.farm.devices import NAMES
+
+    if not NAMES.fullmatch(name):
+        raise click.BadParameter(f"{name!r} is none of auto, cpu, cuda and cuda:N.")
+    return name
 
 
 def json_option(command: Command) -> Command:

@@ -132,6 +132,14 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
+def queued(jobs: int, as_json: bool) -> None:
+    """Print how many jobs `reconcile` has queued."""
+    if as_json:
+        print_json({"queued": jobs})
+    else:
+        click.echo("1 job queued" if jobs == 1 else f"{jobs} jobs queued")
+
+
 def _cost(result: DryRun) -> None:
     """Print the size and the cost of what would be planned, and a better use of the same cost."""
     size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from photonfarm.shared.core.waiting import in_words
+from photonfarm.shared.farm.training import counted
 from photonfarm.shared.farm.up import FarmProgress
 
 PLAIN_LINE_S = 5.0  # between progress lines where there is no terminal for bars
@@ -47,8 +48,9 @@ class FarmTalk:
             first = samples if found.samples[0] < found.samples[1] else passes  # what is in hand is of these
             for bar, (committed, planned) in ((samples, found.samples), (passes, found.passes)):
                 done = min(committed + found.in_hand * (bar == first), planned)
+                done = max(done, int(bars.tasks[bar].completed))  # rich counts what falls and rises again twice
                 bars.update(bar, completed=done, total=planned, visible=bar == samples or planned > 0)
-            bars.update(training, completed=found.step)
+            bars.update(training, completed=found.step, total=max(found.step, steps))
             note = f"training{found.note}" if found.note else ""
             below.plain = "\n".join(filter(None, (*found.doing, note)))
             for wait in found.waits:
@@ -71,7 +73,7 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
     in_hand = f" (+{found.in_hand} in hand)" if found.in_hand else ""
     left = f", {in_words(left_s)} left" if left_s and samples < planned else ""
     words = f"  further passes {passes}/{further}" if further else ""
-    training = f"  steps {found.step}/{found.steps}{found.note}" if found.steps else ""
+    training = f"  steps {counted(found.step, found.steps)}{found.note}" if found.steps else ""
     why = f"  ({'; '.join(found.waits)})" if found.waits else f"  ({'; '.join(found.doing)})" if found.doing else ""
     return f"samples {samples}/{planned}{in_hand}{left}{words}{training}{why}"
 
@@ -79,4 +81,4 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
 def _bars() -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                TimeRemainingColumn())  # fmt: skip
-    return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S)
+    return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S, get_time=time.monotonic)

@@ -5,7 +5,8 @@
     ├── StoreError (OSError)       exit 4   a store, or other data, that cannot be read or written
     │   └── CorruptError           exit 4   stored bytes that are not what was committed
     ├── QueueError (OSError)       exit 5   no Redis, or one that refuses us
-    ├── BackendError (RuntimeError) exit 6  this machine cannot render, or import: Mitsuba, LLVM, scene files, Blender
+    ├── BackendError (RuntimeError) exit 6  this machine cannot render or import: Mitsuba, LLVM, card, scenes, Blender
+    ├── SchedulerError (OSError)   exit 9   no SLURM, or one that refuses a job
     └── IncompleteError            exit 7   work that ended before it was done, samples that are not complete
         └── DivergedError          exit 8   training whose loss is no longer finite (in the trainer's `learner`)
 
@@ -52,6 +53,12 @@ class BackendError(PhotonfarmError, RuntimeError):
     """Mitsuba, Dr.Jit, LLVM or the scene files cannot be used on this machine."""
 
     exit_code = 6
+
+
+class SchedulerError(PhotonfarmError, OSError):
+    """SLURM is not here, or refuses a job."""
+
+    exit_code = 9
 
 
 class SceneNotHereError(BackendError):

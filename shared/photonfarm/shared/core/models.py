@@ -45,8 +45,12 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
 
     `known` are the allowed keys. Entries of lists are called by their names in the document `of`, where they have one.
     """
-    for fault in error.errors():
-        key = _key(fault["loc"], of)
+    faults = error.errors()
+    for fault in faults:
+        place = fault["loc"]
+        if fault["type"] == "too_short" and any(place == each["loc"][:-1][: len(place)] for each in faults):
+            continue  # only as its faulty entries were left out
+        key = _key(place, of)
         rule = _RULES[fault["type"]].format(**fault.get("ctx", {})) if fault["type"] in _RULES else fault["msg"]
         rule = rule.removeprefix("Value error, ")
         if not key:  # of the whole
@@ -78,6 +82,8 @@ _RULES = {
     "model_type": "a table is required",
     "multiple_of": "a multiple of {multiple_of} is required",
     "string_type": "text is required",
+    "too_long": "{max_length} or fewer are required",
+    "too_short": "{min_length} or more are required",
     "tuple_type": "a list is required",
 }
 """The rules that wrong types break, for people; by pydantic's kinds of faults."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -60,12 +61,55 @@ def waiting(log: Log, what: str, silence_s: float = SILENCE_S) -> Iterator[None]
         yield
 
 
-def time_left(done: int, total: int, begun: float) -> str:
-    """How far some equal steps are that began at `begun` of the monotonic clock, and how long the rest should take."""
-    if not done:
-        return f"0 of {total}"
-    left = (time.monotonic() - begun) / done * (total - done)
-    return f"{done} of {total}, about {in_words(left)} left"
+class Steps:
+    """How far some steps of about equal length are, and how long the rest should take.
+
+    While a step is in hand, what it should take becomes less, and never more.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        *,
+        slow: int = 0,
+        most_s: Callable[[], float] = lambda: math.inf,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Take how many there are; the first `slow` take longer than the others, as they compile.
+
+        `most_s` gives the seconds after which no further step begins.
+        """
+        self.total, self._slow, self._most_s, self._clock = total, slow, most_s, clock
+        self._done, self._in_hand = 0, 1
+        self._before = self._counted = self._last = clock()
+
+    def reach(self, done: int) -> None:
+        """Note how many are done."""
+        if done <= self._done:
+            return
+        self._in_hand, self._done = done - self._done, done
+        self._before, self._last = self._last, self._clock()
+        if done <= self._slow:
+            self._counted = self._last
+
+    @property
+    def left_s(self) -> float | None:
+        """The seconds that the rest should take, or, after slow steps alone, takes at most; None before the first."""
+        if not self._done:
+            return None
+        counted = self._done - self._slow
+        since = (self._counted, counted) if counted > 0 else (self._before, self._in_hand)
+        pace_s = (self._last - since[0]) / since[1]
+        since_s, rest = self._clock() - self._last, self.total - self._done
+        left_s = max(pace_s * rest - since_s, pace_s * (rest - self._in_hand))
+        return max(min(left_s, max(self._most_s(), pace_s * self._in_hand - since_s)), 0.0)
+
+    def words(self) -> str:
+        """Both in words."""
+        far = f"{self._done} of {self.total}"
+        if (left_s := self.left_s) is None:
+            return far
+        return f"{far}, {'about' if self._done > self._slow else 'at most'} {in_words(left_s)} left"
 
 
 def in_words(seconds: float) -> str:

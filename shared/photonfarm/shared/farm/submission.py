@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from photonfarm.shared import queue
-from photonfarm.shared.core.errors import QueueError, SpecError
+from photonfarm.shared.core.errors import QueueError, SpecError, store_errors
 from photonfarm.shared.farm.job_size import WORKERS, rows_per_job
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
@@ -62,7 +63,7 @@ def submit(
     scene.plan(Request(), **rows, dry_run=True)  # what is refused leaves no wish for guides behind
     scene.guides.want(named.spec.guides)
     planned = opened.plan(named.spec, request, **rows)
-    queued = None if redis_url is None else queue_missing(opened, redis_url, retry=retry)
+    queued = _queued(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 
 
@@ -88,7 +89,7 @@ def top_up(
             f"{other_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
         )
     planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
-    queued = None if redis_url is None or dry_run else queue_missing(opened, redis_url, retry=retry)
+    queued = None if dry_run else _queued(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
         planned.plan,
@@ -99,6 +100,13 @@ def top_up(
         spp_per_pass=spp_per_pass(named.spec),
         passes=wanted.passes(named.spec),
     )
+
+
+def _queued(store: Store, redis_url: str | None, *, retry: bool) -> int | None:
+    """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
+    with store_errors("note a submission", store.storage.where):
+        queue.keep_submission(store, retry=retry, at_s=time.time())
+    return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
 
 
 def queue_missing(

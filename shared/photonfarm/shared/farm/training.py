@@ -58,21 +58,32 @@ class TrainingProgress:
         found = self.validation
         if found is None:
             return ""
-        return f"held-out error {stated(found['error'], found['standard_error'])} on {found['held_out']} samples"
+        samples = "1 sample" if found["held_out"] == 1 else f"{found['held_out']} samples"
+        return f"held-out error {stated(found['error'], found['standard_error'])} on {samples}"
+
+    @property
+    def figures(self) -> str:
+        """How long training still takes, and its last error, each after a comma."""
+        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
+        return "".join(f", {part}" for part in (left, self.error) if part)
 
     @property
     def note(self) -> str:
-        """What training does, how long that still takes, and its last error, each after a comma."""
-        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
-        doing = self.phase if self.phase != TRAINS else None
-        return "".join(f", {part}" for part in (doing, left, self.error) if part)
+        """What holds training up, and its figures, each after a comma."""
+        doing = f", {self.phase}" if self.phase and self.phase != TRAINS else ""
+        return doing + self.figures
 
     @property
     def line(self) -> str:
         """All of it in words."""
-        steps = f"{self.step}/{self.steps}" if self.steps else str(self.step)
+        steps = counted(self.step, self.steps) if self.steps else str(self.step)
         ended = f", ended ({self.ended})" if self.ended else ""
         return f"training {self.run}: step {steps}{self.note}{ended}"
+
+
+def counted(step: int, steps: int) -> str:
+    """How many of the wanted steps are done; a run that is asked for fewer than it has keeps those that it has."""
+    return f"{step}/{steps}" if step <= steps else f"{step} ({steps} wanted)"
 
 
 class RunFolder:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +18,7 @@ from typing import Protocol
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.shared.core.processes import free_port, tied
+from photonfarm.shared.farm.devices import CPU
 from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import WEB_PORT, announced
@@ -33,6 +34,9 @@ from photonfarm.shared.scene.plausibility import warnings
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.shared.store import SceneStore, Store
+
+WORKERS = 2
+"""The workers on a processor, unless another number is asked for."""
 
 POLL_S = 0.5
 ASK_S = 2.0  # between questions to Redis
@@ -73,6 +77,11 @@ def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float
     return ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
 
 
+def worker_arguments(scene_id: str, name: str, device: str) -> list[str]:
+    """A worker's verb with its arguments."""
+    return ["work", "--until-complete", "--scene", scene_id, "--name", name, "--device", device]
+
+
 def run_farm(
     spec: str,
     store: str | Path,
@@ -88,12 +97,14 @@ def run_farm(
     reference_spp: int = 256,
     shard_rows: int | None = None,
     web: bool = True,
+    devices: Sequence[str] = (CPU,),
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
     The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
     with them. Without a `hold_out` it is the run's, or of a new run the default or just enough for one configuration.
-    With `web`, pages that show all of it are served on this machine until the end.
+    With `web`, pages that show all of it are served on this machine until the end. Workers render on the `devices` in
+    turn.
 
     A wrong spec, a run of another scene, a hold-out that leaves one side empty, and references of no valid number are
     refused before anything is written, by a SpecError.
@@ -121,21 +132,24 @@ def run_farm(
         talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
-            talk.say(f"references: {added.planned} further passes planned, {added.planned_before} planned before")
+            there = f"passes that the samples have, or that were planned before: {added.planned_before}"
+            talk.say(f"references: {added.planned} further passes planned; {there}")
         opened = Store(store)
         scene = opened.scene(planned.scene_id)
         rows = scene.plans()[0].shard_rows
         talk.say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
-        work = ["work", "--until-complete", "--scene", planned.scene_id, "--name"]
-        verbs = {name: [*work, name] for name in (f"worker-{i + 1}" for i in range(workers))}
+        verbs = {
+            f"worker-{i + 1}": worker_arguments(planned.scene_id, f"worker-{i + 1}", devices[i % len(devices)])
+            for i in range(workers)
+        }
         if train_steps:
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
         address = stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
         trained = run if train_steps else None
         stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, talk))
-        preview = ["preview", spec, "--out", str(out / "preview.html")]
+        preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
             farm = _Farm(scene, run, train_steps, partial(queue_now, opened, redis.url))
             _watch(running, farm, redis, talk)
@@ -274,11 +288,11 @@ class _Farm:
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
         named = {self.scene.scene_id: self.scene.spec.name}
-        activities = status.activities if status else {}
-        missing = found.planned_samples - found.committed_samples
+        missing = found.planned_samples - found.usable_samples
+        activities = status.activities if status and missing else {}  # a report may be seconds old
         return FarmProgress(
             samples, passes, trained.step, self.steps, trained.note,
-            min(sum(each.samples for each in activities.values()), missing),  # a report may be seconds old
+            min(sum(each.samples for each in activities.values()), found.planned_samples - found.committed_samples),
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
             tuple(map(str, waits(self._queue, named, 0))),
         )  # fmt: skip
@@ -295,13 +309,14 @@ def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, ta
     with talk.progress(farm.steps) as show:
         while True:
             redis.keep_running()
-            alive = any(process.poll() is None for process in running.values())
-            show(farm.look(), not alive)
-            for name, process in running.items():
-                if process.poll():
+            codes = {name: process.poll() for name, process in running.items()}
+            alive = None in codes.values()
+            show(farm.look(), not alive or any(codes.values()))
+            for name, code in codes.items():
+                if code:
                     log = farm.run / f"{name}.log"
-                    said = f"{name} {_end(process.returncode)}; {log} says: {_tail(log)}. What is rendered and trained"
-                    if process.returncode == SpecError.exit_code:  # the same command would be refused again
+                    said = f"{name} {_end(code)}; {log} says: {_tail(log)}. What is rendered and trained"
+                    if code == SpecError.exit_code:  # the same command would be refused again
                         raise IncompleteError(f"{said} is kept")
                     raise IncompleteError(f"{said} is kept, and the same command goes on from there")
             if not alive:

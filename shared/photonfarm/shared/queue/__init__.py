@@ -45,8 +45,9 @@ from photonfarm.shared.queue.failures import (
 from photonfarm.shared.queue.heartbeat import ALIVE, WORKER, beat, bury, free_job, hosts, job_of_worker, take_name
 from photonfarm.shared.queue.idle_workers import IdleReports, clear_idle_report, report_idle
 from photonfarm.shared.queue.job import FUNCTION, OVERDUE, QUEUE, STARTS, RenderArguments, job_name
-from photonfarm.shared.queue.kept_failures import keep_failure, kept_failures
+from photonfarm.shared.queue.kept_failures import jobs_left_alone, keep_failure, keep_submission, kept_failures
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.share import Share
 from photonfarm.shared.queue.status import QueueStatus, queue_status
 from photonfarm.shared.queue.worker_activity import Activity, clear_activity, report_activity
 
@@ -90,6 +91,7 @@ __all__ = [
     "QueueWorker",
     "RenderArguments",
     "RenderJob",
+    "Share",
     "beat",
     "bury",
     "causes",
@@ -108,7 +110,9 @@ __all__ = [
     "hosts",
     "job_name",
     "job_of_worker",
+    "jobs_left_alone",
     "keep_failure",
+    "keep_submission",
     "kept_failures",
     "look",
     "open_queue",

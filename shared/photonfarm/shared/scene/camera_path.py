@@ -28,6 +28,9 @@ ORBIT = 0.9
 SMALLER, HEIGHTS = (ORBIT, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1), (0.5, 0.75, 0.95, 0.25, 0.05)
 """Ellipses to try among solids, in this order: their sizes, and their heights in the box of origins."""
 
+FORM = '{"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}'
+"""What a path's file looks like."""
+
 FinitePoint = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
@@ -39,7 +42,7 @@ class KeyView(Frozen):
 
 
 class CameraPath(Frozen):
-    """A path's file: {"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}."""
+    """A path's file, like `FORM`."""
 
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
     views: Annotated[tuple[KeyView, ...], Field(min_length=1)]
@@ -51,11 +54,11 @@ class CameraPath(Frozen):
         try:
             return cls.model_validate(json.loads(file.read_text()))
         except ValidationError as error:
-            raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
+            raise SpecError(f"{file}: {'; '.join(sentences(error))}; a camera path looks like {FORM}") from error
         except OSError as error:
             raise SpecError(f"{file}: cannot be read: {error.strerror}") from error
         except ValueError as error:
-            raise SpecError(f"{file}: is not a camera path in JSON: {error}") from error
+            raise SpecError(f"{file}: is not valid JSON: {error}; a camera path looks like {FORM}") from error
 
     def sampled(self) -> list[View]:
         """The views of all frames, at equal steps of the curve's parameter, which is 1 between two key views.

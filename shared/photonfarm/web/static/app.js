@@ -71,9 +71,10 @@ function progress(state) {
   });
   const trainings = state.trainings.filter((run) => run.steps || run.step).map((run) => h("div", { class: "progress" },
     h("div", {}, h("span", {}, `training ${run.run}`), h("span", { class: "figure" },
-      h("b", {}, `${count(run.step)} of ${count(run.steps)}`), ` steps`)),
-    track(run.step, run.steps),
-    h("div", { class: "figure" }, (run.ended ? `ended (${run.ended})` : run.phase ?? "not at work") + run.note)));
+      h("b", {}, run.step > run.steps ? count(run.step) : `${count(run.step)} of ${count(run.steps)}`),
+      run.step > run.steps ? ` steps (${count(run.steps)} wanted)` : " steps")),
+    track(Math.min(run.step, run.steps), run.steps),
+    h("div", { class: "figure" }, (run.ended ? `ended (${run.ended})` : run.phase ?? "not at work") + run.figures)));
   const shown = rates[current]?.some((rate) => rate) ? [spark(rates[current], "samples per second"),
     h("p", { class: "note" }, "Throughput since this page was opened.")] : [];
   return card("half", "Progress", null, ...(scenes.length ? scenes : [h("p", { class: "note" }, "No scene is planned yet; ",
@@ -134,14 +135,17 @@ function maps(scene, found) {
 }
 
 function training(runs) {
-  const by = (axis) => runs.map((run, place) => ({ place, points: run.validations.map((each) => [each[axis], each[2], each[3]]) }));
+  const held = (each) => `${count(each[5])} held-out sample${each[5] === 1 ? "" : "s"}`;
+  const by = (axis) => runs.map((run, place) => ({ place, points: run.validations.map((each) => [each[axis], each[2], each[3],
+    { hollow: each[5] < run.validations.at(-1)[5], title: `step ${count(each[0])}: ${each[2].toFixed(5)} on ${held(each)}` }]) }));
   if (!runs.some((run) => run.validations.length)) return card("half", "Training", null, h("p", { class: "note" }, "No validation yet."));
   const legend = runs.map((run, place) => {
     const last = run.validations.at(-1);
-    return h("span", { class: `run-${place % 6}` }, last ? `${run.run}: ${last[2].toFixed(5)} at step ${count(last[0])}` : run.run);
+    return h("span", { class: `run-${place % 6}` }, last ? `${run.run}: ${last[2].toFixed(5)} at step ${count(last[0])}, on ${held(last)}` : run.run);
   });
   return card("half", "Training", "held-out error, noise removed; shaded: its standard error", curves(by(0), "step"),
-    curves(by(1), "seconds, with waiting"), h("div", { class: "legend" }, ...legend));
+    curves(by(1), "seconds, with waiting"), h("div", { class: "legend" }, ...legend),
+    h("p", { class: "note" }, "Each point is a validation; hollow ones were measured on fewer held-out samples than the last: the others had not been rendered. A pointer on a point tells how many."));
 }
 
 const chosen = {}; // the step of each run that is shown; none: the last one

@@ -27,7 +27,7 @@ function logTicks(low, high) {
   return found;
 }
 
-// Lines of [x, y, error or null] with y on a logarithmic scale; `runs` are {place, points}.
+// Lines of [x, y, error or null, {hollow, title}] with y on a logarithmic scale; `runs` are {place, points}.
 export function curves(runs, label) {
   const wide = 640, high = 280, left = 58, right = 14, top = 12, bottom = 38;
   const plot = s("svg", { viewBox: `0 0 ${wide} ${high}`, class: "plot", role: "img", "aria-label": label });
@@ -59,8 +59,9 @@ export function curves(runs, label) {
       plot.append(s("path", { class: `band run-${place % 6}`, d: `M${[...upper, ...lower].join("L")}Z` }));
     }
     plot.append(s("path", { class: `run run-${place % 6}`, d: path }));
-    const last = there.at(-1);
-    if (last) plot.append(s("circle", { class: `run run-${place % 6}`, cx: X(last[0]), cy: Y(last[1]), r: 3.5 }));
+    for (const [i, [x, y, , { hollow, title }]] of there.entries())
+      plot.append(s("circle", { class: `run run-${place % 6}${hollow ? " hollow" : ""}`, cx: X(x).toFixed(1), cy: Y(y).toFixed(1),
+        r: i === there.length - 1 ? 3.5 : there.length > 60 ? 1.6 : 2.6 }, s("title", {}, title)));
   }
   return plot;
 }

@@ -136,7 +136,7 @@ def test_values_that_are_not_finite_and_rows_that_are_not_the_plans_are_found(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No writer of ours stores them. The last job has rows 8 and 9."""
-    monkeypatch.setattr("photonfarm.shared.store.write.commit._stays_finite", lambda *_: True)
+    monkeypatch.setattr("photonfarm.shared.store.write.commit.stays_finite", lambda *_: True)
     monkeypatch.setattr(RowWriter, "_claim", lambda *_: None)
     monkeypatch.setattr(RowWriter, "_check_complete", lambda _: None)
     monkeypatch.setattr(GuideWriter, "_check_readable", lambda _: None)

@@ -125,8 +125,8 @@ def test_a_marker_of_a_job_that_no_plan_has_is_found_and_set_aside(store: Store,
 
 def test_a_value_that_is_not_finite_is_found(store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """No writer of ours stores one."""
-    monkeypatch.setattr("photonfarm.shared.store.write.commit._radiance", lambda halves, _: ("radiance", halves))
-    monkeypatch.setattr("photonfarm.shared.store.write.commit._stays_finite", lambda *_: True)
+    monkeypatch.setattr("photonfarm.shared.store.write.commit.as_array", lambda halves, _: ("radiance", halves))
+    monkeypatch.setattr("photonfarm.shared.store.write.commit.stays_finite", lambda *_: True)
 
     def poison(given: Any) -> None:
         given.radiance[1][1, 2, 3, 0] = np.nan

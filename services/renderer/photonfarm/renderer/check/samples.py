@@ -5,7 +5,6 @@ They are the first that `photonfarm submit` plans by default, a view of each, on
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,10 +14,11 @@ import numpy as np
 from photonfarm.renderer.check import cameras
 from photonfarm.renderer.check.cameras import Cameras
 from photonfarm.renderer.measure import exposure, sample_costs
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture, display
 from photonfarm.shared.core.records import F32, BasePointCloud
-from photonfarm.shared.core.waiting import WorkLog, time_left
+from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -87,10 +87,11 @@ def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: Wor
     half_spp = int(np.clip(exposure.PATHS // (film.width * film.height), FEW_SPP + 1, 64))
     drawn = [_drawn(spec, number) for number in range(COUNT)]
     measured: list[_Measured] = []
-    begun = time.monotonic()
-    work.begin(f"rendering {COUNT} configurations", lambda: time_left(len(measured), COUNT, begun))
+    steps = Steps(COUNT, slow=WARM_UPS)
+    work.begin(f"rendering {COUNT} configurations", steps.words)
     for number, (modification, views) in enumerate(drawn):
         measured.append(_measured(scene, cloud, modification, views, number, half_spp))
+        steps.reach(len(measured))
     return Samples(
         [
             Shown(number, modification, views[0], display(measured[number].halves.mean(axis=0), spec.exposure))
@@ -128,9 +129,9 @@ def _configure(scene: LoadedScene, cloud: BasePointCloud, modification: Modifica
 
 
 def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    begun = time.process_time()
+    begun = backend.work_s()
     result = work()
-    return time.process_time() - begun, result
+    return backend.work_s() - begun, result
 
 
 def _costs(spec: SceneSpec, film: Film, half_spp: int, measured: Sequence[_Measured]) -> SampleCosts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from functools import partial
@@ -10,13 +11,14 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.cli.options import device_option, json_option, redis_option, store_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 
 
 @click.command()
 @store_option
 @redis_option
+@device_option
 @json_option
 def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Try each part on this machine, and say what to do about what does not work."""
@@ -33,6 +35,7 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
 @click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
               help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
+@device_option
 @ended_by_ctrl_c()
 def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
     """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
@@ -60,9 +63,23 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
     return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
 
 
+def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001
+    from photonfarm.shared.core.errors import SpecError
+    from photonfarm.shared.queue.share import Share
+
+    try:
+        return None if text is None else Share.parse(text)
+    except SpecError as error:
+        raise click.BadParameter(str(error)) from error
+
+
 @click.command()
+@click.argument("specs", metavar="[SPEC]...", nargs=-1)
 @store_option
 @redis_option
+@click.option("--share", callback=_share, metavar="K/N",
+              help="Work without Redis: take the jobs whose number leaves K when it is divided by N, then what is "
+              "left of the others'. K is from 0 to N - 1. SPEC: render these scenes alone.")  # fmt: skip
 @click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
 @click.option("--scene", "scene_id", metavar="ID",
               help="Work for this scene alone: its id, how it begins, or its name.")  # fmt: skip
@@ -88,9 +105,11 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
     metavar="SECONDS", help="End a job that takes longer; it is started up to five times. A worker that was "
     "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
 )  # fmt: skip
+@device_option
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")
 def work(
+    specs: tuple[str, ...],
     store: str | Path,
     redis_url: str,
     scene_id: str | None,
@@ -98,14 +117,22 @@ def work(
     check: bool,
     **settings: Any,
 ) -> None:
-    """Render queued jobs into the store, on one core, until asked to stop; start one per core.
+    """Render queued jobs into the store, on one core or one card, until asked to stop; start one for each of them.
+
+    With --share the store alone says what is missing; several workers may then render the same job near the end, and
+    the first commit stays.
 
     A store that does not exist is waited for; --until-complete ends with exit code 4 then. One Redis serves one store.
     Ctrl-C gives the job in hand 5 s to end, a second one ends it at once; it is rendered again then.
     """
     from photonfarm.renderer.worker import worker
 
-    if check:
+    if settings["share"] is not None:
+        _check_share(specs, scene_id, job, check, settings["ahead"])
+        worker.run_worker(store, scene_id=scene_id, scene_ids=_scene_ids(specs), **settings)
+    elif specs:
+        raise click.UsageError("SPEC needs --share; a worker with Redis renders one scene by --scene, or all")
+    elif check:
         worker.check(redis_url)
     elif job is None:
         worker.run_worker(store, redis_url, scene_id=scene_id, **settings)
@@ -114,3 +141,26 @@ def work(
     else:
         rendered, seconds = worker.render_job(store, scene_id, job)
         click.echo(f"job {job} rendered and committed in {seconds:.1f} s" if rendered else f"job {job} is committed")
+
+
+def _check_share(
+    specs: tuple[str, ...], scene_id: str | None, job: int | None, check: bool, ahead: float | None
+) -> None:
+    """Raise UsageError for what does not go with a share."""
+    if job is not None or check:
+        raise click.UsageError(f"--share and {'--check' if check else '--job'} exclude each other")
+    if ahead is not None:
+        raise click.UsageError("--ahead needs Redis, where the trainer reports what it has used; --share works without")
+    if specs and scene_id is not None:
+        raise click.UsageError("give either SPEC or --scene")
+
+
+def _scene_ids(specs: tuple[str, ...]) -> tuple[str, ...]:
+    """The scenes of specs. The child, which has no spec's file, will find scene files that lie beside one."""
+    from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec
+
+    named = [NamedSpec.load(spec) for spec in specs]
+    folders = [os.environ.get(SCENES_VARIABLE), *(spec.scenes for spec in named)]
+    if any(folders):
+        os.environ[SCENES_VARIABLE] = os.pathsep.join(dict.fromkeys(filter(None, folders)))
+    return tuple(spec.spec.scene_id for spec in named)

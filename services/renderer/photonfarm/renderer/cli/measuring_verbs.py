@@ -8,9 +8,9 @@ from functools import partial
 
 import click
 
-from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.cli.options import device_option, json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import WorkLog, waiting
+from photonfarm.shared.core.waiting import WorkLog
 
 
 @click.command()
@@ -20,6 +20,7 @@ from photonfarm.shared.core.waiting import WorkLog, waiting
 @click.option("--seconds", type=click.FloatRange(0, min_open=True),
               help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
@@ -47,6 +48,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
               help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
 @click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
               help="Random configurations to render, a view of each.")  # fmt: skip
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
@@ -61,15 +63,16 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     backend.load(threads=1)
     from photonfarm.renderer.measure.exposure import propose
 
-    log = partial(click.echo, err=True)
-    with waiting(log, f"proposing an exposure for {loaded.name}"):
-        found = propose(loaded, find_spec(spec).parent, log, target=target, frames=frames)
+    with WorkLog(partial(click.echo, err=True)) as work:
+        work.begin(f"loading {loaded.name}")
+        found = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
     click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
 
 
 @click.command()
 @click.argument("spec")
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
@@ -105,23 +108,35 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     help="Processor time for all of it, with loading and compiling; a kept measurement is reused if it was given at "
     "least as long.",
 )
+@click.option(
+    "--for",
+    "purpose",
+    type=click.Choice(["training", "images"]),
+    default="training",
+    show_default=True,
+    help="How noise counts: as the trainer's relative loss weighs it, with all that a sample takes, or relative to the "
+    "brightness of each pixel, with the time of images alone.",
+)
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
+@device_option
 @json_option
 @ended_by_ctrl_c()
-def scene_plan(spec: str, seconds: int, write: bool, again: bool, as_json: bool) -> None:
+def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer.scene import backend
     from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
+    from photonfarm.renderer.strategy.objective.purpose import Purpose
     from photonfarm.renderer.strategy.output import spec_file
     from photonfarm.renderer.strategy.output.printed import lines
     from photonfarm.renderer.strategy.plan import make_plan
 
     file = spec_file.writable(spec) if write else find_spec(spec)
-    plan = make_plan(loaded, file.parent, seconds=seconds, again=again, log=partial(click.echo, err=True))
+    log = partial(click.echo, err=True)
+    plan = make_plan(loaded, file.parent, Purpose(purpose), seconds=seconds, again=again, log=log)
     click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))
     if write:
         if plan.changes:

@@ -9,26 +9,29 @@ from pathlib import Path
 
 import click
 
-from photonfarm.shared.cli.options import json_option, store_option
+from photonfarm.shared.cli.options import device_option, json_option, store_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 from photonfarm.shared.core.waiting import waiting
 
 
 @click.command()
-@click.argument("spec")
+@click.argument("scene", metavar="SPEC_OR_SCENE")
 @store_option
 @click.option("--count", type=click.IntRange(1), default=24, show_default=True, help="Samples to show.")
 @click.option("--out", type=click.Path(path_type=Path), default="preview.html", show_default=True)
-def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
-    """Write a contact sheet of SPEC's samples: plans of what stands where, A, B, albedo, normal, depth, photons."""
+def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
+    """Write a contact sheet of a scene's samples: plans of what stands where, A, B, albedo, normal, depth, photons.
+
+    SPEC_OR_SCENE is a spec's file, or names a scene of the store by its id, how that begins, or its name.
+    """
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: the sheet is a page; name it like preview.html", param_hint="--out")
     from photonfarm.renderer.tools.preview import write_contact_sheet
-    from photonfarm.shared.scene.spec_loading import load_spec
-    from photonfarm.shared.store.read.other_scenes import scene_of
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import scene_or_spec
     from photonfarm.shared.store.read.reader import SceneReader
 
-    write_contact_sheet(SceneReader(store, scene_of(store, spec, load_spec(spec))), count, out)
+    write_contact_sheet(SceneReader(store, scene_or_spec(Store(store), scene).scene_id), count, out)
     click.echo(out)
 
 
@@ -47,6 +50,7 @@ def preview(spec: str, store: str | Path, count: int, out: Path) -> None:
 )
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Instead: once around the scene.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="buffers.npz", show_default=True)
+@device_option
 @ended_by_ctrl_c()
 def buffers(
     store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
@@ -78,6 +82,7 @@ def buffers(
 @click.option("--points", type=click.IntRange(1), metavar="P",
               help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
+@device_option
 @ended_by_ctrl_c()
 def measure_frames(
     store: str | Path,
@@ -113,12 +118,14 @@ def measure_frames(
               help="Another pass of its view, stored or not.  [default: that of the row]")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
               help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
     """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
 
-    On the same kind of machine, with the same versions, it is equal to the bit. Elsewhere it differs by rounding.
+    On the same kind of processor, with the same versions, it is equal to the bit. Elsewhere it differs by rounding.
+    What a card rendered, or renders here, is equal in distribution alone.
 
     Exit codes: 0 equal to the bit, or the store does not have this pass; 1 it differs, by no more than chance (a block
     z-test); 4 it differs by more.

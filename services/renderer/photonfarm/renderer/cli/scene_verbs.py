@@ -9,7 +9,7 @@ from shlex import quote
 
 import click
 
-from photonfarm.shared.cli.options import json_option
+from photonfarm.shared.cli.options import device_option, json_option
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 from photonfarm.shared.core.waiting import waiting
 
@@ -47,6 +47,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, as_json: bool) ->
 @click.argument("spec")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
               help="The page.")  # fmt: skip
+@device_option
 @json_option
 @ended_by_ctrl_c()
 def scene_check(spec: str, out: Path, as_json: bool) -> None:

@@ -68,7 +68,7 @@ def import_scene(path: Path, out: Path | None, up: Vector | None, log: Log) -> I
         spec.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=spec.parent, prefix=".import-") as scratch, WorkLog(log) as work:
             scene = read(path, Path(scratch), work.begin)
-            return _import(scene, path, spec, folder, Path(scratch), up, work.begin)
+            return _import(scene, path, spec, folder, Path(scratch), up, work)
 
 
 def _place(path: Path, out: Path | None) -> Path:
@@ -81,25 +81,25 @@ def _place(path: Path, out: Path | None) -> Path:
 
 
 def _import(
-    scene: ImportedScene, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None, log: Log
+    scene: ImportedScene, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None, work: WorkLog
 ) -> Imported:
-    loaded = load(scene, scratch, log)
+    loaded = load(scene, scratch, work.begin)
     frame = Frame(up or scene.up)
-    proposal, things, belonging = _proposal(scene, loaded, frame, log)
+    proposal, things, belonging = _proposal(scene, loaded, frame, work.begin)
     if not loaded.emitters() and not proposal.room.has_ceiling:
         elements.put_sky(scene.root)
         scene.notes.append("the scene has no light and no ceiling; it got a white sky")
     shapes = splitting.shapes_of_things(scene, loaded, belonging, len(things), scratch)
     written = scratch / "written"
     written.mkdir()
-    log("writing the scene")
+    work.begin("writing the scene")
     write_scene(scene, written)
     text = SpecText(_name(spec.stem), f"{folder.name}/scene.xml", path.name, frame, proposal, shapes, scene.notes)
     if not loaded.emitters() and proposal.room.has_ceiling:
         text.ceiling = proposal.ceiling_light()
     (scratch / folder.name).symlink_to(written.resolve(), target_is_directory=True)
-    _keep_in_the_open(text, scratch / spec.name, log)
-    _expose(text, scratch / spec.name, log)
+    _keep_in_the_open(text, scratch / spec.name, work.begin)
+    _expose(text, scratch / spec.name, work)
     shutil.move(str(written), folder)
     write_whole(spec, text.text())
     load_spec(spec)
@@ -135,14 +135,14 @@ def _keep_in_the_open(text: SpecText, draft: Path, log: Log) -> None:
         text.notes.append(f"cameras are not kept out of solids: {error}")
 
 
-def _expose(text: SpecText, draft: Path, log: Log) -> None:
+def _expose(text: SpecText, draft: Path, work: WorkLog) -> None:
     """Put the exposure in; a scene that stays dark gets a light under its ceiling."""
-    log("choosing the exposure by a quick render")
+    work.begin("choosing the exposure by a quick render")
     for _ in range(2):  # the second time with a light that is added
         draft.write_text(text.text(), encoding="utf-8")
         spec = load_spec(draft)
         try:
-            found = exposure.propose(spec, draft.parent, log, frames=FRAMES)
+            found = exposure.propose(spec, draft.parent, work, frames=FRAMES)
         except SpecError:
             if text.ceiling is not None:
                 raise
@@ -151,7 +151,7 @@ def _expose(text: SpecText, draft: Path, log: Log) -> None:
                 text.exposure = float(f"{found.exposure:.3g}")
                 return
         text.ceiling = text.proposal.ceiling_light()
-        log("the scene stays dark; a light is added under its ceiling")
+        work.begin("the scene stays dark; a light is added under its ceiling")
 
 
 def _found(text: SpecText) -> list[str]:

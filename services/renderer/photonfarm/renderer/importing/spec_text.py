@@ -58,6 +58,11 @@ class SpecText:
             f"Made by `photonfarm scene import` from {self.source}. Everything here is a proposal: change what you "
             "like. Lengths are in the scene's units; docs/scene-spec.md lists every key."
         )
+        if self.free_space:
+            self._say(
+                "After a change of origin, look_at or near, or of a group's shapes or at, run "
+                "`photonfarm scene free-space SPEC --write` again, which measures where cameras may stand."
+            )
         lengths = [self._number(length) for length in size]
         self._say(f"The room is about {lengths[0]} × {lengths[1]}, and {lengths[2]} high.")
         for note in self.notes[:MOST_NOTES]:

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer.jobs.render import SceneLoader, halves_of, load_scene, located, versions
+from photonfarm.renderer.jobs.estimates import halves_of
+from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
+from photonfarm.renderer.scene import backend
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.archives import write_arrays
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
@@ -26,10 +28,11 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import scene_folder
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.read.find import is_spec_file, scene_or_spec
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import SceneMatch
-from photonfarm.shared.store.write.commit import as_stored
+from photonfarm.shared.store.write.rounding import as_stored
 
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that a pass is written as."""
@@ -46,11 +49,17 @@ class Comparison:
     z: float  # largest of the block z-test…
     z_limit: float  # …and what chance allows
     other_versions: dict[str, tuple[str, str]]  # packages that are other ones here: that of the store, that of here
+    devices: tuple[str, str] = (markers.CPU, markers.CPU)  # what rendered it: that of the store, that of here
 
     @property
     def is_equal(self) -> bool:
         """Whether all values are the same to the bit."""
         return self.different == 0
+
+    @property
+    def repeats_bytes(self) -> bool:
+        """Whether equal seeds can give equal bytes: on processors alone, as cards add up in an order of their own."""
+        return self.devices == (markers.CPU, markers.CPU)
 
     @property
     def exit_code(self) -> int:
@@ -66,7 +75,12 @@ class Comparison:
         size = f"by at most {self.largest:.2g}, by {self.relative:.2g} of the image (RMS)"
         test = f"block z-test {self.z:.2g} of {self.z_limit:.2g}: {verdict}"
         versions_differ = f"; other versions: {', '.join(others)}" if others else ""
-        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}"
+        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}{self._on_cards()}"
+
+    def _on_cards(self) -> str:
+        """Why bytes need not be equal, where a card rendered."""
+        there, here = self.devices
+        return "" if self.repeats_bytes else f"; rendered on {there}, here on {here}: equal in distribution alone"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +158,7 @@ def repeat(
         loaded = load(spec)
         loaded.apply(modification)
     with waiting(log, f"rendering pass {number} of the view in row {row}"):
-        halves, _ = halves_of(loaded, key, view)
+        ((halves, _),) = halves_of(loaded, [(key, view)])
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
 
@@ -176,8 +190,10 @@ def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparis
     difference = here.astype(np.float64) - there
     test = block_z_test(_interleaved(here), _interleaved(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))
-    rendered_by = stored.marker(row // stored.plans()[0].shard_rows)["figures"]["versions"]
-    others = {name: (said, here_) for name, said in rendered_by.items() if (here_ := versions().get(name)) != said}
+    figures = stored.marker(row // stored.plans()[0].shard_rows)["figures"]
+    others = {
+        name: (said, here_) for name, said in figures["versions"].items() if (here_ := versions().get(name)) != said
+    }
     return Comparison(
         different=int(np.count_nonzero(here.view(np.uint32) != there.view(np.uint32))),
         values=here.size,
@@ -186,6 +202,7 @@ def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparis
         z=test.z_max,
         z_limit=test.z_limit,
         other_versions={name: (said, here_ or "not installed") for name, (said, here_) in others.items()},
+        devices=(figures.get("device", markers.CPU), backend.device().name),
     )
 
 

@@ -8,7 +8,6 @@ Shape letters: N views, H W image.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.waiting import Log
+from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import sample_view
@@ -44,9 +43,6 @@ RANGE = (-40.0, 40.0)
 
 EXACT = 1e-4
 """The range of powers at which the search ends."""
-
-SILENT_S = 4.0
-"""Seconds after which it is said how many views are rendered."""
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
@@ -122,7 +118,7 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, log: Log, *, target: float = TARGET, frames: int = FRAMES
+    spec: SceneSpec, beside: Path | None, work: WorkLog, *, target: float = TARGET, frames: int = FRAMES
 ) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
@@ -130,8 +126,10 @@ def propose(
     """
     small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
     spp = _half_spp(small.film)
-    log(f"rendering {frames} views of {spec.name}, {small.film.width} × {small.film.height}, 2 × {spp} spp")
-    pictures = Pictures(np.stack(list(_rendered(LoadedScene.load(small, beside), frames, spp, log))))
+    scene, steps = LoadedScene.load(small, beside), Steps(frames, slow=1)
+    size = f"{small.film.width} × {small.film.height}"
+    work.begin(f"rendering {frames} views of {spec.name}, {size}, 2 × {spp} spp", steps.words)
+    pictures = Pictures(np.stack(list(_rendered(scene, frames, spp, steps))))
     exposure = pictures.exposure(target)
     if exposure is None:
         reached = pictures.display_means(2 ** RANGE[1]).mean()
@@ -172,14 +170,12 @@ def _half_spp(film: Film) -> int:
     return PATHS // (film.width * film.height)
 
 
-def _rendered(scene: LoadedScene, frames: int, spp: int, log: Log) -> Iterator[F32]:
+def _rendered(scene: LoadedScene, frames: int, spp: int, steps: Steps) -> Iterator[F32]:
     """Two halves of each view, (2, H, W, 3)."""
-    spec, said = scene.spec, time.monotonic()
+    spec = scene.spec
     for number in range(frames):
-        if time.monotonic() - said > SILENT_S:
-            said = time.monotonic()
-            log(f"{number} of {frames} views are rendered")
         modification = sample_modification(spec, SEED, number)
         scene.apply(modification)
         view = sample_view(spec, modification.key(spec.scene_id), SEED, number, modification)
         yield scene.render_halves(view, (2 * number, 2 * number + 1), spp)
+        steps.reach(number + 1)

@@ -18,7 +18,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs.render import lit_points, photons_of, visibility_of
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -28,7 +29,7 @@ from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Photons
-from photonfarm.shared.core.waiting import Log, WorkLog, time_left
+from photonfarm.shared.core.waiting import Log, Steps, WorkLog
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
@@ -112,10 +113,12 @@ def sample_costs(scene: LoadedScene, frames: int, log: Log = lambda _: None) -> 
 
 def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: WorkLog) -> tuple[SampleCosts, int]:
     """The costs, and of how many frames; as many as the budget allows, and one at least after the one that compiles."""
-    name, begun, measured = scene.spec.name, time.monotonic(), list[_Frame]()
+    name, measured = scene.spec.name, list[_Frame]()
+    views = Steps(WARM_UPS + frames, slow=WARM_UPS, most_s=_seconds_left(budget))
+    within = f", in about {budget.seconds:.0f} s of processor time in all" if math.isfinite(budget.seconds) else ""
     work_log.begin(
-        f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count",
-        lambda: f"view {time_left(len(measured), WARM_UPS + frames, begun)}",
+        f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count{within}",
+        lambda: f"view {views.words()}",
     )
     cloud = scene.base()[1]
     last_s = 0.0
@@ -129,9 +132,21 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
                 "measuring its costs; `photonfarm scene cost` measures them without a limit, and keeps them"
             )
         measured.append(_measured(scene, cloud, number))
+        views.reach(len(measured))
         last_s = budget.spent_s - before
     measured = measured[min(WARM_UPS, len(measured) - 1) :]
     return _medians(scene.spec.scene_id, measured), len(measured)
+
+
+def _seconds_left(budget: Budget) -> Callable[[], float]:
+    """A function that gives how many seconds a budget still lasts, with as much of a core as there has been so far."""
+    begun, spent_s = time.monotonic(), budget.spent_s
+
+    def left_s() -> float:
+        used_s = budget.spent_s - spent_s
+        return budget.left_s * max(1.0, (time.monotonic() - begun) / used_s if used_s else 1.0)
+
+    return left_s
 
 
 def _medians(scene_id: str, measured: list[_Frame]) -> SampleCosts:
@@ -193,9 +208,9 @@ def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: 
 
 
 def _timed(work: Callable[[], T]) -> tuple[float, T]:
-    begun = time.process_time()
+    begun = backend.work_s()
     result = work()
-    return time.process_time() - begun, result
+    return backend.work_s() - begun, result
 
 
 def _median(values: list[float]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Set
 from dataclasses import dataclass, field
 from math import ceil
@@ -10,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidate import Candidate, Render
 from photonfarm.renderer.strategy.image_cost import LEAST_TURNS, RANGE
 from photonfarm.renderer.strategy.pilot import LEAST_PAIRS
@@ -36,7 +36,7 @@ class Budget:
     """Processor seconds for all of a measurement: loading, compiling and timing count."""
 
     seconds: float
-    clock: Callable[[], float] = time.process_time
+    clock: Callable[[], float] = backend.work_s
     begun: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -10,7 +10,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from photonfarm.renderer.jobs.render import versions
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.measurement import GRID, Measurement
+from photonfarm.renderer.strategy.objective.purpose import Purpose
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
@@ -18,15 +20,17 @@ from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
 _DECIDED = ("connections", "light_ratio", "half_spp")
 
 
-def digest(spec: SceneSpec) -> str:
-    """32 hexadecimal digits: the scene without the settings that a plan decides, the candidates, machine, and code.
+def digest(spec: SceneSpec, purpose: Purpose) -> str:
+    """32 hexadecimal digits: the scene without what a plan decides, the purpose, the candidates, machine, and code.
 
-    So a plan that is written into its spec does not require another one.
+    So a plan that is written into its spec does not require another one. For training the guides count, whose time
+    belongs to a sample.
     """
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
     scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
-    return digest_here("scene plan", scene.scene_id, repr(GRID))
+    guides = [spec.guides.model_dump_json()] if purpose is Purpose.TRAINING else []
+    return digest_here("scene plan", scene.scene_id, repr(GRID), purpose.value, *guides)
 
 
 def digest_here(*parts: str) -> str:
@@ -35,13 +39,12 @@ def digest_here(*parts: str) -> str:
 
 
 def _machine() -> tuple[object, ...]:
-    """All that times depend on beside the scene and the code: processor, cores, variant, versions of the packages.
+    """All that times depend on beside the scene and the code: processor, cores, device, versions of the packages.
 
     The number of threads is not among them, as a pilot has one.
     """
-    import mitsuba
-
-    return _processor(), os.cpu_count(), mitsuba.variant(), sorted(versions().items())
+    device = backend.device()
+    return _processor(), os.cpu_count(), device.variant, device.name, sorted(versions().items())
 
 
 def _processor() -> str:
@@ -72,20 +75,20 @@ def file_of(folder: str, digest: str) -> Path:
     return Path(root) / "photonfarm" / folder / f"{digest}.json"
 
 
-def _file(spec: SceneSpec) -> Path:
-    return file_of("plans", digest(spec))
+def _file(spec: SceneSpec, purpose: Purpose) -> Path:
+    return file_of("plans", digest(spec, purpose))
 
 
-def find(spec: SceneSpec) -> Measurement | None:
-    """The kept measurement of this scene; None if it is missing, unreadable or unusable."""
+def find(spec: SceneSpec, purpose: Purpose) -> Measurement | None:
+    """The kept measurement of this scene for a purpose; None if it is missing, unreadable or unusable."""
     try:
-        return Measurement.model_validate_json(_file(spec).read_bytes())
+        return Measurement.model_validate_json(_file(spec, purpose).read_bytes())
     except (OSError, ValidationError):
         return None
 
 
 def keep(spec: SceneSpec, measurement: Measurement) -> Path:
     """Keep a measurement; returns its file, which appears whole. Raises OSError if it cannot be written."""
-    file = _file(spec)
+    file = _file(spec, measurement.purpose)
     write_whole(file, measurement.model_dump_json(indent=1) + "\n")
     return file

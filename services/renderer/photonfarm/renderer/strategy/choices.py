@@ -15,7 +15,7 @@ class CandidateAtCost(MeasuredCandidate):
     """A candidate with the samples per pixel that fit the time; `time_s` is the time of such a half-estimate."""
 
     half_spp: int
-    half_error: float  # relMSE of such a half-estimate
+    half_error: float  # of such a half-estimate: relMSE, or relative loss (see `noise`)
     fits: bool  # whether at least about one sample per pixel fits the time
 
 
@@ -23,15 +23,16 @@ def candidates_at_equal_cost(measurement: Measurement, half_s: float) -> dict[Ca
     """Every measured candidate, at the samples per pixel that fit `half_s`.
 
     The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
-    sample × time / n.
+    sample × time / n. For training, time contains the half's part of what its sample takes beside. That is the same for
+    all candidates, and so matters only as far as whole numbers of samples do not take exactly `half_s`.
     """
-    plain = measurement.row(PLAIN)
-    return {row.candidate: _at_cost(row, plain, measurement.spp, half_s) for row in measurement.rows}
+    return {row.candidate: _at_cost(row, measurement, half_s) for row in measurement.rows}
 
 
-def _at_cost(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) -> CandidateAtCost:
+def _at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> CandidateAtCost:
+    plain, beside_s = measurement.row(PLAIN), measurement.view_cost.half_s
     samples = row.cost.bought(half_s)
-    cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
+    cost = row.errors.ratio * _per_sample_s(row, half_s, beside_s) / _per_sample_s(plain, half_s, beside_s)
     relative = row.errors.relative_spread(plain.errors)
     return CandidateAtCost(
         candidate=row.candidate,
@@ -41,14 +42,14 @@ def _at_cost(row: CandidateRow, plain: CandidateRow, spp: int, half_s: float) ->
         relative_cost=cost,
         spread=None if relative is None else cost * relative,
         half_spp=samples,
-        half_error=row.errors.mean * spp / samples,
+        half_error=row.errors.mean * measurement.spp / samples,
         fits=row.cost.pays(half_s),
     )
 
 
-def _per_sample_s(row: CandidateRow, half_s: float) -> float:
+def _per_sample_s(row: CandidateRow, half_s: float, beside_s: float) -> float:
     samples = row.cost.bought(half_s)
-    return row.cost.time_s(samples) / samples
+    return (row.cost.time_s(samples) + beside_s) / samples
 
 
 def best(candidates: dict[Candidate, CandidateAtCost]) -> CandidateAtCost:

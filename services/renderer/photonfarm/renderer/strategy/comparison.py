@@ -20,7 +20,7 @@ WORTHWHILE = 0.05
 
 
 class RelativeErrors(Frozen):
-    """A candidate's relMSE of one image, with the charge for missed light, by views, or by pairs of a single view.
+    """A candidate's error of one image, with the charge for missed light, by views, or by pairs of a single view.
 
     `plain` has the same values of plain path tracing, over images of the same seeds. Both have the same rare bright
     samples, so their ratio is more certain than either of them.
@@ -32,12 +32,12 @@ class RelativeErrors(Frozen):
 
     @property
     def mean(self) -> float:
-        """relMSE of one image."""
+        """The error of one image."""
         return _mean(self.own)
 
     @property
     def ratio(self) -> float:
-        """The relMSE of one image over that of plain path tracing."""
+        """The error of one image over that of plain path tracing."""
         return self.mean / _mean(self.plain)
 
     def relative_spread(self, other: RelativeErrors) -> float | None:
@@ -80,7 +80,7 @@ class MeasuredCandidate:
 
     @property
     def error(self) -> float:
-        """relMSE of one image of the pilot."""
+        """The error of one image of the pilot: relMSE, or relative loss (see `noise`)."""
         return self.errors.mean
 
 

@@ -34,6 +34,10 @@ class ImageCost:
         sample_s = max((many_s - few_s) / (many - few), 0.02 * few_s / few)  # if noise hides it
         return cls(max(few_s - few * sample_s, 0.0), sample_s)
 
+    def of_a_half(self) -> ImageCost:
+        """The cost of one of two half-estimates that share a launch, and so the fixed part of an image."""
+        return ImageCost(self.fixed_s / 2, self.sample_s)
+
     def time_s(self, spp: float) -> float:
         """The time of an image with `spp` samples per pixel."""
         return self.fixed_s + spp * self.sample_s

@@ -13,6 +13,9 @@ from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, Budget, affo
 from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
 from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
+from photonfarm.renderer.strategy.objective import view_cost
+from photonfarm.renderer.strategy.objective.purpose import Purpose
+from photonfarm.renderer.strategy.objective.view_cost import FREE, ViewCost
 from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
 from photonfarm.renderer.strategy.rounds import SCOUTS
 from photonfarm.shared.core.models import Frozen
@@ -41,6 +44,9 @@ LIT, LEAST_LIT, REACH = 16, 2, 0.25
 """The number of configurations in which light paths are traced, to see which photons are worth storing: 16, or as many,
 at least 2, as a quarter of the time allows, with what went before."""
 
+BESIDE = 0.35
+"""The share of the time after which no more views are looked at beside their images, for training."""
+
 IMAGES = 400
 """The number of images that the time should pay for: about as many as ten settings need at least."""
 
@@ -52,7 +58,7 @@ class CandidateRow(Frozen):
     light_ratio: float
     errors: RelativeErrors  # of images of `Measurement.spp`
     missed: float  # as in `MeasuredCandidate`
-    fixed_s: float  # as in `ImageCost`, on the spec's film
+    fixed_s: float  # as in `ImageCost`, of a half-estimate on the spec's film
     sample_s: float
 
     @property
@@ -62,16 +68,19 @@ class CandidateRow(Frozen):
 
     @property
     def cost(self) -> ImageCost:
-        """The CPU time of an image of the spec's film."""
+        """The CPU time of a half-estimate."""
         return ImageCost(self.fixed_s, self.sample_s)
 
 
 class Measurement(Frozen):
     """One pilot of one scene: all that a plan depends on besides the settings that it decides."""
 
+    purpose: Purpose
     film: Film  # of the pilot
     spp: int
     half_s: float  # CPU time of a half-estimate that the spec accepted, at which the pilot compared
+    configuration_s: float  # this and the next one as in `ViewCost`; 0 for images
+    view_s: float
     views: int
     max_depth: int
     modelled: tuple[str, ...]
@@ -84,6 +93,11 @@ class Measurement(Frozen):
     asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time in all
     compiling_s: float  # the part for loading, kernels, and the images that give the weights
+
+    @property
+    def view_cost(self) -> ViewCost:
+        """The CPU time of a sample beside its half-estimates."""
+        return ViewCost(self.configuration_s, self.view_s)
 
     def knows(self, candidate: Candidate) -> bool:
         """Whether a candidate was measured."""
@@ -101,13 +115,14 @@ class _Compared:
     film: Film
     spp: int
     half_s: float
+    beside: ViewCost
     choice: pilot.Choice
     rows: tuple[CandidateRow, ...]
     notes: tuple[str, ...]  # sentences on what there was no time for
 
 
-def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> Measurement:
-    """Load the scene of a spec and measure its light transport, in `seconds` of CPU time for all of it.
+def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: float, log: Log) -> Measurement:
+    """Load the scene of a spec and measure its light transport for a purpose, in `seconds` of CPU time for all of it.
 
     The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does,
     IncompleteError, with the time that it takes, if the time is too short.
@@ -125,12 +140,15 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> M
         depth = spec.transport.max_depth
         candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
         every = list(dict.fromkeys([*candidates, present(spec)]))
-        compared = _compare(pilot_scene, every, edit_s, budget, work_log)
+        compared = _compare(pilot_scene, every, purpose, edit_s, budget, work_log)
     spent = budget.spent_s
     return Measurement(
+        purpose=purpose,
         film=compared.film,
         spp=compared.spp,
         half_s=compared.half_s,
+        configuration_s=compared.beside.configuration_s,
+        view_s=compared.beside.view_s,
         views=compared.choice.views,
         max_depth=depth,
         modelled=(*content.sentences(found, depth), *compared.notes),
@@ -147,10 +165,16 @@ def measure(spec: SceneSpec, beside: Path | None, seconds: float, log: Log) -> M
 
 
 def _compare(
-    pilot_scene: PilotScene, every: list[Candidate], edit_s: float, budget: Budget, work_log: WorkLog
+    pilot_scene: PilotScene,
+    every: list[Candidate],
+    purpose: Purpose,
+    edit_s: float,
+    budget: Budget,
+    work_log: WorkLog,
 ) -> _Compared:
     spec = pilot_scene.spec
     now, half_spp = present(spec), spec.transport.half_spp
+    beside = _beside(pilot_scene, budget, work_log) if purpose is Purpose.TRAINING else FREE
     work_log.begin("compiling and timing images", budget.words)
     quick = _on_quick_film(pilot_scene, budget)
     what = f"{spec.name}: comparing settings"
@@ -159,7 +183,8 @@ def _compare(
     pixels = spec.film.width * spec.film.height
     scale = pixels / (quick.spec.film.width * quick.spec.film.height)
     costs = {candidate: ImageCost(cost.fixed_s, scale * cost.sample_s) for candidate, cost in timed.items()}
-    half_s = costs[now].time_s(half_spp)
+    halves = {c: cost.of_a_half() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
+    half_s = halves[now].time_s(half_spp)
     left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
     film, spp, views = _pilot_film(spec, costs, left_s)
     pilot_scene = quick.on_film(film)
@@ -175,12 +200,23 @@ def _compare(
         spp=spp,
         seed=SEED,
         keep=[c for c in (DEFAULT, now) if c in candidates],
-        later={candidate: _images(cost, half_s, spp) / cost.time_s(pilot_spp) for candidate, cost in costs.items()},
+        later={c: _images(halves[c], half_s, beside, spp) / cost.time_s(pilot_spp) for c, cost in costs.items()},
+        weigh=purpose.weigh(spec.exposure),
         clock=pilot_scene.clock,
     )
-    rows = tuple(_row(measured, costs[measured.candidate], pilot_spp, half_spp) for measured in choice.measured)
+    rows = tuple(
+        _row(measured, costs[measured.candidate], halves[measured.candidate], pilot_spp, half_spp)
+        for measured in choice.measured
+    )
     fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {budget.seconds:g} allows no more"
-    return _Compared(film, spp, half_s, choice, rows, (fewer,) if len(candidates) < len(every) else ())
+    return _Compared(film, spp, half_s, beside, choice, rows, (fewer,) if len(candidates) < len(every) else ())
+
+
+def _beside(pilot_scene: PilotScene, budget: Budget, work_log: WorkLog) -> ViewCost:
+    work_log.begin("timing what a sample has beside its images", budget.words)
+    return view_cost.measure(
+        pilot_scene, budget.within(BESIDE, pilot_scene.draw(view_cost.MOST_VIEWS), view_cost.LEAST_VIEWS)
+    )
 
 
 def _on_quick_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
@@ -208,10 +244,13 @@ def present(spec: SceneSpec) -> Candidate:
     return Candidate(spec.transport.connections, spec.transport.light_ratio)
 
 
-def _images(cost: ImageCost, half_s: float, spp: int) -> float:
-    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
-    samples = cost.bought(half_s)
-    return spp / samples * cost.time_s(samples)
+def _images(half: ImageCost, half_s: float, beside: ViewCost, spp: int) -> float:
+    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel.
+
+    What else their samples take counts.
+    """
+    samples = half.bought(half_s)
+    return spp / samples * (half.time_s(samples) + beside.half_s)
 
 
 def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
@@ -231,8 +270,12 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_spp: int) -> CandidateRow:
-    """A candidate's row: its cost as timed beforehand, corrected by the times of the pilot's many images.
+def _row(
+    measured: MeasuredCandidate, cost: ImageCost, half: ImageCost, pilot_spp: float, half_spp: int
+) -> CandidateRow:
+    """A candidate's row: the cost of its half-estimates, corrected by the times of the pilot's many images.
+
+    `cost` is that of an image as timed beforehand, and `half` that of a half-estimate which follows from it.
 
     Images of the pilot with far fewer samples correct nothing, as their fixed part hides the time of their samples.
     """
@@ -243,6 +286,6 @@ def _row(measured: MeasuredCandidate, cost: ImageCost, pilot_spp: float, half_sp
         light_ratio=measured.candidate.light_ratio,
         errors=measured.errors,
         missed=measured.missed,
-        fixed_s=correction * cost.fixed_s,
-        sample_s=correction * cost.sample_s,
+        fixed_s=correction * half.fixed_s,
+        sample_s=correction * half.sample_s,
     )

@@ -1,7 +1,9 @@
 """The noise of a candidate's images: noise that the pilot sees, and a charge for light that it is too short to see.
 
-Shape letters: H W image, B × B blocks, V views. Of a pixel, x is the value, r the reference, and y the weighted value
-x/√(r² + ε·mean(r)²). The mean variance of y is the relative mean squared error (relMSE) of one image.
+Shape letters: H W image, B × B blocks, V views. Of a pixel, x is the value, r the reference, and y the weighted value.
+For images, y = x/√(r² + ε·mean(r)²), and the mean variance of y is the relative mean squared error (relMSE) of one
+image. For training, y = x·e/√((e·b)² + 0.05), e being the scene's exposure and b the mean of r over channels; and the
+mean variance of y is the relative loss of a network that predicts the noise-free image.
 
 **Noise that is seen** is mean (y_a − y_b)²/2 over two independent images a, b of a view. Rare bright samples that all
 candidates share are left out (`not_counted`).
@@ -25,7 +27,10 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_means
 
 EPSILON = 0.01
-"""ε, which bounds the weights of dark pixels."""
+"""ε, which bounds the weights of dark pixels in images."""
+
+LOSS_EPSILON = 0.05
+"""The ε of the trainer's relative loss, squared exposed radiance; a test compares it."""
 
 BLOCKS = (1, 4, 16)
 """The numbers of blocks along each side of the image, for missing light."""
@@ -40,21 +45,43 @@ Blocks = NDArray[np.float64]
 
 
 def view_weights(images: Sequence[F32]) -> F32 | None:
-    """1/√(r² + ε·mean(r)²) of a view, (H, W, 3), from images that serve no other purpose; None for a black view.
+    """1/√(r² + ε·mean(r)²) of a view, (H, W, 3), from images that serve no other purpose; None for a black view."""
+    floor = EPSILON * float(np.mean(images, dtype=np.float64)) ** 2
+    return None if floor == 0 else (1 / np.sqrt(_reference(images) ** 2 + floor)).astype(np.float32)
 
-    The weighted images must not be among them: a bright sample in r would hide the noise that it causes. r is the mean
-    image, or its mean over 3 × 3 pixels where that is brighter: few images may miss a light in the corner of a pixel,
-    but not in all pixels around it.
+
+def training_weights(images: Sequence[F32], exposure: float) -> F32 | None:
+    """e/√((e·b)² + 0.05) of a view, (H, W, 3), from images that serve no other purpose; None for a black view.
+
+    Its square is the weight of a squared error in the trainer's relative loss, at the noise-free image. In expectation
+    the noise of targets adds to that loss their variance times this weight, and it adds to what is learned from n of
+    them the n-th part, as far as weights are alike where a network averages. The weight is the same in all channels,
+    and its floor the same in all views, so that dark views count little.
+    """
+    if not np.any(images):
+        return None
+    bright = exposure * _reference(images).mean(axis=-1, keepdims=True)
+    weights = exposure / np.sqrt(bright**2 + LOSS_EPSILON)
+    return np.broadcast_to(weights, images[0].shape).astype(np.float32)
+
+
+def _reference(images: Sequence[F32]) -> NDArray[np.float64]:
+    """r, (H, W, 3): the mean image, or its mean over 3 × 3 pixels where that is brighter.
+
+    Few images may miss a light in the corner of a pixel, but not in all pixels around it. The images must not be among
+    those that r weights: a bright sample in r would hide the noise that it causes. The noise of r remains in the
+    weights. It is the same for all candidates, so that it biases their errors alike.
     """
     pooled = np.mean(images, axis=0, dtype=np.float64)
     edged = np.pad(pooled, ((1, 1), (1, 1), (0, 0)), mode="edge")
     around = np.lib.stride_tricks.sliding_window_view(edged, (3, 3), axis=(0, 1)).mean(axis=(-2, -1))
-    floor = EPSILON * float(np.mean(pooled)) ** 2
-    return None if floor == 0 else (1 / np.sqrt(np.maximum(pooled, around) ** 2 + floor)).astype(np.float32)
+    return np.asarray(np.maximum(pooled, around))
 
 
 def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[float], float]:
-    """The relMSE of one image from each candidate's pair of images, and the part that all candidates share.
+    """The error of one image from each candidate's pair of images, and the part that all candidates share.
+
+    It is the mean variance of y, relMSE or relative loss.
 
     The shared part is the mean over pixels of the least (y_a − y_b)²/2 of all candidates.
     """
@@ -147,7 +174,7 @@ class BlockSums:
 
 
 def missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
-    """The charge for light that other candidates find and this one misses, as relMSE, mean over the views.
+    """The charge for light that other candidates find and this one misses, as an error, mean over the views.
 
     For each view it is the largest over the sizes of blocks, since light may be missing in a spot or everywhere, of
 

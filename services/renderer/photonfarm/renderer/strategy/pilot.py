@@ -7,12 +7,14 @@ most rare bright samples are the same, and differences between candidates are du
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate
+from photonfarm.renderer.strategy.noise import view_weights
+from photonfarm.renderer.strategy.objective.purpose import Weigh
 from photonfarm.renderer.strategy.reasons import BLACK, reasons_for
 from photonfarm.renderer.strategy.rounds import Rounds
 
@@ -27,7 +29,7 @@ class Choice:
     candidate: Candidate
     measured: tuple[MeasuredCandidate, ...]  # in the order of the candidates given
     reasons: tuple[str, ...]  # sentences
-    shared: float  # relMSE of the rare bright samples that all candidates share, which `error` leaves out (see `noise`)
+    shared: float  # error of the rare bright samples that all candidates share, which `error` leaves out (see `noise`)
     views: int  # the views that were not black
     spent_s: float  # CPU time of the whole pilot
     scouting_s: float  # the part before the first measurement: kernels, and the images that give the weights
@@ -46,7 +48,8 @@ def choose(
     seed: int = 0,
     keep: Sequence[Candidate] = (),
     later: Mapping[Candidate, float] | None = None,
-    clock: Callable[[], float] = time.process_time,
+    weigh: Weigh = view_weights,
+    clock: Callable[[], float] = backend.work_s,
 ) -> Choice:
     """The candidate with the least error × time over some views; each of `renders` renders one view.
 
@@ -56,14 +59,14 @@ def choose(
 
     Images are compared at `spp` samples per pixel, and their time includes the fixed part of an image. So `spp` should
     be that of later use. Otherwise `later` gives a factor for each candidate: the time that later use takes to the
-    error of one image of the pilot, over the time of that image. Raises ValueError without views, or for images that
-    are not finite.
+    error of one image of the pilot, over the time of that image. `weigh` says how the noise of pixels counts. Raises
+    ValueError without views, or for images that are not finite.
     """
     views = [renders] if callable(renders) else list(renders)
     if not views:
         raise ValueError("choose: renders is empty; a pilot needs a view at least")
     every = list(dict.fromkeys([PLAIN, *candidates]))
-    rounds = Rounds(views, every, spp, seed, later or {}, clock)
+    rounds = Rounds(views, every, spp, seed, later or {}, weigh, clock)
     rounds.scout()
     pairs = max(1, -(-LEAST_PAIRS // len(views)))
     rounds.round(every, pairs)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.sensor import AimedSensor
 from photonfarm.renderer.strategy.candidate import Candidate, Render
@@ -40,17 +40,23 @@ class PilotScene:
         return PilotScene(spec, None, LoadedScene(spec, self.loaded.scene))
 
     def clock(self) -> float:
-        """CPU seconds of this process without those of edits, which cost all candidates the same."""
-        return time.process_time() - self._editing_s
+        """The seconds of `backend.work_s` without those of edits, which cost all candidates the same."""
+        return backend.work_s() - self._editing_s
+
+    def draw(self, count: int) -> Iterator[tuple[Modification, View]]:
+        """Some configurations, and a view of each; always the same."""
+        for i in range(count):
+            modification = sample_modification(self.spec, SEED, i)
+            yield modification, sample_view(self.spec, modification.key(self.spec.scene_id), SEED, i, modification)
 
     def renders(self, count: int) -> list[Render]:
         """A function for each of some configurations; it renders one view of it."""
-        return [partial(self._render, *drawn) for drawn in _draw(self.spec, count)]
+        return [partial(self._render, *drawn) for drawn in self.draw(count)]
 
     def configurations(self, count: int) -> Iterator[Any]:
         """The Mitsuba scene in each of the same configurations, in turn."""
-        for modification, _ in _draw(self.spec, count):
-            self._apply(modification)
+        for modification, _ in self.draw(count):
+            self.apply(modification)
             yield self.loaded.scene
 
     def camera(self) -> Any:
@@ -58,21 +64,16 @@ class PilotScene:
         return AimedSensor(self.spec).sensor
 
     def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
-        self._apply(modification)
+        self.apply(modification)
         if candidate not in self._integrators:
             settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
             self._integrators[candidate] = integrator_of(self.spec.transport.model_copy(update=settings))
         return self.loaded.render(view, seed, self._integrators[candidate], spp)
 
-    def _apply(self, modification: Modification) -> None:
+    def apply(self, modification: Modification) -> None:
+        """Bring the scene into a configuration, unless that object is the one that it is in."""
         if modification is not self._applied:
-            start = time.process_time()
+            start = backend.work_s()
             self.loaded.apply(modification)
             self._applied = modification
-            self._editing_s += time.process_time() - start
-
-
-def _draw(spec: SceneSpec, count: int) -> Iterator[tuple[Modification, View]]:
-    for i in range(count):
-        modification = sample_modification(spec, SEED, i)
-        yield modification, sample_view(spec, modification.key(spec.scene_id), SEED, i, modification)
+            self._editing_s += backend.work_s() - start

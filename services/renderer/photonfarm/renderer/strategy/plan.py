@@ -12,6 +12,7 @@ from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost, candidates_at_equal_cost, settled
 from photonfarm.renderer.strategy.comparison import Saving, saving
 from photonfarm.renderer.strategy.measurement import Measurement, measure, present
+from photonfarm.renderer.strategy.objective.purpose import Purpose
 from photonfarm.renderer.strategy.output.spec_file import SpecTables
 from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
@@ -36,7 +37,8 @@ class TransportPlan:
     photons: PhotonSpec
     photons_reason: str
     at_equal_cost: Mapping[Candidate, CandidateAtCost]  # all measured ones; empty if every view is black
-    halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples
+    halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples; None
+    # if they were taken to share a launch, as for training
 
     @property
     def settings(self) -> SpecTables:
@@ -70,6 +72,7 @@ class TransportPlan:
         """All of it, for JSON."""
         return {
             "scene_id": self.spec.scene_id,
+            "for": self.measurement.purpose.value,
             "settings": self.settings,
             "changes": self.changes,
             "savings": [
@@ -83,12 +86,14 @@ class TransportPlan:
         }  # fmt: skip
 
 
-def make_plan(spec: SceneSpec, beside: Path | None, *, seconds: float, again: bool, log: Log) -> TransportPlan:
-    """The plan of a spec; a cached measurement is used if it took at least `seconds`, unless `again` is set."""
-    found = None if again else cache.find(spec)
+def make_plan(
+    spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
+) -> TransportPlan:
+    """The plan of a spec for a purpose; a cached measurement is used if it took `seconds`, unless `again` is set."""
+    found = None if again else cache.find(spec, purpose)
     if found is not None and found.asked_s >= seconds and _knows(found, spec):
         return plan_of(spec, found, cached=True)
-    measurement = measure(spec, beside, seconds, log)
+    measurement = measure(spec, beside, purpose, seconds, log)
     try:
         cache.keep(spec, measurement)
     except OSError as error:
@@ -115,7 +120,7 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Trans
         return TransportPlan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
     now = present(spec)
     candidate, samples = settled(measurement, now, half_spp)
-    cost = measurement.row(candidate).cost
+    cost, shared = measurement.row(candidate).cost, measurement.purpose is Purpose.TRAINING
     return TransportPlan(
         spec=spec,
         measurement=measurement,
@@ -125,5 +130,5 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Trans
         photons=photons,
         photons_reason=reason,
         at_equal_cost=candidates_at_equal_cost(measurement, measurement.row(now).cost.time_s(half_spp)),
-        halves_overhead=2 * cost.time_s(samples) / cost.time_s(2 * samples) - 1,
+        halves_overhead=None if shared else 2 * cost.time_s(samples) / cost.time_s(2 * samples) - 1,
     )

@@ -17,7 +17,7 @@ SUSPICIOUS = 0.05
 def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], shared: float) -> tuple[str, ...]:
     """The reasons for choosing a candidate among all that were measured.
 
-    `shared` is the relMSE of one image from rare bright samples that all candidates share (see `noise`).
+    `shared` is the error of one image from rare bright samples that all candidates share (see `noise`).
     """
     reasons = [_against_plain(chosen, rows)]
     if alike := [str(row.candidate) for row in rows if row is not chosen and is_alike(row, chosen)]:
@@ -31,7 +31,7 @@ def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], sh
     if shared > 0.5 * chosen.error:
         reasons.append(
             "rare bright samples that all settings compared have in common are left out of the comparison: they add "
-            f"about {shared:.2g} to the relMSE of an image, which is {chosen.error:.2g} without them"
+            f"about {shared:.2g} to the error of an image, which is {chosen.error:.2g} without them"
         )
     return tuple(reasons)
 

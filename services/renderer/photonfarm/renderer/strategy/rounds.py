@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
-from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights
+from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors
+from photonfarm.renderer.strategy.objective.purpose import Weigh
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
 
@@ -26,7 +27,7 @@ MOST_PAIRS = 32
 class _Record:
     """One candidate's measurements in one view."""
 
-    errors: list[float] = field(default_factory=list)  # relMSE of an image, by each pair
+    errors: list[float] = field(default_factory=list)  # of an image, by each pair
     times_s: list[float] = field(default_factory=list)
 
 
@@ -40,6 +41,7 @@ class Rounds:
         spp: int,
         seed: int,
         later: Mapping[Candidate, float],
+        weigh: Weigh,
         clock: Callable[[], float],
     ) -> None:
         self._views = views
@@ -47,6 +49,7 @@ class Rounds:
         self._spp = spp
         self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
         self._later = later
+        self._weigh = weigh
         self._clock = clock
         self._begun = clock()
         self.scouting_s = 0.0
@@ -62,7 +65,7 @@ class Rounds:
         turns = -(-SCOUTS // len(self._candidates))
         for view, render in enumerate(self._views):
             every = list(self._candidates) * turns
-            weights = view_weights([self._render(render, c, next(self._seeds[view])) for c in every])
+            weights = self._weigh([self._render(render, c, next(self._seeds[view])) for c in every])
             if weights is not None:
                 self.weights[view] = weights
                 for candidate in self._candidates:
@@ -118,40 +121,45 @@ class Rounds:
     def _time_later(self, candidate: Candidate) -> float:
         return self._time(candidate) * self._later.get(candidate, 1.0)
 
-    def _missed(self, candidate: Candidate) -> float:
+    def missed(self, candidate: Candidate) -> float:
+        """The part of a candidate's error that is inferred from light that others found."""
         return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
-        """The relMSE that counts, by pairs and views, (pairs, views)."""
+        """The error that counts, by pairs and views, (pairs, views)."""
         columns = []
         for view, record in self._records[candidate].items():
             columns.append(np.array(record.errors) - not_counted(self._shared[view])[: len(record.errors)])
         return np.stack(columns, axis=1)
 
     def shared(self) -> float:
-        """The uncounted relMSE of rare bright samples that all candidates share in an image."""
+        """The uncounted error of rare bright samples that all candidates share in an image."""
         return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
 
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
-        inferred = self._missed(candidate)
+        inferred = self.missed(candidate)
         return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
 
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
-        return float((self._seen(candidate).mean() + self._missed(candidate)) * self._time_later(candidate))
+        return float((self._seen(candidate).mean() + self.missed(candidate)) * self._time_later(candidate))
+
+    def errors(self, candidate: Candidate) -> RelativeErrors:
+        """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
+        seen = self._seen(candidate)
+        own, plain = seen + self.missed(candidate), self._seen(PLAIN)[: len(seen)] + self.missed(PLAIN)
+        return RelativeErrors(images=self.images(candidate), own=_by_views(own), plain=_by_views(plain))
 
     def measured(self, candidate: Candidate) -> MeasuredCandidate:
-        """The error × time against plain path tracing, over the images that both rendered with equal seeds."""
-        seen, inferred = self._seen(candidate), self._missed(candidate)
-        plain = self._seen(PLAIN)[: len(seen)] + self._missed(PLAIN)
-        errors = RelativeErrors(images=self.images(candidate), own=_by_views(seen + inferred), plain=_by_views(plain))
+        """The error × time against plain path tracing."""
+        errors = self.errors(candidate)
         cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
         relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
         return MeasuredCandidate(
             candidate=candidate,
             errors=errors,
-            missed=inferred,
+            missed=self.missed(candidate),
             time_s=self._time(candidate),
             relative_cost=cost,
             spread=None if relative is None else cost * relative,

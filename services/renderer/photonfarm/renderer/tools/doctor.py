@@ -16,6 +16,7 @@ from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
 from photonfarm.shared.core.processes import ended_by_ctrl_c
 from photonfarm.shared.core.waiting import Log, waiting
+from photonfarm.shared.farm.devices import Cards, cards_here
 from photonfarm.shared.store.io.storage import open_storage
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class MachineCheck:
 def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Iterator[MachineCheck]:
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
+    yield _optional(_cards(cards_here()), "needed by `--device cuda` only")
     yield _tried("renderer", lambda: _renders(log))
     yield _tried("store", lambda: _writes(store))
     yield _tried("embedded Redis", _starts_redis)
@@ -58,6 +60,18 @@ def _optional(finding: MachineCheck, note: str) -> MachineCheck:
     return finding if finding.works else MachineCheck(finding.name, False, f"{finding.detail} ({note})")
 
 
+def _cards(found: Cards) -> MachineCheck:
+    """The NVIDIA cards, their driver and OptiX; without them the processor renders."""
+    driver = f"driver {found.driver or 'of unknown version'}, CUDA {found.cuda // 100}.{found.cuda % 100}"
+    cards = [
+        f"cuda:{card.number} {card.name}, compute capability {card.capability}, {card.memory_bytes / 2**30:.0f} GiB"
+        for card in found.cards
+    ]
+    if found.trouble:
+        return MachineCheck("GPU", False, "; ".join([found.trouble, *([driver] if cards else []), *cards]))
+    return MachineCheck("GPU", True, "; ".join([*cards, driver, "OptiX"]))
+
+
 @ended_by_ctrl_c()
 def _renders(log: Log) -> str:
     from photonfarm.renderer.scene import backend
@@ -72,7 +86,10 @@ def _renders(log: Log) -> str:
         image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
     seconds = time.perf_counter() - start
     size = f"{spec.film.width} × {spec.film.height}"
-    return f"{mi.variant()}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"
+    where = backend.device().name
+    return (
+        f"{mi.variant()} on {where}: bdpt rendered a Cornell box, {size}, mean {image.mean():.3f}, in {seconds:.1f} s"
+    )
 
 
 def _writes(store: str | Path) -> str:

@@ -23,6 +23,20 @@ REPORT_S = 2.0
 """The seconds between two reports of what the worker is doing."""
 
 
+@contextlib.contextmanager
+def in_hand(settings: WorkerSettings, pipe: int | None, name: str) -> Iterator[None]:
+    """Tell the supervisor of a job that the block renders; past the deadline the process ends, and prints where."""
+    if pipe is not None:
+        with contextlib.suppress(BrokenPipeError):
+            os.write(pipe, f"{JOB_IN_HAND}{name}\n".encode())
+    # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
+    faulthandler.dump_traceback_later(settings.deadline_s, exit=True, file=STDERR if pipe is None else pipe)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
 class HeartbeatThread:
     """Writes the heartbeat of the worker and its job, and why it is idle, from a thread with its own connection.
 
@@ -34,7 +48,7 @@ class HeartbeatThread:
         self._settings = settings
         self._store = store
         self._pipe = pipe
-        self._connection = queue.connect(settings.redis_url)
+        self._connection = queue.connect(settings.queue_url)
         self._supervisor = os.getppid()
         self._job: str | None = None
         self._ended = threading.Event()
@@ -65,18 +79,11 @@ class HeartbeatThread:
     def working(self, name: str) -> Iterator[None]:
         """Beat for a job too while the block runs; past the deadline the process ends, and prints where it hung."""
         self._job = name
-        if self._pipe is not None:
-            with contextlib.suppress(BrokenPipeError):
-                os.write(self._pipe, f"{JOB_IN_HAND}{name}\n".encode())
         self._beat()
-        # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
-        faulthandler.dump_traceback_later(
-            self._settings.deadline_s, exit=True, file=STDERR if self._pipe is None else self._pipe
-        )
         try:
-            yield
+            with in_hand(self._settings, self._pipe, name):
+                yield
         finally:
-            faulthandler.cancel_dump_traceback_later()
             self._job = self._activity = None
             with contextlib.suppress(redis.RedisError):
                 self._connection.delete(queue.ALIVE + name)

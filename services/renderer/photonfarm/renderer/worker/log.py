@@ -86,6 +86,10 @@ class WorkerLog:
                 name,
             )
 
+    def given_up(self, name: str) -> None:
+        """Log that a job in hand was given up, as another worker has committed it."""
+        log.info("worker %s: gives up %s, which another worker has committed", self._name, name)
+
     def pausing(self, reason: str | None) -> None:
         """Log once that no jobs are taken, and once that they are taken again."""
         if reason and not self._pausing:

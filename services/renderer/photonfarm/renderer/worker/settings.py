@@ -6,7 +6,9 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
+from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.models import Count, Frozen, Positive
+from photonfarm.shared.queue import Share
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.
@@ -34,7 +36,9 @@ class WorkerSettings(Frozen):
     model_config = ConfigDict(hide_input_in_errors=True)  # the URL may hold a password
 
     store: str
-    redis_url: Annotated[str, Field(repr=False)]
+    redis_url: Annotated[str | None, Field(repr=False)] = None  # None: only with a share
+    share: Share | None = None  # of the jobs, taken from the store alone; None: jobs come from Redis
+    scene_ids: tuple[str, ...] = ()  # the only scenes of a share; none: all scenes of the store, or `scene_id`
     name: Annotated[str, Field(min_length=1, max_length=128)]
     until_complete: bool = False
     scene_id: str | None = None  # the only scene to queue jobs of and to wait for; None: all scenes of the store
@@ -48,3 +52,10 @@ class WorkerSettings(Frozen):
     report_s: Positive = 60.0  # between lines about the progress
     reserve_bytes: Annotated[int, Field(ge=0)] = 10**9  # a few jobs, and room for whatever else needs the disk
     ahead: Annotated[float, Field(ge=1)] | None = None  # the most committed samples for each that the trainer has used
+
+    @property
+    def queue_url(self) -> str:
+        """The queue's Redis; raises QueueError without one."""
+        if self.redis_url is None:
+            raise QueueError("a worker needs a Redis, or a share of the jobs such as 0/4")
+        return self.redis_url

@@ -13,13 +13,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-import redis
-
 from photonfarm.renderer.worker.log import JobCounts
+from photonfarm.renderer.worker.registration import Registration, registration
 from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, JOBS_SO_FAR, RECYCLED, WorkerSettings
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.core.processes import Stop, process_space
+from photonfarm.shared.core.errors import BackendError, IncompleteError, StoreError
+from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
 from photonfarm.shared.store.read.find import scene_named
@@ -39,20 +37,23 @@ class ChildOutput:
 
     last: str  # its last line, which may state why it ended; "" if there is none
     job: str | None  # the job that it began last
+    in_hand: bool  # whether that job had not ended
     hung: str  # the stack of that job if the deadline ended it; otherwise ""
     counts: JobCounts  # of the jobs that ended
 
     @classmethod
     def of(cls, text: str) -> ChildOutput:
         """Parse a child's output: its reports of jobs, other lines, and the dump of faulthandler, main thread last."""
-        written, timeout, dump = text.partition("Timeout (")
+        written, timeout, dump = f"\n{text}".partition("Timeout (")
         lines = written.splitlines()
         jobs = [line.removeprefix(JOB_IN_HAND) for line in lines if line.startswith(JOB_IN_HAND)]
         counted = [line for line in lines if line.startswith(JOBS_SO_FAR)]
         others = [line for line in lines if line.strip() and not line.startswith((JOB_IN_HAND, JOBS_SO_FAR))]
         stack = dump.rpartition("Thread 0x")[2].splitlines()[1:] if timeout else []
         counts = JobCounts.of(counted[-1]) if counted else JobCounts()
-        return cls(others[-1] if others else "", jobs[-1] if jobs else None, "\n".join(stack[:HUNG_LINES]), counts)
+        in_hand = written.rfind(f"\n{JOB_IN_HAND}") > written.rfind(f"\n{JOBS_SO_FAR}")
+        hung = "\n".join(stack[:HUNG_LINES])
+        return cls(others[-1] if others else "", jobs[-1] if jobs else None, in_hand, hung, counts)
 
     @property
     def overdue(self) -> str | None:
@@ -78,56 +79,42 @@ class Supervisor:
         if vacant and self._settings.until_complete:
             raise StoreError(f"{self._settings.store}: there is no store; `photonfarm submit` makes one")
         store = None if vacant else Store(self._settings.store)
-        with self._signals(), queue.connect(self._settings.redis_url) as connection:
+        with self._signals(), registration(self._settings) as known:
             if store is not None:
-                queue.serve(connection, store)
+                known.serve(store)
             try:
-                with self._named(connection):
-                    store = store or self._waited_for(connection)
+                with self._named(known):
+                    store = store or self._waited_for(known)
                     if store is not None:
-                        queue.serve(connection, store)
-                        self._supervise(store)
+                        known.serve(store)
+                        self._supervise(store, known)
             finally:
                 if (self._counts.jobs or self._counts.failed) and not self._settings.quiet:
                     self._report(f"worker {self._settings.name}: ended: {self._counts}")
-                with contextlib.suppress(redis.RedisError):
-                    if store is not None:
-                        queue.release(connection, store)
+                if store is not None:
+                    known.release(store)
 
     @contextlib.contextmanager
-    def _named(self, connection: redis.Redis) -> Iterator[None]:
+    def _named(self, known: Registration) -> Iterator[None]:
         """Hold a name that no other live worker has, until the block ends; raises QueueError if Redis fails."""
         wanted = self._settings.name
-        try:
-            name = queue.take_name(
-                connection, wanted, process_space(), os.getpid(), ttl_s=self._settings.heartbeat_ttl_s
-            )
-        except redis.RedisError as error:
-            raise QueueError(f"Redis failed while worker {wanted} was announced: {error}") from error
-        if name != wanted:
-            self._report(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
-        self._settings = self._settings.model_copy(update={"name": name})
-        try:
+        with known.named(wanted) as name:
+            if name != wanted:
+                self._report(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
+            self._settings = self._settings.model_copy(update={"name": name})
             yield
-        finally:
-            with contextlib.suppress(redis.RedisError):
-                queue.bury(connection, name)
 
-    def _waited_for(self, connection: redis.Redis) -> Store | None:
+    def _waited_for(self, known: Registration) -> Store | None:
         """Wait for the store; None if asked to stop before. The worker counts as alive meanwhile."""
         settings = self._settings
         self._report(f"worker {settings.name}: waiting for a store at {settings.store}")
         while is_vacant(settings.store):
-            with contextlib.suppress(redis.RedisError):
-                queue.beat(
-                    connection, settings.name, process_space(), None, ttl_s=settings.heartbeat_ttl_s,
-                    process=os.getpid(),
-                )  # fmt: skip
+            known.beat(settings.name)
             if self._stop.wait(POLL_S):
                 return None
         return Store(settings.store)
 
-    def _supervise(self, store: Store) -> None:
+    def _supervise(self, store: Store, known: Registration) -> None:
         if self._settings.scene_id is not None:
             scene_id = scene_named(store, self._settings.scene_id)
             self._settings = self._settings.model_copy(update={"scene_id": scene_id})
@@ -136,7 +123,7 @@ class Supervisor:
             started = time.monotonic()
             code, output = self._run_child()
             if code < 0 and self._stop.is_set():
-                _free_job(self._settings)
+                known.stopped(self._settings.name)
             if code == 0 or self._stop.is_set():
                 return
             _raise_final(code, output.last)
@@ -146,9 +133,10 @@ class Supervisor:
             failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
             pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
-            if code > 0 and output.overdue:
-                _count_overdue(self._settings, output.overdue)
             ending = _ending(code, output, self._settings.deadline_s)
+            if output.job is not None and output.in_hand:
+                overdue = code > 0 and bool(output.overdue)
+                known.lost(store, self._settings.name, output.job, ending, overdue=overdue)
             self._report(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
@@ -225,20 +213,6 @@ def _ending(code: int, output: ChildOutput, deadline_s: float) -> str:
         deadline = f"--deadline {deadline_s:g} s"
         return f"job {output.overdue} took longer than {deadline} and was ended, while in\n{output.hung}\n"
     return output.last or f"its child ended with exit code {code}, for the reason above"
-
-
-def _free_job(settings: WorkerSettings) -> None:
-    """Free the job of a killed child at once, and do not count this start of it."""
-    with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
-        name = queue.free_job(connection, settings.name)
-        if name is not None:
-            queue.forget_starts_of(connection, name)
-
-
-def _count_overdue(settings: WorkerSettings, name: str) -> None:
-    """Record that the deadline ended this start of a job; a Redis that cannot be reached is ignored."""
-    with contextlib.suppress(QueueError, redis.RedisError), queue.connect(settings.redis_url) as connection:
-        queue.count_overdue(connection, name)
 
 
 def _raise_final(code: int, message: str) -> None:

@@ -1,6 +1,6 @@
 """The worker: a supervisor and the child that it keeps alive.
 
-The child (`child`) is an RQ worker that renders in its own process, so that scenes and kernels stay loaded. It is
+The child (`child`) renders in its own process, so that scenes and kernels stay loaded. It is
 always a fresh interpreter, as Dr.Jit's threads do not survive a fork. It gets its settings through stdin, as the Redis
 URL may hold a password. It ends when that pipe is closed, so that it cannot outlive its supervisor.
 """
@@ -17,11 +17,13 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.worker.settings import LOG_FORMAT, WorkerSettings
 from photonfarm.renderer.worker.supervisor import Supervisor
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.queue import Share
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import scene_named
 
@@ -32,8 +34,9 @@ log = logging.getLogger(__name__)
 
 def run_worker(
     store: str | Path,
-    redis_url: str,
+    redis_url: str | None = None,
     *,
+    share: Share | str | None = None,
     name: str | None = None,
     child: Sequence[str] = CHILD,
     report: Callable[[str], None] | None = None,
@@ -41,14 +44,19 @@ def run_worker(
 ) -> None:
     """Render queued jobs until asked to stop, or with `until_complete` until nothing is missing.
 
+    With a `share`, such as "0/4", there is no queue: this worker renders that share of the jobs, and then what is left.
     It waits for a missing store, except with `until_complete`. If another worker has its name, this one appends a
     number. SIGTERM and SIGINT end it after the job in hand, but not later than after GRACE_S, and a second one at once.
     Further `settings` are those of WorkerSettings; `scene_id` may also be the beginning of an id, or a scene's name.
     Raises QueueError if there is no Redis at the start (later outages are waited out) or it serves another store,
-    StoreError, BackendError, and IncompleteError if jobs have failed and nothing else is left to do.
+    StoreError, BackendError (before it waits for anything, if the device that should render is not there), and
+    IncompleteError if jobs have failed and nothing else is left to do.
     """
+    backend.device()
     logging.basicConfig(format=LOG_FORMAT, stream=sys.stderr)
-    worker = WorkerSettings(store=str(store), redis_url=redis_url, name=name or _default_name(), **settings)
+    part = Share.parse(share) if isinstance(share, str) else share
+    settings |= {"redis_url": redis_url, "share": part, "name": name or _default_name()}
+    worker = WorkerSettings(store=str(store), **settings)
     Supervisor(worker, tuple(child), report or log.warning).run()
 
 

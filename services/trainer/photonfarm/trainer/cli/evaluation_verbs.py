@@ -167,6 +167,7 @@ def infer(
 
     The views of a path are in no store: the renderer makes their buffers, where it is installed, or a file has them.
     """
+    from photonfarm.shared.scene.camera_path import CameraPath
     from photonfarm.shared.scene.frames import Frames
     from photonfarm.trainer.predict import infer as shows
     from photonfarm.trainer.predict.trained import TrainedRun
@@ -178,6 +179,8 @@ def infer(
         raise click.UsageError(f"name what to show by one of {', '.join(kinds)}, or by --modification{several}")
     if modification and given in (["--row"], ["--buffers"]):
         raise click.UsageError(f"{given[0]} has a configuration; --modification cannot give it another one")
+    if path is not None:
+        CameraPath.load(path).sampled()  # a faulty one is refused before anything is loaded
     trained = TrainedRun.load(run)
     if path is not None or orbit is not None:
         shows.check_path(trained)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from photonfarm.shared.core.estimate import stated
 from photonfarm.trainer.runs import wait_times
 
+if TYPE_CHECKING:
+    from photonfarm.trainer.dry_run.dry_run import DryRun
+
 
 def record(of: dict[str, Any]) -> None:
     """Print what people want to know of a record of a run's log, if anything."""
     if of["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in of["changes"].items())
-        click.echo(f"goes on from step {of['step']} with {changed}", err=True)
+        click.echo(f"settings changed at step {of['step']}: {changed}", err=True)
     if of["kind"] == "loss":
         click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
     if of["kind"] == "recovered":
@@ -27,6 +31,13 @@ def record(of: dict[str, Any]) -> None:
             + wait_times.stated(of["waits"], of["samples_per_used"]),
             err=True,
         )
+
+
+def dry_run(found: DryRun, as_json: bool) -> None:
+    """Print the estimate of a training."""
+    from photonfarm.trainer.dry_run.printed import document, text
+
+    click.echo(json.dumps(document(found), indent=2) if as_json else text(found))
 
 
 def _recovered(log_record: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from photonfarm.shared.core.processes import repeating
-from photonfarm.shared.core.waiting import SILENCE_S, time_left
+from photonfarm.shared.core.waiting import SILENCE_S, Steps
 
 OnProgress = Callable[[str, int, int], None]
 
@@ -47,19 +47,20 @@ def _bars(console: Console) -> Iterator[OnProgress]:
 
 @contextmanager
 def _lines() -> Iterator[OnProgress]:
-    now: tuple[str, int, int, float] = ("starts", 0, 0, time.monotonic())  # the last callback, and since when
+    name, since_s, samples = "starts", time.monotonic(), Steps(0)
 
-    def show(name: str, done: int, total: int) -> None:
-        nonlocal now
-        now = (name, done, total, now[3] if name == now[0] else time.monotonic())
+    def show(what: str, done: int, total: int) -> None:
+        nonlocal name, since_s, samples
+        if what != name:
+            name, since_s, samples = what, time.monotonic(), Steps(total)
+        samples.reach(done)
         if total and done == total:
             click.echo(f"{name}: {total} samples", err=True)
 
-    with repeating(SILENCE_S, lambda: click.echo(_line(*now), err=True)):
+    def line() -> str:
+        if not samples.total:
+            return f"{name}, for {time.monotonic() - since_s:.0f} s"
+        return f"{name}: sample {samples.words()}"
+
+    with repeating(SILENCE_S, lambda: click.echo(line(), err=True)):
         yield show
-
-
-def _line(name: str, done: int, total: int, since_s: float) -> str:
-    if not total:
-        return f"{name}, for {time.monotonic() - since_s:.0f} s"
-    return f"{name}: sample {time_left(done, total, since_s)}"

@@ -10,9 +10,11 @@ from types import TracebackType
 from typing import Any, Self
 
 from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.hold_out import rows_held_out
+from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
+from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
@@ -26,9 +28,9 @@ class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
 
     Rows that are incomplete when they are read, for instance after a repair of the store, are left out of their batch,
-    until they are complete again. Only the feed's thread uses the source. There is no cache of samples besides the
-    batches: to read a sample from the system's cache, checked, takes less than half of the time to write it into a
-    batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
+    until they are complete again. Only the feed's thread uses the source. On a CPU there is no cache of samples besides
+    the batches, unless one is asked for: to read a sample from the system's cache, checked, takes less than half of the
+    time to write it into a batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
     """
 
     def __init__(
@@ -37,12 +39,17 @@ class Feed:
         settings: TrainSettings,
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
+        resident: ResidentSamples | None = None,
     ) -> None:
-        """Feed a batch with the inputs that the settings' network needs, or those in `needs`."""
+        """Feed a batch with the inputs that the settings' network needs, or those in `needs`.
+
+        With `resident`, samples are kept there, and batches are on its device.
+        """
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or kind_of(settings.network.architecture).needs
+        self._resident = resident if resident is not None and resident.keeps_any else None
         if self._needs.guides:
             source.follow_guides()
         self.geometry, self.cloud = source.base()
@@ -51,6 +58,8 @@ class Feed:
         self._arrived: list[tuple[int, bool]] = []
         self._complete = False
         self._plans: list[dict[str, Any]] = []
+        self._sides: set[bool] = set()  # whether samples so far are held out
+        self._units: set[Key] = set()  # what is held out as one, until some are and some are not
         self._here: set[int] = set()  # rows that are complete
         self._known: set[int] = set()  # rows that are or were complete
         self._error: BaseException | None = None
@@ -108,6 +117,11 @@ class Feed:
         with self._lock:
             return self._plans
 
+    def other_hold_out(self) -> float | None:
+        """A share that splits what has arrived, where the settings' one leaves one side empty; None if none does."""
+        with self._lock:
+            return enough(self._units, least=0.0)
+
     def _raise(self) -> None:
         if self._error is not None:
             raise self._error
@@ -141,11 +155,16 @@ class Feed:
         rows = [int(row) for row in self._source.refresh()]
         gone = [int(row) for row in self._source.taken_back]
         self._here.difference_update(gone)
+        if self._resident is not None:
+            self._resident.forget(gone)
         self._here.update(rows)
         self._known.update(rows)
-        found = list(zip(rows, rows_held_out(self._source, rows, self._settings.hold_out), strict=True))
+        units = units_of(self._source, rows)
+        held_out = are_held_out(units, self._settings.hold_out)
         with self._lock:
-            self._arrived.extend(found)
+            self._arrived.extend(zip(rows, held_out, strict=True))
+            self._sides.update(held_out)
+            self._units = set() if len(self._sides) > 1 else self._units.union(units)
             self._plans = list(self._source.plan_requests)
             self._complete = 0 < self._source.planned <= len(self._known)
         self._polled.set()
@@ -162,4 +181,7 @@ class Feed:
 
     def _read_complete(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
         there = [row for row in rows if row in self._here]
-        return read_into(memory, self._source, there, self._needs, self.cloud)
+        if self._resident is None:
+            return read_into(memory, self._source, there, self._needs, self.cloud)
+        fresh = read_into(memory, self._source, self._resident.lacking(there), self._needs, self.cloud)
+        return self._resident.batch(there, fresh)

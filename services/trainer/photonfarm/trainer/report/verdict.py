@@ -19,7 +19,7 @@ LARGE = 10  # times less error: from here on it is said as a fraction, below in 
 
 
 Kind = Literal["better", "mixed", "worse"]
-"""Than the mean colour; "mixed": in the mean over all configurations, but not in most of them."""
+"""Than the mean colour; "mixed": in the mean over all, but not in most configurations, or only by light above white."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +61,9 @@ def _against(name: str, errors: HeldOutErrors, constant: HeldOutErrors, shown: f
     if error >= colour:
         times = f"{error / colour:.3g} times that of one colour for every pixel"
         return "worse", f"{name} is worse than the mean colour: on unseen {unit}s its error is {times}."
+    if shown >= 1:
+        over_all = f"over all pixels it has {_share(error / colour)} that error"
+        return "mixed", f"{name} is worse than the mean colour where no light is above white; {over_all}."
     share = _share(max(error / colour, shown))
     if 2 * better.sum() < len(better):
         mean = f"only in the mean over all has it {share} that error"

@@ -5,8 +5,8 @@ Supplement Figs. 6 to 8. Shape letters: H W image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from photonfarm.shared.core.pictures import Picture, display, display_values, of
 from photonfarm.shared.core.records import F32, Guides
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
+from photonfarm.trainer.report.worst_cases import ALL, WorstCase
 from photonfarm.trainer.report.worst_cases import caption as worst_view
 
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
@@ -63,7 +64,8 @@ def shown_views(contents: ReportContents) -> list[ShownView]:
     there = contents.entries[0].row.shown
     found = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]
     median = sorted(found, key=lambda view: view.mse)[(len(found) - 1) // 2 :][:1]
-    return [*median, *(view for view in found if view not in median)]
+    first = [replace(view, caption=caption(contents.worst, view.row, is_median=True)) for view in median]
+    return [*first, *(view for view in found if view not in median)]
 
 
 def _view(contents: ReportContents, target: Target) -> ShownView:
@@ -82,12 +84,15 @@ def _view(contents: ReportContents, target: Target) -> ShownView:
     for name, image in others:
         images += _shown(name, image, target.image, of=f" of {name}")[:2]
     inputs = tuple(_inputs(contents, target.row))
-    return ShownView(target.row, _caption(contents, target), against, tuple(images), inputs, mse)
+    return ShownView(target.row, caption(contents.worst, target.row), against, tuple(images), inputs, mse)
 
 
-def _caption(contents: ReportContents, target: Target) -> str:
-    kinds = [case.kind for case in contents.worst if case.row == target.row]
-    return f"{worst_view(kinds)}; row {target.row}" if kinds else f"Row {target.row}"
+def caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) -> str:
+    """What a view is shown for, and its row; one of median error may still be the worst of some kinds of pixels."""
+    kinds = [case.kind for case in worst if case.row == row and not (is_median and case.kind == ALL)]
+    parts = ["view of median error"] * is_median + ([worst_view(kinds)] if kinds else []) + [f"row {row}"]
+    text = "; ".join(parts)
+    return text[0].upper() + text[1:]
 
 
 def _shown(name: str, image: F32, target: F32, of: str = "") -> tuple[Layer, Layer, float]:

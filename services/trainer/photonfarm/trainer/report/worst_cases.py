@@ -71,7 +71,7 @@ def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
 def caption(kinds: Sequence[str]) -> str:
     """The caption of a view that is the worst of some kinds, at least one."""
     *others, last = kinds
-    return "Worst view of " + " and ".join([*([", ".join(others)] if others else []), last])
+    return "worst view of " + " and ".join([*([", ".join(others)] if others else []), last])
 
 
 def squared_error(view: HeldOutView) -> NDArray[np.float64]:

@@ -162,7 +162,8 @@ def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
     """
     if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
         raise SpecError(
-            f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder"
+            f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
+            "(--run)"
         )
 
 

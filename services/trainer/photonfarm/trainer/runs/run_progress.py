@@ -12,7 +12,7 @@ from pathlib import Path
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.processes import repeating
 from photonfarm.shared.core.waiting import in_words
-from photonfarm.shared.farm.training import PROGRESS, TRAINS, WAITS
+from photonfarm.shared.farm.training import PROGRESS, TRAINS, WAITS, counted
 from photonfarm.trainer.runs.wait_times import TimeKind
 
 FILE_S = 2.0  # between two versions of the file
@@ -56,7 +56,7 @@ class RunProgress:
         self._history.append((now, self._step))
         (began, first), left = self._history[0], None
         if self._step > first:
-            left = (self._steps - self._step) * (now - began) / (self._step - first)
+            left = max(self._steps - self._step, 0) * (now - began) / (self._step - first)
         phase = WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS
         return {
             "step": self._step, "steps": self._steps, "samples": self._samples, "phase": phase,
@@ -68,12 +68,20 @@ class RunProgress:
         found = self.look()
         left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
         since = f" for {found['phase_s']:.0f} s" if found["phase"] != TRAINS else ""
-        return f"step {self._step}/{self._steps}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
+        return f"{self._steps_done}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
+
+    def last_line(self) -> str:
+        """The state at the end of the session, in words; "" if nothing has arrived."""
+        return f"{self._steps_done}, {self._samples} samples have arrived" if self._samples else ""
+
+    @property
+    def _steps_done(self) -> str:
+        return f"step {counted(self._step, self._steps)}"
 
 
 @contextmanager
 def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
-    """Keep the file up to date until the block ends, and say a line every five seconds."""
+    """Keep the file up to date until the block ends; say a line every five seconds, and a last one."""
     said = time.monotonic()
 
     def follow() -> None:
@@ -87,6 +95,8 @@ def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | No
     try:
         with repeating(FILE_S, follow):
             yield
+        if say is not None and (last := progress.last_line()):
+            say(last)
     finally:
         with suppress(OSError):
             (run / PROGRESS).unlink(missing_ok=True)

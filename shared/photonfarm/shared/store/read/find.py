@@ -8,6 +8,7 @@ from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.store.read.other_scenes import scene_of
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import FoundSample, Place, SceneMatch
 from photonfarm.shared.store.write.scene_store import SceneStore
@@ -46,10 +47,10 @@ def is_spec_file(named: str) -> bool:
 def scene_or_spec(store: Store, named: str) -> SceneStore:
     """The scene that a user names by a spec's file, or as `scene_named` takes it.
 
-    Raises StoreError, which names the scenes that are there, and SpecError for a file that is no spec.
+    Raises StoreError, which names the scenes that are there and how one of the spec's name differs from it, and
+    SpecError for a file that is no spec.
     """
-    text = load_spec(named).scene_id if is_spec_file(named) else named
-    return store.scene(scene_named(store, text))
+    return store.scene(scene_of(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named))
 
 
 def _name(store: Store, scene_id: str) -> str | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.models import differing
 from photonfarm.shared.scene.spec import SceneSpec
@@ -17,11 +15,11 @@ FILES = "the scene's files"
 """What the digest `content` is of."""
 
 
-def scene_of(root: str | Path, name: str, spec: SceneSpec) -> str:
+def scene_of(store: Store, name: str, spec: SceneSpec) -> str:
     """The id of a spec's scene, which the store holds; StoreError if it does not. `name` is the spec's for its user."""
-    store = Store(root)
     if not store.has_scene(spec.scene_id):
-        raise StoreError(f"{root}: holds no samples of {name} (scene {spec.scene_id}); {other_scenes(store, spec)}")
+        where = store.storage.where
+        raise StoreError(f"{where}: holds no samples of {name} (scene {spec.scene_id}); {other_scenes(store, spec)}")
     return spec.scene_id
 
 

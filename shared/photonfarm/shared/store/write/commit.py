@@ -28,6 +28,7 @@ from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
+from photonfarm.shared.store.write.rounding import as_array, stays_finite
 
 WAITING_ROWS = 8
 """The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""
@@ -48,6 +49,8 @@ class Figures:
     redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
     worker: str
     versions: Mapping[str, str]
+    device: str = markers.CPU  # what rendered; otherwise the name of a card
+    driver: str = ""  # the version of the card's driver
 
 
 Clock = Callable[[], datetime]
@@ -129,7 +132,7 @@ class RowWriter(ABC):
         array = self._arrays[name]
         if values.shape != array.shape:
             raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
-        if not _stays_finite(values, array.dtype):
+        if not stays_finite(values, array.dtype):
             raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
         self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
         self._raise_error()
@@ -336,7 +339,7 @@ class JobWriter(RowWriter):
     def radiance(self, row: int, halves: F32) -> None:
         """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
         self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
-        self._put(row, *_radiance(halves, self._scene.spec.radiance_exponent))
+        self._put(row, *as_array(halves, self._scene.spec.radiance_exponent))
 
     def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
         """Add a new view row: its buffers, and which points and photons it sees."""
@@ -384,30 +387,3 @@ class JobWriter(RowWriter):
 def _matches(named: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:
     """Whether a marker's entry matches a file: the same size and checksum, or neither exists."""
     return named == there if named is None or there is None else all(named[key] == there[key] for key in there)
-
-
-def _radiance(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
-    """The array that a sample goes to, and its values: scaled, or unscaled if float16 cannot hold them."""
-    with np.errstate(over="ignore", under="ignore"):
-        scaled = radiance * np.float32(2.0**exponent)
-    return ("radiance", scaled) if _stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
-
-
-def as_stored(radiance: F32, exponent: int) -> F32:
-    """Radiance as readers give it once it is stored: rounded to float16 at the store's scale, if that can hold it."""
-    name, values = _radiance(radiance, exponent)
-    return (
-        values if name == "radiance_wide" else values.astype(np.float16).astype(np.float32) * np.float32(2.0**-exponent)
-    )
-
-
-def _stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
-    """Whether all values are finite in the type that they are stored in, to which the writer's thread rounds them.
-
-    65504 is the largest float16 and 65520 the first number that rounds to infinity; likewise for float32. NaN is in no
-    range.
-    """
-    if stored.kind != "f":
-        return True
-    end = {2: 65520.0, 4: 2.0**128 - 2.0**103}[stored.itemsize]
-    return -end < float(values.min()) and float(values.max()) < end

@@ -13,12 +13,20 @@ from photonfarm.shared.scene.spec_loading import SCENE_SUFFIXES
 BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
 """What Blender reads for us."""
 
+FEW = 3
+"""Up to so many scenes of a folder are named."""
+
 Reader = Callable[[Path, Path, Log], ImportedScene]
 """Reads a file; what it makes of it lies in the folder that is given, and it says what takes long."""
 
 
 def reader_of(path: Path) -> Reader:
-    """The reader of a file, by its ending; raises SpecError for an unknown one and for a file that is not there."""
+    """The reader of a file, by its ending; raises SpecError for an unknown one and for what is no file or not there."""
+    if path.is_dir():
+        there = sorted(each.name for each in path.iterdir() if each.suffix.lower() in SCENE_SUFFIXES)
+        names = ", ".join(there[:FEW]) + (f" and {len(there) - FEW} more" if len(there) > FEW else "")
+        remedy = f"name the scene's file in it: {names}" if there else "and holds no scene; name the file of one"
+        raise SpecError(f"{path}: is a folder{';' if there else ','} {remedy}")
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES:
         raise SpecError(

@@ -8,22 +8,23 @@ from photonfarm.renderer.strategy.candidate import Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost, best
 from photonfarm.renderer.strategy.comparison import CLEAR, WORTHWHILE, saving
 from photonfarm.renderer.strategy.measurement import present
+from photonfarm.renderer.strategy.objective.purpose import Purpose
 from photonfarm.renderer.strategy.output.table import legend, table
 from photonfarm.renderer.strategy.plan import TransportPlan
 from photonfarm.renderer.strategy.reasons import BLACK, plus_minus, reasons_for
 
 
 def lines(plan: TransportPlan) -> list[str]:
-    """The verdict, the modelled content, what is left out, the reasons, the saving, and the measurement."""
+    """The settings, the verdict, the modelled content, what is left out, the reasons, the saving, the measurement."""
     m = plan.measurement
     origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
     return [
         f"{plan.spec.name}: connections {plan.candidate.connections}, light_ratio {plan.candidate.light_ratio:g}, "
         f"half_spp {plan.half_spp}; photons: paths {plan.photons.paths}, depth {plan.photons.depth}",
-        _verdict(plan),
+        f"for {m.purpose}: {_verdict(plan)}",
         "",
         "Modelled",
-        *(f"  {sentence}" for sentence in (*m.modelled, plan.photons_reason, *_halves(plan))),
+        *(f"  {sentence}" for sentence in (*m.modelled, plan.photons_reason, *_halves(plan), *_beside(plan))),
         "Left out",
         *(f"  {sentence}" for sentence in (*m.left_out, *_unchosen(plan)) or ("nothing",)),
         "Why",
@@ -63,6 +64,16 @@ def _halves(plan: TransportPlan) -> list[str]:
     return [
         f"both half-estimates: they cost at most {plan.halves_overhead:.0%} more than one image of twice the samples, "
         "and without them no error could be measured free of noise"
+    ]
+
+
+def _beside(plan: TransportPlan) -> list[str]:
+    m = plan.measurement
+    if m.purpose is not Purpose.TRAINING:
+        return []
+    return [
+        f"beside its half-estimates, which share a launch, a sample takes {1e3 * m.configuration_s:.1f} ms for its "
+        f"configuration and {1e3 * m.view_s:.1f} ms for its view: buffers, guides, and what it sees"
     ]
 
 
@@ -135,4 +146,5 @@ def _measured(plan: TransportPlan) -> list[str]:
     """The table, its legend and an empty line each; nothing without a measurement."""
     if not plan.at_equal_cost:
         return []
-    return [*table(list(plan.at_equal_cost.values()), plan.candidate), "", *legend(plan.spec), ""]
+    purpose, rows = plan.measurement.purpose, list(plan.at_equal_cost.values())
+    return [*table(rows, plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]

@@ -77,13 +77,15 @@ def _part_of(text: str, name: str) -> slice:
 
 def _tables(text: str) -> Iterator[tuple[int, str]]:
     """Where each table of a document begins, and the first key of its header."""
+    begin = 0  # of the table before
     for header in re.finditer(r"^[ \t]*\[.*$", text, re.MULTILINE):
         try:  # what stands in a list or a string of several lines is no header
-            tomlkit.parse(text[: header.start()])
+            tomlkit.parse(text[begin : header.start()])
             (key,) = tomlkit.parse(header.group())
         except (TOMLKitError, ValueError):
             continue
-        yield header.start(), key
+        begin = header.start()
+        yield begin, key
 
 
 def _put_table(text: str, name: str, entries: Mapping[str, int | float | dict[str, Any]]) -> str:

@@ -8,11 +8,15 @@ from collections.abc import Iterable, Sequence
 from photonfarm.renderer.strategy.candidate import Candidate
 from photonfarm.renderer.strategy.choices import CandidateAtCost
 from photonfarm.renderer.strategy.measurement import present
+from photonfarm.renderer.strategy.objective.purpose import Purpose
 from photonfarm.renderer.strategy.reasons import rounded
 from photonfarm.shared.scene.spec import SceneSpec
 
+ERROR = {Purpose.IMAGES: "relMSE", Purpose.TRAINING: "loss"}
+"""The head of the column with errors."""
 
-def table(candidates: Sequence[CandidateAtCost], chosen: Candidate) -> list[str]:
+
+def table(candidates: Sequence[CandidateAtCost], chosen: Candidate, purpose: Purpose) -> list[str]:
     """A line of heads and one for each candidate."""
     costs = [rounded(measured.relative_cost, measured.spread) for measured in candidates]
     means, spreads = (_aligned(part) for part in zip(*costs, strict=True))
@@ -21,7 +25,7 @@ def table(candidates: Sequence[CandidateAtCost], chosen: Candidate) -> list[str]
         "light ratio": _aligned(f"{measured.candidate.light_ratio:g}" for measured in candidates),
         "images": [str(measured.errors.images) for measured in candidates],
         "half_spp": [str(measured.half_spp) for measured in candidates],
-        "relMSE": _aligned(_three_digits(measured.half_error) for measured in candidates),
+        ERROR[purpose]: _aligned(_three_digits(measured.half_error) for measured in candidates),
         "ms": _aligned(f"{1e3 * measured.time_s:.1f}" for measured in candidates),
         "error × time": [
             f"{mean} {'±' if spread.strip() else ' '} {spread}" for mean, spread in zip(means, spreads, strict=True)
@@ -39,17 +43,26 @@ def _remark(measured: CandidateAtCost, chosen: Candidate) -> str:
     return "" if measured.fits else "too costly"
 
 
-def legend(spec: SceneSpec) -> list[str]:
+def legend(spec: SceneSpec, purpose: Purpose) -> list[str]:
     """The meaning of the columns."""
+    error = ERROR[purpose]
     film, now = spec.film, spec.transport.half_spp
     return [
         "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "
         "tracing: 0 and 0; images: rendered to measure it, over all views",
         f"half_spp: samples per pixel, 1 at least, for the time that {now} of the spec's settings take now, "
-        f"{present(spec)}; relMSE and ms: relative mean squared error and CPU milliseconds of such a half-estimate, "
+        f"{present(spec)}; {error} and ms: {_MEANING[purpose]} and CPU milliseconds of such a half-estimate, "
         f"{film.width} × {film.height} pixels",
-        "error × time: relMSE × ms, relative to plain path tracing, ± one standard error: the time to the same error",
+        f"error × time: {error} × {_TIME[purpose]}, relative to plain path tracing, ± one standard error: the time to "
+        "the same error",
     ]
+
+
+_MEANING = {
+    Purpose.IMAGES: "relative mean squared error",
+    Purpose.TRAINING: "relative loss that noise alone leaves, at the scene's exposure,",
+}
+_TIME = {Purpose.IMAGES: "ms", Purpose.TRAINING: "(ms + half of what a sample takes beside its half-estimates)"}
 
 
 def _three_digits(value: float) -> str:

@@ -1,0 +1,1 @@
+"""What a plan minimises: noise as images or training weigh it, and the processor time that counts."""

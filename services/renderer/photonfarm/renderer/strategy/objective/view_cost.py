@@ -1,0 +1,78 @@
+"""The processor time of a sample beside its two half-estimates: its configuration and its view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.renderer.jobs.render import lit_points, visibility_of
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
+from photonfarm.shared.core.keys import view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Photons
+from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.view import View
+
+LEAST_VIEWS, MOST_VIEWS = 2, 7
+"""The views that are looked at; the first one compiles, and does not count."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class ViewCost:
+    """Processor seconds, as in `SampleCosts`; a sample is charged for both, as with one view of each configuration."""
+
+    configuration_s: float  # the scene edited, its points moved, its photons traced
+    view_s: float  # the view's buffers and guides, and which points and photons it sees
+
+    @property
+    def half_s(self) -> float:
+        """The part of either half-estimate, which share it."""
+        return (self.configuration_s + self.view_s) / 2
+
+
+FREE = ViewCost(0.0, 0.0)
+"""For images alone: nothing but they is rendered."""
+
+
+def measure(pilot_scene: PilotScene, views: Iterable[tuple[Modification, View]]) -> ViewCost:
+    """The medians over some views, each of a configuration of its own, without the first one."""
+    cloud = pilot_scene.loaded.base()[1]
+    times = []
+    for modification, view in views:
+        configuration_s, lit = _timed(partial(_configure, pilot_scene, cloud, modification))
+        view_s, _ = _timed(partial(_look, pilot_scene, cloud, modification, view, lit))
+        times.append((configuration_s, view_s))
+    configuration_s, view_s = np.median(times[1:], axis=0).tolist()
+    return ViewCost(configuration_s, view_s)
+
+
+_Lit = tuple[tuple[F32, NDArray[np.bool_]], Photons | None]
+
+
+def _configure(pilot_scene: PilotScene, cloud: BasePointCloud, modification: Modification) -> _Lit:
+    pilot_scene.apply(modification)
+    dr.sync_thread()  # else what is pending would be charged to the view
+    return rebuild(cloud, modification), pilot_scene.loaded.photons(SEED)
+
+
+def _look(pilot_scene: PilotScene, cloud: BasePointCloud, modification: Modification, view: View, lit: _Lit) -> None:
+    scene = pilot_scene.loaded
+    scene.buffers(view)
+    visibility_of(scene, view, *lit)
+    key = view_key(modification.key(scene.spec.scene_id), view.vector)
+    scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
+
+
+def _timed(work: Callable[[], T]) -> tuple[float, T]:
+    begun = backend.work_s()
+    result = work()
+    return backend.work_s() - begun, result

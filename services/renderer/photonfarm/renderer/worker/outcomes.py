@@ -1,0 +1,197 @@
+"""What the jobs of a child come to: counts for its supervisor, and the consequences of errors for job and worker.
+
+It is the same whether jobs come from Redis or from the store alone; where failures are counted differs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import redis
+
+from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
+from photonfarm.renderer.worker.log import JobCounts
+from photonfarm.renderer.worker.settings import RECYCLED, WorkerSettings
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import (
+    BackendError,
+    CorruptError,
+    IncompleteError,
+    PhotonfarmError,
+    QueueError,
+    SceneNotHereError,
+    StoreError,
+)
+from photonfarm.shared.queue import RenderArguments
+from photonfarm.shared.store import SceneStore, Store
+
+NOT_HERE_S = 300.0
+"""How long a scene whose files are missing here is left to other workers before its files are looked for again."""
+
+log = logging.getLogger(__name__)
+
+
+def send_line(pipe: int, message: str) -> None:
+    """Send a line to the supervisor, if it is still there."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(pipe, f"{' '.join(message.split())}\n".encode())  # a line, which the supervisor repeats
+
+
+class Outcomes:
+    """What the jobs of a child come to."""
+
+    def __init__(
+        self,
+        settings: WorkerSettings,
+        store: Store,
+        pipe: int | None,
+        *,
+        record: Callable[[str, str], None],
+        put_back: Callable[[str], None],
+    ) -> None:
+        """Take what counts a failure of a job for a reason, and what puts a job back that others may still render."""
+        self.disk = DiskReserve(store, settings.reserve_bytes)
+        self.not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
+        self._look_again: dict[str, float] = {}  # …and until when
+        self.has_failed = False  # the job in hand
+        self._settings, self._store, self._pipe = settings, store, pipe
+        self._record_further, self._put_back = record, put_back
+        self._fatal: PhotonfarmError | None = None
+        self._tainted = False  # an unexpected error happened, perhaps in the middle of an edit
+        self._counts = JobCounts()
+        self._done = 0
+
+    def begin(self) -> None:
+        """Note that a job begins."""
+        self.has_failed = False
+
+    def count(self, name: str, seconds: float, *, done: bool = True) -> None:
+        """Report the jobs so far to the supervisor, which outlives this process, however it ends.
+
+        The job in hand has ended; it counts as done unless it failed, or was left to another worker.
+        """
+        done = done and not self.has_failed
+        self._counts += JobCounts(done, self.has_failed, self._samples(name) if done else 0, seconds)
+        if self._pipe is not None:
+            send_line(self._pipe, self._counts.line)
+
+    def after_job(self) -> int | None:
+        """Raise the error that the next job would meet as well; RECYCLED if a successor should go on."""
+        self._done += 1
+        if self._fatal:
+            raise self._fatal
+        worn = self._done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+        return RECYCLED if worn or self._tainted else None
+
+    def left(self) -> dict[str, str]:
+        """Why this worker takes no jobs of some scenes, by their ids: their files are not here."""
+        for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
+            del self.not_here[scene_id], self._look_again[scene_id]
+        return {scene_id: str(error) for scene_id, error in self.not_here.items()}
+
+    def failed(self, name: str, error: BaseException) -> None:
+        """Decide the consequences of a failed job: for the job, for this worker, or none."""
+        if self._is_committed(name):
+            log.warning("job %s is committed, and nothing lost; only Redis does not know it: %s", name, error)
+            return
+        self.has_failed = True
+        what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"
+        known = isinstance(error, PhotonfarmError | redis.RedisError)
+        log.warning("job %s %s: %s", name, what, error, exc_info=None if known else error)
+        if is_full(error):
+            self.disk.refused()
+        elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
+            scene_id = name.rpartition("-")[0]
+            self.not_here[scene_id] = error
+            self._look_again[scene_id] = time.monotonic() + NOT_HERE_S
+            log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
+        elif (fatal := self._fatal_of(error)) is not None:
+            self._fatal = fatal
+            with contextlib.suppress(redis.RedisError):
+                self._put_back(name)
+        elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
+            self._tainted = not isinstance(error, PhotonfarmError)
+            self._record(name, f"{type(error).__name__}: {error}")
+
+    def _samples(self, name: str) -> int:
+        """The number of samples of a job; 0 if its scene cannot be read any more."""
+        with contextlib.suppress(PhotonfarmError, IndexError):
+            arguments = RenderArguments.of(name)
+            return len(self._store.scene(arguments.scene_id).job_rows(arguments.job).samples)
+        return 0
+
+    def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
+        """The error that the next job would meet as well; if the store is gone, whatever error the job had."""
+        if isinstance(error, redis.RedisError):
+            return None
+        try:
+            self._store.check()
+        except StoreError as gone:
+            return gone
+        return error if isinstance(error, StoreError | BackendError) and not isinstance(error, CorruptError) else None
+
+    def _is_committed(self, name: str) -> bool:
+        with contextlib.suppress(PhotonfarmError, OSError):
+            arguments = RenderArguments.of(name)
+            return self._store.scene(arguments.scene_id).is_done(arguments.job)
+        return False
+
+    def _record(self, name: str, reason: str) -> None:
+        """Record a failure: in the store, and where else failures are counted, so that the job is left alone."""
+        with contextlib.suppress(OSError):
+            queue.keep_failure(self._store, name, reason, worker=self._settings.name, at_s=time.time())
+        with contextlib.suppress(redis.RedisError):
+            self._record_further(name, reason)
+
+
+def _resident_bytes() -> int:
+    """The memory of this process now; its peak if the system does not state it."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+# ---------------------------------------------------------------------------------------------------------- at the end
+
+
+def missing_jobs(store: Store, scene_ids: tuple[str, ...]) -> tuple[dict[str, list[int]], dict[str, StoreError]]:
+    """The missing jobs of some scenes, or of all if none are named; and why scenes cannot be read. Both by scene id.
+
+    Raises StoreError if the store, or a scene that is named, cannot be read.
+    """
+    if scene_ids:
+        return {scene_id: store.scene(scene_id).missing_jobs() for scene_id in scene_ids}, {}
+    return store.each(SceneStore.missing_jobs)
+
+
+def is_complete(
+    missing: Mapping[str, list[int]],
+    unreadable: Mapping[str, StoreError],
+    failed: Mapping[str, str],
+    not_here: Mapping[str, SceneNotHereError],
+) -> bool:
+    """Whether a worker that is to stop when nothing is missing may stop; `failed` are reasons by the jobs' names.
+
+    Raises the error for which it should rather end, as nothing is left that it could do or wait for.
+    """
+    scene_of = {queue.job_name(scene_id, job): scene_id for scene_id, jobs in missing.items() for job in jobs}
+    not_failed = scene_of.keys() - failed.keys()
+    if not_failed and all(scene_of[name] in not_here for name in not_failed):
+        raise not_here[scene_of[min(not_failed)]]
+    if unreadable and not not_failed:  # and nothing else is left: the other scenes' jobs were taken before
+        raise unreadable[min(unreadable)]
+    if scene_of and not not_failed:
+        first = min(scene_of)
+        raise IncompleteError(
+            f"{len(scene_of)} jobs have failed; {first}: {failed[first]}. `photonfarm status` has the causes, and "
+            "commands that repeat them"
+        )
+    return not scene_of

@@ -1,0 +1,204 @@
+"""The files for Kubernetes, read as YAML: they agree with the compose file, the code, and each other.
+
+The files of deploy/kustomize are what the chart renders, so these tests need no tool of Kubernetes;
+tests/end_to_end/test_kubernetes.py asks those.
+"""
+
+import json
+import re
+import runpy
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from redis import Redis
+
+from photonfarm.shared import queue
+
+ROOT = Path(__file__).parents[2]
+CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
+COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
+VERSION = tomllib.loads((ROOT / "shared/pyproject.toml").read_text())["project"]["version"]
+
+DOCUMENTS: list[dict[str, Any]] = [
+    document
+    for path in sorted(KUSTOMIZE.glob("*/*.yaml"))
+    if path.name != "kustomization.yaml"
+    for document in yaml.safe_load_all(path.read_text())
+]
+
+
+def pod_of(document: dict[str, Any]) -> dict[str, Any] | None:
+    """The template of a document's pods."""
+    spec = document.get("spec", {})
+    spec = spec["jobTemplate"]["spec"] if document["kind"] == "CronJob" else spec
+    return spec.get("template")
+
+
+PODS = {document["metadata"]["name"]: pod for document in DOCUMENTS if (pod := pod_of(document)) is not None}
+
+
+def containers() -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every container, with the name of what runs it."""
+    return ((name, container) for name, pod in PODS.items() for container in pod["spec"]["containers"])
+
+
+def named(kind: str, name: str) -> dict[str, Any]:
+    """One document."""
+    (found,) = [d for d in DOCUMENTS if (d["kind"], d["metadata"]["name"]) == (kind, name)]
+    return found
+
+
+def test_there_are_the_parts_of_the_farm_and_no_others() -> None:
+    parts = ("plan-first", "reconcile", "redis", "renderer", "trainer")
+    assert set(PODS) == {f"photonfarm-{part}" for part in parts}
+
+
+def test_the_images_are_those_of_the_compose_file_in_a_registry_that_nobody_has() -> None:
+    ours = {service["image"] for service in COMPOSE["services"].values()}
+    assert {container["image"] for _, container in containers()} == {f"localhost/{image}:{VERSION}" for image in ours}
+    assert yaml.safe_load((CHART / "Chart.yaml").read_text())["appVersion"] == VERSION
+    renamed = yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["images"]
+    assert {(image["name"], image["newTag"]) for image in renamed} == {(f"localhost/{i}", VERSION) for i in ours}
+
+
+def test_every_command_and_probe_of_photonfarm_has_a_verb_and_options_that_there_are(parse) -> None:
+    lines = [container["command"] for _, container in containers()]
+    lines += [c[probe]["exec"]["command"] for _, c in containers() for probe in c if probe.endswith("Probe")]
+    for patch in yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["patches"]:
+        lines += [operation["value"] for operation in yaml.safe_load(patch["patch"])]
+    ours = [line[1:] for line in lines if line[0] == "photonfarm"]
+    assert len(ours) == len(PODS) - 1 + 2 + 1  # all but Redis, two probes and a patch
+    for arguments in ours:
+        parse(arguments)
+
+
+def test_commands_and_probes_are_those_of_the_compose_file() -> None:
+    for part in ("renderer", "trainer"):
+        service, (container,) = COMPOSE["services"][part], PODS[f"photonfarm-{part}"]["spec"]["containers"]
+        said = service.get("command", ["photonfarm", "work"])  # of its image
+        assert container["command"] == said + ["--until-complete"] * (part == "trainer")
+        assert container["readinessProbe"]["exec"]["command"] == service["healthcheck"]["test"][1:]
+    (container,) = PODS["photonfarm-redis"]["spec"]["containers"]
+    for probe in ("readinessProbe", "livenessProbe"):
+        assert container[probe]["exec"]["command"][2] == COMPOSE["services"]["redis"]["healthcheck"]["test"][1]
+
+
+def test_variables_are_those_of_the_compose_file_and_on_the_page_of_the_configuration() -> None:
+    page = (ROOT / "docs/configuration.md").read_text()
+    wanted = {
+        **COMPOSE["services"]["renderer"]["environment"],
+        "PHOTONFARM_REDIS_URL": "redis://photonfarm-redis:6379/0",
+    }
+    for name, container in containers():
+        variables = {variable["name"]: variable["value"] for variable in container["env"]}
+        assert variables == ({"REDIS_DATA": "/queue"} if name == "photonfarm-redis" else wanted)
+    in_templates = "".join(path.read_text() for path in (CHART / "templates").iterdir())
+    for variable in {*wanted, *re.findall(r"\bPHOTONFARM_\w+", in_templates)} - {"HOME"}:
+        assert f"`{variable}`" in page, variable
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pod_is_nobody_in_particular_and_writes_to_nothing_but_its_volumes(name: str) -> None:
+    spec = PODS[name]["spec"]
+    assert spec["securityContext"]["runAsNonRoot"]
+    assert spec["securityContext"]["runAsUser"] == spec["securityContext"]["fsGroup"] == 1000
+    assert spec["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert spec["automountServiceAccountToken"] is False
+    for container in spec["containers"]:
+        assert container["securityContext"] == {
+            "allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]},
+        }  # fmt: skip
+        assert "memory" in container["resources"]["limits"]
+        volumes = {volume["name"]: volume for volume in spec["volumes"]}
+        mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
+        assert {mount["name"] for mount in mounts.values()} == set(volumes)
+        assert {path for path, mount in mounts.items() if not mount.get("readOnly")} <= {"/tmp", "/data", "/queue"}
+        assert volumes["tmp"]["emptyDir"]["sizeLimit"]
+        password = volumes[mounts["/run/photonfarm"]["name"]]["secret"]
+        assert (password["secretName"], password["items"][0]["path"]) == ("photonfarm-redis", "redis_password")
+
+
+def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but_redis_and_names() -> None:
+    redis, farm = (named("NetworkPolicy", f"photonfarm-{part}")["spec"] for part in ("redis", "farm"))
+    component = "app.kubernetes.io/component"
+    covered = farm["podSelector"]["matchExpressions"][0]["values"]
+    labels = {name: pod["metadata"]["labels"] for name, pod in PODS.items()}
+    assert {label[component] for label in labels.values()} == {"redis", *covered}
+    for label in labels.values():
+        assert farm["podSelector"]["matchLabels"].items() <= label.items()
+    assert redis["podSelector"]["matchLabels"] == labels["photonfarm-redis"]
+    assert redis["policyTypes"] == farm["policyTypes"] == ["Ingress", "Egress"]
+    assert "egress" not in redis
+    assert "ingress" not in farm
+    (entry,) = redis["ingress"]
+    assert [peer["podSelector"] for peer in entry["from"]] == [farm["podSelector"]]
+    to_redis, names = farm["egress"]
+    assert to_redis["to"] == [{"podSelector": redis["podSelector"]}]
+    assert {port["port"] for port in names["ports"]} == {53}
+
+
+def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(connection: Redis) -> None:
+    scaled, access = (
+        named(*of) for of in (("ScaledObject", "photonfarm-renderer"), ("TriggerAuthentication", "photonfarm-redis"))
+    )
+    jobs = queue.open_queue(connection)
+    watched = [trigger["metadata"]["listName"] for trigger in scaled["spec"]["triggers"]]
+    assert watched == [jobs.key, jobs.started_job_registry.key]
+    assert named("Deployment", scaled["spec"]["scaleTargetRef"]["name"])
+    service = named("Service", "photonfarm-redis")
+    for trigger in scaled["spec"]["triggers"]:
+        assert trigger["metadata"]["address"] == "photonfarm-redis.photonfarm.svc:6379"
+        assert trigger["authenticationRef"]["name"] == access["metadata"]["name"]
+    assert service["spec"]["ports"][0]["port"] == 6379
+    keys = {entry["parameter"]: entry["key"] for entry in access["spec"]["secretTargetRef"]}
+    assert keys == {"username": "username", "password": "redis_password"}
+    assert scaled["spec"]["minReplicaCount"] == 0
+    assert named("CronJob", "photonfarm-reconcile"), "nothing would wake the workers again"
+
+
+def test_every_value_has_a_schema_and_every_schema_a_value() -> None:
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    schema = json.loads((CHART / "values.schema.json").read_text())
+    assert keys_of_schema(schema, schema) - {"global"} == keys_of(values)
+
+
+def keys_of(values: dict[str, Any], before: str = "") -> set[str]:
+    """The dotted keys of values, as deep as they are the chart's."""
+    found = set()
+    for key, value in values.items():
+        free = key in {"resources", "nodeSelector"}
+        found |= keys_of(value, f"{before}{key}.") if isinstance(value, dict) and not free else {before + key}
+    return found
+
+
+def keys_of_schema(schema: dict[str, Any], root: dict[str, Any], before: str = "") -> set[str]:
+    """The same of the schema; what lies below a reference is not the chart's."""
+    found = set()
+    for key, value in schema["properties"].items():
+        found |= keys_of_schema(value, root, f"{before}{key}.") if "properties" in value else {before + key}
+    return found
+
+
+def test_podman_gets_pods_whose_volumes_are_their_own_and_whose_ports_nobody_reaches() -> None:
+    convert = runpy.run_path(str(ROOT / "scripts/podman_pods.py"))["podman_documents"]
+    left_out: list[str] = []
+    made = list(convert(DOCUMENTS, left_out))
+    pods = {document["metadata"]["name"]: document["spec"] for document in made if document["kind"] == "Pod"}
+    assert set(pods) == {
+        *(f"photonfarm-{part}" for part in ("plan-first", "redis", "renderer-0", "renderer-1", "trainer"))
+    }
+    assert [document["kind"] for document in made if document["kind"] != "Pod"] == ["PersistentVolumeClaim"]
+    assert {name.partition("/")[0] for name in left_out} == {
+        "CronJob", "NetworkPolicy", "ScaledObject", "Service", "TriggerAuthentication",
+    }  # fmt: skip
+    own = [volume["name"] for spec in pods.values() for volume in spec["volumes"] if "emptyDir" in volume]
+    assert len(own) == len(set(own)) == len(pods) + 1  # a /tmp each, and Redis's journal
+    for spec in pods.values():
+        (container,) = spec["containers"]
+        assert "ports" not in container
+        assert {mount["name"] for mount in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
+    assert [pods[f"photonfarm-{part}"]["restartPolicy"] for part in ("redis", "trainer")] == ["Always", "OnFailure"]

@@ -1,0 +1,188 @@
+"""Workers that share the jobs of a store without Redis: killed, hung, failing, and at work on the same job."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from click.testing import CliRunner
+
+from photonfarm.renderer.worker.worker import run_worker
+from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.farm.submission import submit
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.queue import job_name, jobs_left_alone, kept_failures
+from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.shared.store import SceneStore, Store
+
+Starter = Callable[..., subprocess.Popen[bytes]]
+
+pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
+
+
+@pytest.fixture
+def start(analytic: ModuleType, tmp_path: Path) -> Iterator[Starter]:
+    """Starts a worker of a share, which is ended with the test and logs to a file of its name."""
+    with contextlib.ExitStack() as stack:
+
+        def started(scene: SceneStore, share: str, *child: object, **settings: object) -> subprocess.Popen[bytes]:
+            name = f"worker-{share.partition('/')[0]}"
+            process = stack.enter_context(
+                analytic.start_worker(
+                    scene.folder.parent.parent,
+                    None,
+                    analytic.command(*child),
+                    tmp_path / f"{name}.log",
+                    share=share,
+                    name=name,
+                    **settings,
+                )
+            )
+            stack.callback(process.kill)
+            return process
+
+        yield started
+
+
+def rendered_by(scene: SceneStore) -> dict[int, str]:
+    return {job: scene.marker(job)["figures"]["worker"] for job in scene.committed_jobs()}
+
+
+def test_a_worker_renders_its_share_first_and_then_that_of_one_who_has_not_come(
+    planned: Callable[..., SceneStore], start: Starter, tmp_path: Path
+) -> None:
+    scene = planned(8)
+    assert start(scene, "1/2", until_complete=True).wait(60) == 0
+    assert scene.missing_jobs() == []
+    committed = sorted((scene.folder / "committed").iterdir(), key=lambda marker: marker.stat().st_mtime_ns)
+    assert [int(marker.stem) for marker in committed][:4] == [1, 3, 5, 7]
+    assert "ended: 8 jobs done, 16 samples" in (tmp_path / "worker-1.log").read_text()
+
+
+@pytest.mark.slow
+def test_workers_under_a_hail_of_kills_complete_the_plan_bit_for_bit(
+    analytic: ModuleType,
+    planned: Callable[..., SceneStore],
+    clean_bytes: Callable[[int], dict[str, bytes]],
+    stored_bytes: Callable[[SceneStore], dict[str, bytes]],
+    start: Starter,
+) -> None:
+    """Supervisors are killed too, and nobody starts them again; the last one renders what is left."""
+    scene, rng = planned(24), random.Random(0)
+    workers = [start(scene, f"{number}/3", 0.08, until_complete=True) for number in range(3)]
+    analytic.wait_for(lambda: len(scene.committed_jobs()) >= 3)
+    for victim in workers[1:]:
+        child = analytic.child_of(victim)
+        victim.kill()
+        if child is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+        time.sleep(rng.uniform(0.1, 0.3))
+    assert workers[0].wait(60) == 0
+    assert scene.missing_jobs() == []
+    Store(scene.folder.parent.parent).sweep(stray_age_s=0)
+    stored, clean = stored_bytes(scene), clean_bytes(24)
+    assert stored.keys() == clean.keys()
+    assert [name for name in clean if stored[name] != clean[name]] == []
+
+
+def test_a_job_that_another_worker_commits_meanwhile_is_given_up(
+    analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter, tmp_path: Path
+) -> None:
+    """Half an estimate takes two seconds, so a job takes eight, and is given up after its first sample."""
+    from photonfarm.renderer.jobs.render import ShardRenderer
+
+    scene = planned(2)
+    quick = ShardRenderer(Store(scene.folder.parent.parent), worker="quick", load=analytic.AnalyticScene.load)
+    quick.render(scene.scene_id, 1)
+    running = start(scene, "0/1", 2.0, until_complete=True)
+    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # its first rows
+    quick.render(scene.scene_id, 0)
+    began = time.monotonic()
+    assert running.wait(60) == 0
+    assert time.monotonic() - began < 7
+    assert rendered_by(scene) == {0: "quick", 1: "quick"}
+    log = (tmp_path / "worker-0.log").read_text()
+    assert "gives up" in log
+    assert "failed" not in log
+
+
+def test_sigterm_lets_the_job_at_hand_be_finished(
+    analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
+) -> None:
+    scene = planned(8)
+    running = start(scene, "0/1", 0.2)
+    analytic.wait_for(lambda: scene.committed_jobs())
+    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # rows of the next one
+    done = len(scene.committed_jobs())
+    running.send_signal(signal.SIGTERM)
+    assert running.wait(20) == 0
+    assert done + 1 <= len(scene.committed_jobs()) <= done + 2
+    assert kept_failures(Store(scene.folder.parent.parent), lambda _: True) == {}
+
+
+def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_the_next_submission(
+    analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter, tmp_path: Path
+) -> None:
+    scene = planned(2)
+    store = Store(scene.folder.parent.parent)
+    for _ in range(2):  # the second worker finds what the first one has kept
+        assert start(scene, "0/1", 0, "broken", until_complete=True).wait(60) == 7
+    kept = kept_failures(store, lambda _: True)
+    assert [failure.times for failure in kept.values()] == [1, 1]
+
+    named = NamedSpec("analytic", analytic.small_spec(), None)
+    submit(named, store.root, None, Request(modifications=1, views_per_modification=2, passes=2))
+    assert start(scene, "0/1", until_complete=True).wait(60) == 0
+    assert scene.missing_jobs() == []
+
+
+def test_a_job_that_ends_its_process_has_failed_and_the_others_go_on(
+    analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
+) -> None:
+    scene = planned(2)
+    running = start(scene, "0/2", 0.5, until_complete=True)
+    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # its first rows
+    os.kill(analytic.child_of(running), signal.SIGKILL)
+    assert running.wait(60) == 7
+    assert scene.missing_jobs() == [0]
+    store = Store(scene.folder.parent.parent)
+    (failure,) = kept_failures(store, lambda _: True).values()
+    assert "SIGKILL" in failure.reason
+    assert jobs_left_alone(store, time.time()) == {job_name(scene.scene_id, 0)}
+
+
+@pytest.mark.slow
+def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., SceneStore], start: Starter) -> None:
+    scene = planned(2)
+    assert start(scene, "0/2", 60, until_complete=True, deadline_s=3.0).wait(60) == 7
+    kept = kept_failures(Store(scene.folder.parent.parent), lambda _: True).values()
+    assert [failure.times for failure in kept] == [1, 1]
+    assert all("took longer than --deadline 3 s" in failure.reason for failure in kept)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--share", "2/2"],
+        ["--share", "0/2", "--job", "1", "--scene", "room"],
+        ["--share", "0/2", "--check"],
+        ["--share", "0/2", "--ahead", "4"],
+        ["--share", "0/2", "--scene", "room", "room"],
+        ["room"],
+    ],
+)
+def test_what_does_not_go_with_a_share_is_wrong_usage(arguments: list[str]) -> None:
+    assert CliRunner().invoke(umbrella, ["work", *arguments]).exit_code == 2
+
+
+def test_a_worker_has_a_redis_or_a_share(store: Store) -> None:
+    with pytest.raises(QueueError):
+        run_worker(store.root)

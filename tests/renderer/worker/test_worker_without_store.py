@@ -1,0 +1,132 @@
+"""Workers whose store is another one, goes away or is not there yet."""
+
+import re
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from photonfarm.renderer.worker.worker import check, run_worker
+from photonfarm.shared import queue
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.queue import connect, job_name, queue_status
+from photonfarm.shared.store import SceneStore, Store
+
+
+@pytest.fixture
+def scene(analytic: ModuleType, tmp_path: Path) -> SceneStore:
+    """Two jobs of three samples."""
+    store = Store(tmp_path / "store", create=True)
+    return store.scene(store.plan(analytic.small_spec(), Request(modifications=6), shard_rows=3).scene_id)
+
+
+QUICK = {"until_complete": True, "idle_s": 1, "heartbeat_ttl_s": 2.0, "reserve_bytes": 0}
+
+
+def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    connection, store = connect(redis_server.url), Store(tmp_path / "store")
+    queue.reconcile(store, connection)
+    Store(tmp_path / "typo", create=True)
+    with pytest.raises(queue.OtherStoreError):
+        run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
+    assert queue_status(connection).queued == 2
+    assert queue_status(connection).workers == 0
+
+
+@pytest.mark.parametrize("in_its_place", ["nothing", "an empty folder", "another store"])
+def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jobs(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, in_its_place: str
+) -> None:
+    root, connection = tmp_path / "store", connect(redis_server.url)
+    queue.reconcile(Store(root), connection)
+    code = f"""
+import runpy, sys
+from pathlib import Path
+from photonfarm.renderer.jobs import render as jobs
+from photonfarm.shared.store import Store
+plain = jobs.ShardRenderer.render
+def render(self, *job):
+    root = Path({str(root)!r})
+    root.rename(root.with_name("away"))
+    if {in_its_place!r} == "an empty folder":
+        root.mkdir()
+    if {in_its_place!r} == "another store":
+        Store(root, create=True)
+    return plain(self, *job)
+jobs.ShardRenderer.render = render
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+    with pytest.raises(StoreError):
+        run_worker(root, redis_server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
+    assert queue_status(connection).failed == {}
+    assert [name.decode() for name in connection.lrange(queue.open_queue(connection).key, 0, -1)] == [
+        job_name(scene.scene_id, job) for job in range(2)
+    ]
+
+
+def test_a_store_that_is_not_there_is_not_made(
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    with pytest.raises(StoreError, match="photonfarm submit"):
+        run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
+    assert not (tmp_path / "typo").exists()
+
+
+def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    log, connection = tmp_path / "log", connect(redis_server.url)
+    with analytic.start_worker(tmp_path / "later", redis_server.url, analytic.command(), log, name="ada") as running:
+        analytic.wait_for(lambda: queue.hosts(connection), 60)
+        time.sleep(3)  # longer than its heartbeat lasts
+        check(redis_server.url)
+        assert not (tmp_path / "later").exists()
+        store = Store(tmp_path / "later", create=True)
+        scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=3), shard_rows=3).scene_id)
+        analytic.wait_for(lambda: scene.missing_jobs() == [], 60)
+        hosts = queue.hosts(connection)
+        running.terminate()
+        assert running.wait(20) == 0
+    assert hosts == {process_space()}
+    assert log.read_text().count(f"worker ada: waiting for a store at {tmp_path / 'later'}") == 1
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", log.read_text()), "a supervisor tells the time as well"
+
+
+def test_a_worker_ends_when_told_while_its_child_is_talking(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    """Three times, as a signal is only lost if it comes between two things that the child says."""
+    code = """
+import os, sys, time
+sys.stdin.readline()
+until = time.monotonic() + 1
+while time.monotonic() < until:
+    os.write(1, b"x" * 100)
+time.sleep(60)
+"""
+    child, log = (sys.executable, "-c", code), tmp_path / "log"
+    for _ in range(3):
+        with analytic.start_worker(tmp_path / "store", redis_server.url, child, log) as running:
+            analytic.wait_for(lambda: analytic.child_of(running) is not None, 60)
+            time.sleep(0.5)
+            running.terminate()
+            assert running.wait(20) == 0
+
+
+def test_a_worker_that_waits_for_a_store_ends_when_told(
+    analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    with analytic.start_worker(tmp_path / "never", redis_server.url, analytic.command(), log) as running:
+        analytic.wait_for(lambda: "waiting for a store" in log.read_text(), 60)
+        running.terminate()
+        assert running.wait(20) == 0
+    assert queue_status(connect(redis_server.url)).workers == 0

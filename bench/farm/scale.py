@@ -82,10 +82,11 @@ def kept(options: argparse.Namespace) -> tuple[Found, dict[str, str]]:
     commits: dict[str, str] = {}
     for file in options.kept:
         earlier, commit = read(file)
+        known = json.loads(file.read_text(encoding="utf-8")).get("kept_from_commits", {})
         for step, sizes in earlier.items():
             if part_of(step) not in now and step not in found:
                 found[step] = {size: dict(values) for size, values in sizes.items()}
-                commits[step] = commit
+                commits[step] = known.get(step, commit)
     return found, commits
 
 

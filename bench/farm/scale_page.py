@@ -175,9 +175,9 @@ Nothing of it changes the store's format, or what a commit guarantees; each has 
 - **Looks at a bucket.** Each look listed every marker, a request per thousand. Now it asks for the few that are missing
   among the first ones, and lists what lies behind (`followed_markers`); all are listed again every ten minutes, or when
   something cannot be read. (`test_followed_markers.py`)
-- **Looks in a folder** still list everything, and so does the arithmetic on all rows after news. Trainer and `--ahead`
-  now wait twenty times as long as a look took, so that looks take a twentieth of the time at most; they take more than
-  that from some 10^6 samples on. (`test_dataset.py`, `test_trainer_pace.py`)
+- **Looks in a folder** still list everything, and so does the arithmetic on all rows after news. Trainers, and workers
+  with `--ahead` or `--share`, now wait twenty times as long as a look took, a minute at most: from some 10^6 samples on
+  that is longer than before, and looks take a twentieth of the time. (`test_dataset.py`, `test_trainer_pace.py`)
 
 ## Not mended, and not measured
 

@@ -81,13 +81,16 @@ def test_the_page_sets_what_was_before_beside_what_is_now(tmp_path: Path) -> Non
 
 def test_what_is_not_measured_again_is_kept_from_the_first_file_that_has_it(tmp_path: Path) -> None:
     def file(commit: str, *steps: str) -> Path:
-        document = {"measured": {step: {"4": {"from": commit}} for step in steps}, "commit": commit}
+        measured = {step: {"4": {"from": commit}} for step in steps}
+        document = {"measured": measured, "commit": commit, "kept_from_commits": {"plan": "ghi"}}
         (tmp_path / commit).write_text(json.dumps(document))
         return tmp_path / commit
 
     files = [file("abc", "workers", "bucket news"), file("def", "bucket news", "plan", "plans")]
     options = argparse.Namespace(kept=files, samples=[], bucket=[], plans=[4, 16], workers=[])
     found, commits = scale.kept(options)
-    assert commits == {"workers": "abc", "bucket news": "abc", "plan": "def"}
-    assert found == {step: {4.0: {"from": commit}} for step, commit in commits.items()}
-    assert "Measured earlier: workers, bucket news at abc; plan at def." in page([], {}, "", commits)
+    assert commits == {"workers": "abc", "bucket news": "abc", "plan": "ghi"}
+    assert found == {
+        "workers": {4.0: {"from": "abc"}}, "bucket news": {4.0: {"from": "abc"}}, "plan": {4.0: {"from": "def"}}
+    }  # fmt: skip
+    assert "Measured earlier: workers, bucket news at abc; plan at ghi." in page([], {}, "", commits)

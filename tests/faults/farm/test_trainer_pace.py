@@ -130,7 +130,8 @@ def test_a_worker_leaves_a_scene_that_is_ahead_says_so_and_renders_the_others(
     code = """
 import runpy, sys
 from photonfarm.renderer.worker import backpressure
-backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0  # a look before each job, however fast they are
+backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0
+backpressure.pause_after_look = lambda took_s, usual_s: usual_s  # a look before each job, however fast they are
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

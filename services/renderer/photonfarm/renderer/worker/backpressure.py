@@ -16,6 +16,7 @@ from redis import Redis
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import store_errors
+from photonfarm.shared.core.waiting import pause_after_look
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.io.local import LocalStorage
 from photonfarm.shared.store.write.scene_store import Progress
@@ -25,9 +26,6 @@ AHEAD_MINIMUM = 256
 
 AHEAD_LOOK_S = 5.0
 """The seconds between two counts of committed samples, since each count looks at the markers."""
-
-LOOK_SHARE = 0.05
-"""The most of a worker's time that it may spend on these counts: in a large store they come less often."""
 
 FULL_S = 30.0
 """The seconds for which no job is taken after a disk refused a commit, even if it seems to have free space."""
@@ -101,7 +99,7 @@ class TrainerPace:
         if self._clock() >= self._due:
             began = self._clock()
             self._ahead = self._look()
-            self._due = self._clock() + max(AHEAD_LOOK_S, (self._clock() - began) / LOOK_SHARE)
+            self._due = self._clock() + pause_after_look(self._clock() - began, AHEAD_LOOK_S)
         return self._ahead
 
     def _progress(self) -> dict[str, Progress]:

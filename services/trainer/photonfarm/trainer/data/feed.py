@@ -12,6 +12,7 @@ from typing import Any, Self
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.core.waiting import pause_after_look
 from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
 from photonfarm.trainer.data.resident import ResidentSamples
@@ -19,9 +20,6 @@ from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
-
-LOOK_SHARE = 0.05
-"""The most of the time that looks at the store may take: at millions of samples they come less often."""
 
 
 class Feed:
@@ -141,7 +139,7 @@ class Feed:
             if self._clock() >= due:
                 began = self._clock()
                 self._poll()
-                due = self._clock() + max(self._settings.poll_seconds, (self._clock() - began) / LOOK_SHARE)
+                due = self._clock() + pause_after_look(self._clock() - began, self._settings.poll_seconds)
             try:
                 rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
             except queue.Empty:

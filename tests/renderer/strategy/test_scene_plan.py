@@ -348,7 +348,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("box.toml", "--seconds", "4", "--json")
+    code, out, err = run("box.toml", "--seconds", "12", "--json")
     assert code == 0
     assert f"measuring {len(GRID)} settings" in err
     first = json.loads(out)
@@ -357,7 +357,7 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     }
     assert (tmp_path / "box.toml").read_text() == SPEC
 
-    code, out, err = run("box.toml", "--seconds", "4", "--json", "--write")
+    code, out, err = run("box.toml", "--seconds", "12", "--json", "--write")
     assert (code, json.loads(out)["cached"]) == (0, True)
     assert json.loads(out)["settings"] == first["settings"]
     for table in ("transport", "photons"):
@@ -371,7 +371,7 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     assert code == 0
     assert "kept from an earlier pilot" in out
 
-    code, out, _ = run("box.toml", "--seconds", "1", "--json", "--again")
+    code, out, _ = run("box.toml", "--seconds", "4", "--json", "--again")
     assert (code, json.loads(out)["cached"]) == (0, False)
     assert json.loads(out)["for"] == "training"
     assert min(json.loads(out)["measurement"][part] for part in ("configuration_s", "view_s")) > 0
@@ -420,7 +420,7 @@ def test_settings_that_the_content_makes_pointless_are_measured_where_the_spec_h
     run: Run, tmp_path: Path
 ) -> None:
     (tmp_path / "box.toml").write_text(SPEC.replace("max_depth = 3", "max_depth = 2"))
-    code, out, _ = run("box.toml", "--seconds", "1", "--json")
+    code, out, _ = run("box.toml", "--seconds", "4", "--json")
     assert code == 0
     found = json.loads(out)["measurement"]
     assert "max_depth is 2" in found["left_out"][0]

@@ -21,6 +21,7 @@ FOLDER = ROOT / "docs/results"
 
 def parser(about: str | None) -> argparse.ArgumentParser:
     """A parser with the option that every benchmark has; `about` is the docstring of its module."""
+    os.environ.setdefault("PHOTONFARM_DEVICE", "cpu")  # figures of pages are processor seconds
     made = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--out", type=Path, default=FOLDER, help="folder for the Markdown and JSON (docs/results)")
     return made

@@ -72,9 +72,9 @@ def test_the_worst_views_are_captioned_by_what_they_are_the_worst_of(
     ((heads, rows, captions),) = laid
     assert heads == [REFERENCE, BEFORE, "its error", AFTER, "its error"]
     assert captions == [
-        "Worst view of mirrors and clear glass and all pixels",
-        "Worst view of specular surfaces",
-        "Worst view of near surfaces",
+        "worst view of mirrors and clear glass and all pixels",
+        "worst view of specular surfaces",
+        "worst view of near surfaces",
     ]
     assert [linear(row[0]).mean() for row in rows] == pytest.approx([0.064, 0.305, 0.022], abs=0.005)
 

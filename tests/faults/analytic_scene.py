@@ -42,6 +42,7 @@ def small_spec(**changes: Any) -> SceneSpec:
 class AnalyticScene:
     """Radiance, buffers and photons that depend on the configuration, the view and the seed, and on nothing else."""
 
+    samples_at_once: ClassVar[int] = 1
     pause_s: ClassVar[float] = 0.0
     broken: ClassVar[bool] = False
 
@@ -62,6 +63,9 @@ class AnalyticScene:
 
     def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
         return np.stack([self.render_half(view, seed) for seed in seeds])
+
+    def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
+        return np.stack([self.render_half(view, seed) for view, seed in zip(views, seeds, strict=True)])
 
     def render_half(self, view: View, seed: int) -> F32:
         time.sleep(self.pause_s)

@@ -13,12 +13,14 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.renderer.worker.share_worker import ShareWorker
 from photonfarm.renderer.worker.worker import run_worker
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import job_name, jobs_left_alone, kept_failures
+from photonfarm.shared.queue import Share, job_name, jobs_left_alone, kept_failures
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -166,6 +168,32 @@ def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., Scen
     kept = kept_failures(Store(scene.folder.parent.parent), lambda _: True).values()
     assert [failure.times for failure in kept] == [1, 1]
     assert all("took longer than --deadline 3 s" in failure.reason for failure in kept)
+
+
+def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
+    planned: Callable[..., SceneStore], analytic: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = planned(4)
+    store = Store(scene.folder.parent.parent)
+    settings = WorkerSettings(
+        store=str(store.root), name="one", share=Share.parse("0/1"), until_complete=True, reserve_bytes=0
+    )
+    worker = ShareWorker(settings, store, Share.parse("0/1"), analytic.AnalyticScene.load)
+    looks, plain = [], SceneStore.missing_jobs
+
+    def missing(scene: SceneStore, *, followed: bool = False) -> list[int]:
+        looks.append(followed)
+        return plain(scene, followed=followed)
+
+    monkeypatch.setattr(SceneStore, "missing_jobs", missing)
+    jobs = scene.jobs()
+    for _ in range(jobs):
+        assert worker._step() is None
+    assert looks == [True]
+    assert plain(scene) == []
+    looks.clear()
+    assert worker._step() == 0
+    assert looks == [True, False] * 2, "followed ones, and since they found nothing, whole ones"
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, queue_status, report_consumed
 from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.write.scene_store import Progress
 
 
 class Clock:
@@ -93,6 +94,26 @@ def test_each_scene_is_held_against_its_own_trainer(
     assert TrainerPace(store, connection, 1.0, scene_id=ahead.scene_id).ahead().keys() == {ahead.scene_id}
 
 
+def test_where_a_look_takes_long_looks_are_rare(
+    store: Store, add: Callable[..., SceneStore], connection: redis.Redis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look takes 3 s here; a worker that is asked each second for ten minutes spends a twentieth of them on looks."""
+    add("one", 8, 0)
+    clock, plain, looks = Clock(), SceneStore.progress, []
+
+    def slow(scene: SceneStore, **how: bool) -> Progress:
+        looks.append(clock.now)
+        clock.now += 3.0
+        return plain(scene, **how)
+
+    monkeypatch.setattr(SceneStore, "progress", slow)
+    pace = TrainerPace(store, connection, 1.0, clock=clock)
+    while clock.now < 1600.0:
+        pace.ahead()
+        clock.now += 1.0
+    assert len(looks) == 10
+
+
 def test_a_ratio_below_one_is_refused_as_it_would_stop_for_good() -> None:
     told = {"store": "s", "redis_url": "redis://h/0", "name": "ada"}
     assert WorkerSettings.model_validate({**told, "ahead": 1}).ahead == 1
@@ -109,7 +130,8 @@ def test_a_worker_leaves_a_scene_that_is_ahead_says_so_and_renders_the_others(
     code = """
 import runpy, sys
 from photonfarm.renderer.worker import backpressure
-backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0  # a look before each job, however fast they are
+backpressure.AHEAD_MINIMUM, backpressure.AHEAD_LOOK_S = 2, 0
+backpressure.pause_after_look = lambda took_s, usual_s: usual_s  # a look before each job, however fast they are
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

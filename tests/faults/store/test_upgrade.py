@@ -1,7 +1,6 @@
 """A store is upgraded while workers die: its samples stay as they are, and each job's guides are committed once."""
 
 import contextlib
-import itertools
 import os
 import shutil
 import signal
@@ -245,11 +244,14 @@ def test_samples_that_lack_guides_hold_no_worker_back_from_rendering_these(
     """A trainer that needs guides has used none, and would wait for ever for a worker that waits for it."""
     monkeypatch.setattr(backpressure, "AHEAD_MINIMUM", 2)
     old.plan(Request(modifications=JOBS, views_per_modification=2, passes=2))
-    pace = TrainerPace(Store(root(old)), connect(redis_server.url), 1.0, clock=itertools.count(step=100).__next__)
+    now_s = [0.0]
+    pace = TrainerPace(Store(root(old)), connect(redis_server.url), 1.0, clock=lambda: now_s[0])
     assert old.scene_id in pace.ahead()
     upgrade(root(old), None)
+    now_s[0] += 100
     assert pace.ahead() == {}
     renderer = renderer_of(old, analytic)
     for job in range(2):
         renderer.render(old.scene_id, job)
+    now_s[0] += 100
     assert pace.ahead()[old.scene_id].startswith("4 samples are committed")

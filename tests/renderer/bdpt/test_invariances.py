@@ -41,11 +41,12 @@ def test_all_counts_are_tried() -> None:
 # ------------------------------------------------ Several launches ------------------------------------------------
 
 
-def test_images_in_one_launch_or_in_several_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_in_one_launch_or_in_several_are_the_same() -> None:
     scene = mi.load_dict(HARD_SCENES["plastics"](16), optimize=False)
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4, "light_ratio": 0.3})
+    settings = {"type": "bdpt", "max_depth": 4, "light_ratio": 0.3}
+    bdpt = mi.load_dict(settings)
     each = np.concatenate([np.array(bdpt.render_seeds(scene, scene.sensors()[0], [seed], 4)) for seed in range(5)])
-    monkeypatch.setattr(launches, "LAUNCH_PATHS", 2 * 16 * 16 * 4)  # two images at a time, and one left over
+    bdpt = mi.load_dict({**settings, "paths_at_once": 2 * 16 * 16 * 4})  # two images at a time, and one left over
     together = np.array(bdpt.render_seeds(scene, scene.sensors()[0], range(5), 4))
     np.testing.assert_array_equal(together, each)
 

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.renderer.jobs import estimates
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError
 from photonfarm.shared.core.keys import seed_of
 from photonfarm.shared.core.records import Visibility
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.store.format import markers
@@ -152,10 +155,48 @@ def test_every_half_has_its_own_seed_which_follows_from_the_samples_key(
         assert not np.array_equal(a, b)
 
 
+def test_samples_rendered_together_are_stored_as_if_each_had_been_rendered_alone(
+    store: Store, small: Any, tmp_path: Path
+) -> None:
+    """The built-in room: two configurations, of which each has two views and two passes of these."""
+    spec = small(load_spec("room"))
+    request, seen = Request(modifications=2, views_per_modification=2, passes=2), []
+    for together, where in ((1, store), (3, Store(tmp_path / "together", create=True))):
+        scene = where.scene(where.plan(spec, request, shard_rows=8).scene_id)
+
+        def load(spec: Any, together: int = together) -> LoadedScene:
+            loaded = LoadedScene.load(spec)
+            loaded.samples_at_once = together
+            return loaded
+
+        assert ShardRenderer(where, worker="test", load=load).render(scene.scene_id, 0)
+        reader = SceneReader(where.root, scene.scene_id)
+        seen.append([reader.read(row) for row in reader.refresh().tolist()])
+    assert len(seen[0]) == len(seen[1]) == 8
+    for alone, with_others in zip(*seen, strict=True):
+        np.testing.assert_array_equal(alone.radiance, with_others.radiance)
+        np.testing.assert_array_equal(alone.buffers.depth, with_others.buffers.depth)
+
+
+def test_of_samples_rendered_together_only_what_is_not_finite_is_drawn_again(
+    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded, "samples_at_once", 3, raising=False)
+    monkeypatch.setattr(recorded, "bad", 2)
+    render_all(scene, store, recorded)
+    seeds = asked(recorded, "half")
+    assert len(seeds) == len(set(seeds)) == 24 + 2
+    assert [scene.marker(job)["figures"]["redrawn"] for job in (0, 1)] == [2, 0]
+    samples = [s for job in range(2) for s in scene.job_rows(job).samples]
+    first = [seed_of(s.key, half) for s in samples for half in ("half A", "half B")]
+    again = [seed_of(samples[0].key, f"{half}, attempt 1") for half in ("half A", "half B")]
+    assert seeds == [*first[:6], *again, *first[6:]]
+
+
 def test_a_half_never_takes_the_seed_of_the_other() -> None:
     taken = seed_of(b"k" * 16, "half B")
-    tried = list(islice(jobs._seeds(b"k" * 16, "half B", (taken,)), jobs.ATTEMPTS))
-    assert len(tried) == len(set(tried)) == jobs.ATTEMPTS
+    tried = list(islice(estimates._seeds(b"k" * 16, "half B", (taken,)), estimates.ATTEMPTS))
+    assert len(tried) == len(set(tried)) == estimates.ATTEMPTS
     assert taken not in tried
 
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import Steps, WorkLog
+from photonfarm.shared.core.waiting import Steps, WorkLog, pause_after_look
 
 
 def test_what_is_done_is_said_again_with_how_far_it_is() -> None:
@@ -87,3 +87,10 @@ def test_afterwards_ctrl_c_is_what_it_was() -> None:
     with ended_by_ctrl_c():
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_slow_looks_take_a_twentieth_of_the_time_and_pauses_end() -> None:
+    assert pause_after_look(0.01, 1.0) == 1.0
+    assert pause_after_look(0.5, 1.0) == 10.0
+    assert pause_after_look(300.0, 1.0) == 60.0
+    assert pause_after_look(300.0, 90.0) == 90.0

@@ -153,9 +153,9 @@ def test_one_that_takes_long_keeps_others_out_until_it_is_done(
 ) -> None:
     began, done = threading.Event(), threading.Event()
 
-    def fill(*_: object) -> int:
+    def fill(*_: object) -> reconciliation.Filled:
         began.set()
-        return int(done.wait(20))
+        return reconciliation.Filled(int(done.wait(20)), 0)
 
     monkeypatch.setattr(reconciliation, "LOCK_TTL_S", 1)
     with monkeypatch.context() as slow, ThreadPoolExecutor(1) as other:

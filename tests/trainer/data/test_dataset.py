@@ -127,7 +127,7 @@ def test_an_error_of_the_source_reaches_the_one_who_takes(make_source, tiny) -> 
 def test_rows_are_told_as_they_arrive_and_when_all_have(make_source, tiny) -> None:
     with Feed(make_source(10, per_look=4), tiny()) as feed:
         rows, complete = feed.arrivals()
-        assert [row for row, _ in rows] == [0, 1, 2, 3][: len(rows)]
+        assert [row for row, _ in rows] == list(range(len(rows)))
         while not complete:
             more, complete = feed.arrivals()
             rows += more
@@ -184,6 +184,24 @@ def test_a_row_taken_back_between_two_looks_at_the_store_is_left_out_as_well(rep
         repair(7)
         feed.ask([14, 0, 15])
         assert feed.take().rows == (0,)
+
+
+def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = repaired
+    source, looks = StoreSource(scene.storage.root, scene.scene_id), []
+    plain = source.refresh
+
+    def slow() -> Any:
+        looks.append(time.monotonic())
+        time.sleep(0.2)
+        return plain()
+
+    monkeypatch.setattr(source, "refresh", slow)
+    with Feed(source, tiny(poll_seconds=0.01)) as feed:
+        time.sleep(1.5)
+        feed.ask([0])
+        assert feed.take().rows == (0,), "batches do not wait for the next look"
+    assert len(looks) == 1, "the next one is due 4 s after the first"
 
 
 def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothing(

@@ -69,6 +69,18 @@ def test_every_architecture_of_the_settings_is_registered() -> None:
 
 
 @pytest.mark.parametrize("architecture", EVERY)
+def test_channels_stay_last_in_memory_through_every_convolution(make_source, architecture: str) -> None:
+    source, seen = make_source(2, photons=64), []
+    made = network(source, architecture)
+    for layer in made.modules():
+        if isinstance(layer, torch.nn.Conv2d):
+            layer.register_forward_hook(lambda _, given, out: seen.extend([*given, out]))
+    image(made, batch_of(source, (0, 1), architecture).inputs)
+    assert len(seen) == 2 * 22
+    assert all(tensor.is_contiguous(memory_format=torch.channels_last) for tensor in seen)
+
+
+@pytest.mark.parametrize("architecture", EVERY)
 def test_a_batch_gives_what_its_samples_give_one_by_one(make_source, architecture: str) -> None:
     source = make_source(3, photons=64)
     made = network(source, architecture)

@@ -7,7 +7,7 @@ from held_out_errors import held_out_errors
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.device import described, round_convolutions, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train
@@ -32,6 +32,25 @@ def test_a_cpu_without_bfloat16_is_said_to_be_slow_at_it(has: bool, monkeypatch:
     said = described(torch.device("cpu"), "bfloat16")
     assert ("precision = float32" in said) is not has
     assert described(torch.device("cpu"), "float32") == "cpu"
+
+
+def test_a_cpu_is_said_to_have_no_tf32_and_its_setting_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "in float32 instead" in described(torch.device("cpu"), "tf32")
+    for before in (True, False):
+        monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", before)
+        round_convolutions(torch.device("cpu"), "tf32")
+        assert torch.backends.cudnn.allow_tf32 is before
+        for precision in ("tf32", "float32", "bfloat16"):
+            round_convolutions(torch.device("cuda"), precision)
+            assert torch.backends.cudnn.allow_tf32 is (precision == "tf32")
+
+
+@pytest.mark.skipif(not HAS_CUDA, reason="there is no CUDA device, and only such have TF32")
+def test_on_cuda_tf32_is_that_of_the_network_that_makes_the_image_and_of_its_gradient(make_source, tiny, run) -> None:
+    for precision in ("tf32", "float32", "bfloat16"):
+        network = NetworkSettings(width=4, precision=precision)
+        train(make_source(24), tiny(network=network, device="cuda"), run / precision)
+        assert torch.backends.cudnn.allow_tf32 is (precision == "tf32")
 
 
 @pytest.mark.skipif(HAS_CUDA, reason="there is a CUDA device")

@@ -1,5 +1,6 @@
 """Two processes on a CPU that share each batch, over gloo, against one that has all of it."""
 
+import copy
 import json
 import multiprocessing
 import os
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.nn.parallel import DistributedDataParallel
 
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.plan.request import Request
@@ -246,6 +248,39 @@ def test_the_gradient_is_that_of_the_joint_batch_however_it_is_parted(tmp_path, 
         assert value == pytest.approx(expected.item(), rel=1e-6)
         torch.testing.assert_close(layer.weight.grad, joint.weight.grad)
         torch.testing.assert_close(layer.bias.grad, joint.bias.grad)
+
+    assert in_both(target) == [0, 0]
+
+
+def test_the_gradient_is_torchs_own_to_the_bit_for_equal_parts_and_the_right_one_for_others() -> None:
+    """DistributedDataParallel takes the mean over processes, which for unequal parts is not that over samples.
+
+    For parts of a power of two, ours times and over the number of samples changes no bit. The truth is in float64.
+    """
+
+    def target(group: Ranks) -> None:
+        for lengths, same in (((2, 2), True), ((3, 3), False), ((3, 1), False)):
+            compare(group, lengths, same=same)
+
+    def compare(group: Ranks, lengths: tuple[int, int], *, same: bool) -> None:
+        torch.manual_seed(0)
+        x = torch.randn(sum(lengths), 5)
+        network = torch.nn.Sequential(torch.nn.Linear(5, 32), torch.nn.ReLU(), torch.nn.Linear(32, 3))
+        own, weights = torch.split(x, lengths)[group.rank], list(network.parameters())
+
+        def gradient(made: torch.nn.Module, inputs: torch.Tensor) -> torch.Tensor:
+            made.zero_grad()
+            loss = made(inputs).square().mean()
+            torch.autograd.backward(loss)
+            if made is network and len(inputs) < len(x):
+                group.average(weights, loss, len(inputs))
+            return torch.cat([weight.grad.double().flatten() for weight in made.parameters()])
+
+        ours, torchs = gradient(network, own), gradient(DistributedDataParallel(network), own)
+        truth = gradient(copy.deepcopy(network).double(), x.double())
+        assert torch.equal(ours, torchs) is same
+        assert (ours - truth).norm() < 1e-6 * truth.norm()
+        assert ((torchs - truth).norm() > 1e-2 * truth.norm()) == (lengths[0] != lengths[1])
 
     assert in_both(target) == [0, 0]
 

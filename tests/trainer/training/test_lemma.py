@@ -18,7 +18,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.renderer.jobs.render import lit_points, photons_of, visibility_of
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.keys import view_key

@@ -10,10 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pydantic import ValidationError
 from redis import Redis, RedisError
 
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
 from photonfarm.shared.core.processes import Stop, repeating
+from photonfarm.shared.scene.spec import Film
 from photonfarm.shared.scene.spec_loading import load_spec, scene_folder
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
@@ -28,6 +30,7 @@ from photonfarm.trainer.runs.user_code import named_in_errors
 if TYPE_CHECKING:
     from photonfarm.shared.core.records import F32
     from photonfarm.shared.scene.spec import SceneSpec
+    from photonfarm.trainer.dry_run.dry_run import DryRun
     from photonfarm.trainer.runs.distributed import TrainingGroup
 
 T = TypeVar("T")
@@ -191,13 +194,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     from photonfarm.trainer.networks.summary import summary, table
 
     network = settings_of(preset_name, changes).network
-    if spec:
-        scene = load_spec(spec)
-    else:
-        scene_id = _only_scene(store)
-        if scene_id is None:
-            raise SpecError(f"{store}: holds no scene; name the spec of the one to summarise a network for")
-        scene = Store(store).scene(scene_id).spec
+    scene = _spec_of(spec, store)
     points = min(network.points or scene.points, scene.points)
     head = (
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
@@ -205,6 +202,44 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     )
     with named_in_errors(architecture=network.architecture):
         return f"{head}\n{table(summary(scene, network))}"
+
+
+def rehearse(
+    spec: str | None, store: str | Path, preset_name: str, changes: dict[str, Any], film: int | None
+) -> DryRun:
+    """What a training would take; nothing is written, and of a store only a spec is read.
+
+    `film` is the side of images in pixels, if it shall be another than the spec's. Raises SpecError without a spec,
+    unless the store has one scene, and in one of several processes.
+    """
+    from photonfarm.shared.core.models import sentences
+    from photonfarm.trainer.dry_run.dry_run import rehearse
+    from photonfarm.trainer.runs.distributed import processes
+
+    if (size := processes()) > 1:
+        raise SpecError(
+            f"torchrun has started {size} processes, and a dry run is one's work; start it without torchrun"
+        )
+    settings = settings_of(preset_name, changes)
+    scene = _spec_of(spec, store)
+    if film is not None:
+        try:
+            square = Film(width=film, height=film)
+        except ValidationError as error:
+            raise SpecError(f"the film of the dry run: {'; '.join(sentences(error))}") from error
+        scene = scene.model_copy(update={"film": square})
+    with named_in_errors(architecture=settings.network.architecture, loss=settings.loss):
+        return rehearse(scene, settings)
+
+
+def _spec_of(spec: str | None, store: str | Path) -> SceneSpec:
+    """The spec of a name, or of a store's only scene; SpecError without one."""
+    if spec:
+        return load_spec(spec)
+    scene_id = _only_scene(store)
+    if scene_id is None:
+        raise SpecError(f"{store}: holds no scene; name the spec of the one to build a network for")
+    return Store(store).scene(scene_id).spec
 
 
 def search(

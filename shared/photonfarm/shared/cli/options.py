@@ -122,25 +122,30 @@ def _refuse_password(url: str) -> None:
         )
 
 
-def device_option(command: Command) -> Command:
+def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """`--device`, what renders; the verb and its child processes find it in the environment."""
     from photonfarm.shared.farm.devices import AUTO, DEVICE_VARIABLE
 
+    @wraps(command)
+    def on_device(*arguments: Any, device: str, **options: Any) -> Any:
+        if click.get_current_context().get_parameter_source("device") is not ParameterSource.DEFAULT:
+            os.environ[DEVICE_VARIABLE] = device
+        return command(*arguments, **options)
+
     return click.option(
-        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True, expose_value=False,
-        metavar="auto|cpu|cuda[:N]", callback=_hand_on_device,
+        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True,
+        metavar="auto|cpu|cuda[:N]", callback=_device,
         help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
         "where there is one that can.",
-    )(command)  # fmt: skip
+    )(on_device)  # fmt: skip
 
 
-def _hand_on_device(ctx: click.Context, param: click.Parameter, name: str) -> None:
-    from photonfarm.shared.farm.devices import DEVICE_VARIABLE, NAMES
+def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
+    from photonfarm.shared.farm.devices import NAMES
 
     if not NAMES.fullmatch(name):
         raise click.BadParameter(f"{name!r} is none of auto, cpu, cuda and cuda:N.")
-    if ctx.get_parameter_source(param.name or "") is not ParameterSource.DEFAULT:
-        os.environ[DEVICE_VARIABLE] = name
+    return name
 
 
 def json_option(command: Command) -> Command:

@@ -119,3 +119,20 @@ def in_words(seconds: float) -> str:
     if seconds < 5940:
         return f"{seconds / 60:.0f} min"
     return f"{seconds / 3600:.1f} h" if seconds < 172800 else f"{seconds / 86400:.1f} days"
+
+
+# ---------------------------------------------------------------------------------------------------------------- looks
+
+LOOK_SHARE = 0.05
+"""The most of the time that somebody who waits for news spends on looking for them."""
+
+LOOK_PAUSE_MOST_S = 60.0
+"""The longest pause that a slow look asks for: a single one may have been slow by accident."""
+
+
+def pause_after_look(took_s: float, usual_s: float) -> float:
+    """The seconds until the next look at something, whose last look took some: the usual ones, or more if it is slow.
+
+    Looks at a store take longer the more it holds, and so come less often.
+    """
+    return max(usual_s, min(took_s / LOOK_SHARE, LOOK_PAUSE_MOST_S))

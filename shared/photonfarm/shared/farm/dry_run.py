@@ -109,7 +109,7 @@ def _guides_of_older_views(scene: SceneStore, loaded: SceneSpec) -> tuple[int, i
     if scene.guides.settings() is not None or not found:
         return 0, 0
     views = int(np.count_nonzero(used_views(found)))
-    jobs = sum(len(jobs_with_views(plan)) for plan in found)
+    jobs = len(jobs_with_views(found))
     return views, most_guide_bytes(loaded, views, jobs, found[0].shard_rows)
 
 

@@ -84,7 +84,7 @@ def _scene_upgrade(scene: SceneStore, wanted: GuideSpec, *, dry_run: bool) -> Sc
     asked = scene.guides.settings() is None if dry_run else scene.guides.ask(wanted)
     settings = scene.guides.settings() or wanted
     status, found = scene_status(scene), scene.plans()
-    jobs = sum(len(jobs_with_views(plan)) for plan in found)
+    jobs = len(jobs_with_views(found))
     most = most_guide_bytes(scene.spec, status.views_planned, jobs, found[0].shard_rows) if found else 0
     samples = status.size_bytes - status.guide_bytes
     return SceneUpgrade(

@@ -14,6 +14,7 @@ rq:photonfarm:paused:<worker name>  why a worker takes no jobs
 rq:photonfarm:left:<scene id>:<worker name>  why a worker skips a scene
 rq:photonfarm:doing:<worker name>   what a worker is doing, and how far it is
 rq:photonfarm:reconcile             lock of the process that fills the queue
+rq:photonfarm:looked:<scene id, or all>  what the last look at the store found, for seconds
 rq:photonfarm:store                 the id of the store that this Redis serves, while it is in use
 rq:photonfarm:consumed:<scene id>   samples of a scene that its trainer has used
 """
@@ -51,11 +52,12 @@ from photonfarm.shared.queue.status import QueueStatus, queue_status
 from photonfarm.shared.queue.worker_activity import Activity, clear_activity, report_activity
 
 if TYPE_CHECKING:
-    from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, reconcile
+    from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, look, reconcile
     from photonfarm.shared.queue.rq_adapter import QueueWorker, RenderJob, open_queue
 else:
     _WITH_RQ = {
         "QUEUE_LIMIT": "reconciliation",
+        "look": "reconciliation",
         "reconcile": "reconciliation",
         "QueueWorker": "rq_adapter",
         "RenderJob": "rq_adapter",
@@ -112,6 +114,7 @@ __all__ = [
     "keep_failure",
     "keep_submission",
     "kept_failures",
+    "look",
     "open_queue",
     "overdue",
     "put_back",

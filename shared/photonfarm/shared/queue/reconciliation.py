@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass
 from itertools import islice
+from typing import Literal
 
 import redis
 from redis import Redis
@@ -26,7 +28,14 @@ from photonfarm.shared.queue.rq_adapter import (
     open_queue,
 )
 from photonfarm.shared.queue.served_store import serve
-from photonfarm.shared.queue.untrusted import Kind, forget_dead_workers, names_below, remove_lasting, remove_others
+from photonfarm.shared.queue.untrusted import (
+    Kind,
+    beginnings,
+    forget_dead_workers,
+    names_below,
+    remove_lasting,
+    remove_others,
+)
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
@@ -35,7 +44,17 @@ QUEUE_LIMIT = 10_000
 LOCK_TTL_S = 10
 """How long the lock outlasts a process that died while it filled the queue; a live one renews it."""
 
+LOOKED_MOST_S = 60
+"""The longest that the result of a look may last; a key that lasts longer is a stranger's."""
+
 _LOCK = "rq:photonfarm:reconcile"
+LOOKED = "rq:photonfarm:looked:"
+
+Look = Literal["queued", "waits", "nothing"]
+"""What a look at the store found: jobs, which are queued now; jobs that others will end; or none to wait for.
+
+Others will end what is queued or being rendered; and whatever another process may find that looks right now.
+"""
 
 log = logging.getLogger(__name__)
 
@@ -51,6 +70,36 @@ _KINDS: dict[str, Kind] = {
     FAILURES: "counter",
 }
 """The types of the keys that are written for a job, by the prefix before its name."""
+
+
+def look(store: Store, connection: Redis, *, scene_id: str | None = None, every_s: float) -> Look:
+    """Fill the queue as `reconcile` does, at most once in `every_s` by all callers together.
+
+    So a thousand workers that wait for the last jobs cost the store and Redis no more than one of them. The others
+    learn what the last look found. After "nothing" a caller may look for itself whether it can end. Raises what
+    `reconcile` does.
+    """
+    key = f"{LOOKED}{scene_id or 'all'}"
+    try:
+        if (known := _found_lately(connection, key)) is not None:
+            return known
+        found = _filled(store, connection, scene_id=scene_id)
+        if found is None:
+            return "waits"
+        if found.queued:
+            return "queued"
+        outcome: Look = "waits" if found.under_way else "nothing"
+        connection.set(key, outcome, px=int(1000 * min(every_s, LOOKED_MOST_S)))
+    except redis.RedisError as error:
+        raise QueueError(f"Redis failed while it was asked what is missing: {error}") from error
+    return outcome
+
+
+def _found_lately(connection: Redis, key: str) -> Look | None:
+    """What another caller's look has found, so recently that it still counts."""
+    remove_lasting(connection, [key], LOOKED_MOST_S)
+    (known,) = beginnings(connection, [key], 16)
+    return "waits" if known == "waits" else "nothing" if known == "nothing" else None
 
 
 def reconcile(
@@ -73,16 +122,47 @@ def reconcile(
     cannot be read is skipped with a warning. Raises QueueError also if Redis fails or serves another store, StoreError
     if the store or the one scene cannot be read.
     """
+    found = _filled(
+        store,
+        connection,
+        scene_id=scene_id,
+        limit=limit,
+        wait_s=wait_s,
+        retry_failed=retry_failed,
+        retry_set_aside=retry_set_aside,
+    )
+    if found is None and wait_s > 0:
+        raise QueueError(
+            f"another process has been filling the queue for {wait_s:g} s, so this one has queued and retried "
+            "nothing; try again"
+        )
+    return found.queued if found else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Filled:
+    """What a reconciliation found."""
+
+    queued: int  # jobs that it has queued
+    under_way: int  # missing jobs that were queued or alive
+
+
+def _filled(
+    store: Store,
+    connection: Redis,
+    *,
+    scene_id: str | None,
+    limit: int = QUEUE_LIMIT,
+    wait_s: float = 0.0,
+    retry_failed: bool = False,
+    retry_set_aside: bool = False,
+) -> Filled | None:
+    """What `reconcile` has done; None if another process still fills the queue after `wait_s`. Raises as that does."""
     serve(connection, store)
     try:
         with _alone(connection, wait_s) as alone:
-            if not alone and wait_s > 0:
-                raise QueueError(
-                    f"another process has been filling the queue for {wait_s:g} s, so this one has queued and retried "
-                    "nothing; try again"
-                )
             if not alone:
-                return 0
+                return None
             if retry_failed or retry_set_aside:
                 forget_failures(connection, set_aside=retry_set_aside)
             return _reconcile(store, scene_id, connection, limit)
@@ -111,15 +191,17 @@ def _alone(connection: Redis, wait_s: float) -> Iterator[bool]:
             lock.release()
 
 
-def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) -> int:
+def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) -> Filled:
     queue = open_queue(connection)
     queued = list(dict.fromkeys(queued_names(queue)))
     remove_lasting(connection, [ALIVE + name for name in names_below(connection, ALIVE)], HEARTBEAT_MOST_S)
     alive = names_below(connection, ALIVE)
     _tidy(queue, alive)
-    busy = {*queued, *alive, *failed_names(connection)}
+    under_way = {*queued, *alive}
+    busy = under_way | failed_names(connection)
     held = _by_scene(queued)
-    lacking = _lacking_by_scene(store, only, busy, limit)
+    missing = _missing_by_scene(store, only)
+    lacking = {scene_id: _lacking(scene_id, jobs, busy, limit) for scene_id, jobs in missing.items()}
     has = {scene_id: len(held.get(scene_id, ())) for scene_id in {**held, **lacking}}
     shares = _shares({scene_id: count + len(lacking.get(scene_id, ())) for scene_id, count in has.items()}, limit)
     wanted = [
@@ -131,25 +213,25 @@ def _reconcile(store: Store, only: str | None, connection: Redis, limit: int) ->
         beyond = [name for scene_id, names in held.items() for name in names[shares[scene_id] :]]
         queue.withdraw(beyond[: max(len(queued) + len(wanted) - limit, 0)])  # they stay in the store
         _enqueue(queue, wanted)
-    return len(wanted)
+    names = (job_name(scene_id, job) for scene_id, jobs in missing.items() for job in jobs)
+    return Filled(len(wanted), 0 if wanted else sum(name in under_way for name in names))
 
 
-def _lacking_by_scene(store: Store, only: str | None, busy: Set[str], limit: int) -> dict[str, list[int]]:
-    """`_lacking` of every scene that can be read; or of one scene, whose error is raised."""
+def _missing_by_scene(store: Store, only: str | None) -> dict[str, list[int]]:
+    """The missing jobs of every scene that can be read; or of one scene, whose error is raised."""
     if only is not None:
-        return {only: _lacking(store.scene(only), busy, limit)}
-    lacking, failed = store.each(lambda scene: _lacking(scene, busy, limit))
+        return {only: store.scene(only).missing_jobs()}
+    missing, failed = store.each(SceneStore.missing_jobs)
     for scene_id, error in failed.items():
         if _logged.get(scene_id) != str(error):
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, error)
         _logged[scene_id] = str(error)
-    return lacking
+    return missing
 
 
-def _lacking(scene: SceneStore, busy: Set[str], limit: int) -> list[int]:
+def _lacking(scene_id: str, missing: Iterable[int], busy: Set[str], limit: int) -> list[int]:
     """The first missing jobs of a scene that are not in `busy`, at most `limit`."""
-    missing = (job for job in scene.missing_jobs() if job_name(scene.scene_id, job) not in busy)
-    return list(islice(missing, limit))
+    return list(islice((job for job in missing if job_name(scene_id, job) not in busy), limit))
 
 
 def _by_scene(names: Iterable[str]) -> dict[str, list[str]]:

@@ -12,8 +12,9 @@ from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat
-from photonfarm.renderer.bdpt.launches import Lanes, Launch, launches
+from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
+from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
 from photonfarm.renderer.bdpt.recording import Recorder
 from photonfarm.renderer.bdpt.scenes import UNBOUNDED, check_scene, depth_limit
 
@@ -31,6 +32,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
+    - ``paths_at_once`` (int, default 2²⁰): the most eye or light paths in a launch of several images. It changes no
+      value beyond the order of sums; a card wants more of them than a processor.
 
     Raises ValueError for a value outside these ranges, and when it renders for what it cannot render without bias.
     """
@@ -41,6 +44,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.rr_depth = int(props.get("rr_depth", 5))
         self.connections = int(props.get("connections", 1))
         self.light_ratio = float(props.get("light_ratio", 1.0))
+        self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
         self._check_parameters()
         self._recorder = Recorder(trace) if props.get("record", False) else None
 
@@ -58,6 +62,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
                 "connect to; use connections=0 or a light_ratio above 0"
             )
+        if self.paths_at_once < 1:
+            raise ValueError(f"bdpt: paths_at_once is {self.paths_at_once}; allowed are numbers of paths from 1")
         if self.hide_emitters:
             raise ValueError(
                 "bdpt: hide_emitters is set; only false is allowed, because light paths cannot know what is hidden"
@@ -108,7 +114,21 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp).tensor(width, height)
 
-    def _render(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> ImageStack:
+    def render_views(
+        self, scene: mi.Scene, sensor: mi.Sensor, places: Places, seeds: Sequence[int], spp: int
+    ) -> mi.TensorXf:
+        """Images of K views, [K, H, W, 3], one for each place and seed; as many as may be share a launch.
+
+        ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
+        has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
+        does.
+        """
+        width, height = sensor.film().crop_size()
+        return self._render(scene, sensor, seeds, spp, places).tensor(width, height)
+
+    def _render(
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None = None
+    ) -> ImageStack:
         sensor.sampler().seed(0, 1)  # else the state left by another integrator would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
@@ -119,11 +139,13 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
             images = ImageStack.black(len(seeds) * pixels)
-            for launch in launches(len(seeds), pixels, spp, light_ratio):
+            for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
                 options = self._options(launch, pixels)
-                own = seeds[launch.first_image : launch.first_image + launch.images]
+                images_of = slice(launch.first_image, launch.first_image + launch.images)
+                own = seeds[images_of]
                 shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
-                lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts)
+                poses = None if places is None else Poses.of(places[images_of])
+                lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts, poses)
                 part = self._trace(scene, sensor, lights, options, lanes)
                 images.add(part, launch.first_image * pixels)
             return images
@@ -157,17 +179,19 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
     if lights is not None and options.traces_light:
         image, path = lanes.light()
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
+        lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         vertices, seen = trace_light_paths(
-            scene, sensor, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
+            scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
         )
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()
     sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.EYE, pixel)
     rng = randomness.sampler(sequence, sample + lanes.first_sample)
-    start = primary_rays(sensor, rng, pixel, joined=options.traces_light)
+    lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
+    start = primary_rays(lens, rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)

@@ -8,8 +8,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from photonfarm.renderer.bdpt.poses import Poses
+
 LAUNCH_PATHS = 1 << 20
-"""The most eye or light paths traced at once, unless one sample of each pixel needs more: about 70 bytes each."""
+"""The most eye or light paths of one image traced at once, unless one sample of each pixel needs more.
+
+Images follow from it, as eye paths are joined to light paths of their own launch: another number gives other images of
+the same mean. The number of images in a launch changes no image.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +30,17 @@ class Launch:
     first_light_path: int
 
 
-def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator[Launch]:
-    """The launches of some images: several small images share one, a large one is split into several."""
-    paths = int(pixels * max(1.0, light_ratio))  # for a sample of each pixel
-    together = max(1, min(images, LAUNCH_PATHS // (paths * spp)))
-    samples = max(1, min(spp, LAUNCH_PATHS // paths))
+def images_at_once(pixels: int, spp: int, light_ratio: float, paths_at_once: int) -> int:
+    """The number of images that share a launch of at most ``paths_at_once`` eye or light paths; at least one."""
+    return max(1, paths_at_once // (_paths(pixels, light_ratio) * _samples_at_once(pixels, spp, light_ratio)))
+
+
+def launches(
+    images: int, pixels: int, spp: int, light_ratio: float, paths_at_once: int = LAUNCH_PATHS
+) -> Iterator[Launch]:
+    """The launches of some images: several images share one as ``paths_at_once`` allows, a large one is split."""
+    together = min(images, images_at_once(pixels, spp, light_ratio, paths_at_once))
+    samples = _samples_at_once(pixels, spp, light_ratio)
     for first_image in range(0, images, together):
         for first_sample in range(0, spp, samples):
             last_sample = min(first_sample + samples, spp)
@@ -37,6 +49,16 @@ def launches(images: int, pixels: int, spp: int, light_ratio: float) -> Iterator
                 min(together, images - first_image), first_image, last_sample - first_sample, first_sample,
                 last_light - first_light, first_light,
             )  # fmt: skip
+
+
+def _paths(pixels: int, light_ratio: float) -> int:
+    """The number of eye paths for one sample of each pixel, or of light paths if these are more."""
+    return int(pixels * max(1.0, light_ratio))
+
+
+def _samples_at_once(pixels: int, spp: int, light_ratio: float) -> int:
+    """The samples of each pixel that one launch traces of an image."""
+    return max(1, min(spp, LAUNCH_PATHS // _paths(pixels, light_ratio)))
 
 
 def _light_paths(eye_paths: int, light_ratio: float) -> int:
@@ -64,9 +86,18 @@ class Lanes:
     first_light_path: mi.UInt32  # [1]
     eye_scale: mi.Float  # [1]: 1 over all samples per pixel
     splat_scale: mi.Float  # [1]: eye paths per light path over all samples per pixel
+    poses: Poses | None  # of the images' cameras; None: all are the sensor's
 
     @classmethod
-    def of(cls, launch: Launch, size: tuple[int, int], spp: int, keys: mi.UInt32, shifts: mi.UInt32 | None) -> Lanes:
+    def of(
+        cls,
+        launch: Launch,
+        size: tuple[int, int],
+        spp: int,
+        keys: mi.UInt32,
+        shifts: mi.UInt32 | None,
+        poses: Poses | None = None,
+    ) -> Lanes:
         """The lanes of a launch whose images have the size ``size`` (W, H) and get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
@@ -77,12 +108,13 @@ class Lanes:
             first_light_path=dr.opaque(mi.UInt32, launch.first_light_path),
             eye_scale=dr.opaque(mi.Float, 1 / spp),
             splat_scale=dr.opaque(mi.Float, ratio / spp),
+            poses=poses,
         )  # fmt: skip
 
     @property
-    def kind(self) -> tuple[int, ...]:
+    def kind(self) -> tuple[int | bool, ...]:
         """The numbers that the kernels are made for."""
-        return self.images, self.width, self.height, self.samples, self.light_paths
+        return self.images, self.width, self.height, self.samples, self.light_paths, self.poses is not None
 
     @property
     def pixels(self) -> int:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
     SceneLoader,
     SceneRenderer,
     lit_points,
     load_scene,
     located,
-    photons_of,
     visibility_of,
 )
 from photonfarm.shared.core.errors import IncompleteError

@@ -1,7 +1,6 @@
 """One job: one shard of samples, rendered in the order that edits the scene least, and committed.
 
-Seeds are functions of content keys: sample key and "half A" or "half B", modification key and "photons". A render with
-a non-finite value is discarded and drawn again with the next seed of its kind; no value is replaced or clamped.
+Samples of one configuration are rendered together, as many as the device likes at once.
 """
 
 from __future__ import annotations
@@ -13,15 +12,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from itertools import count, groupby, islice
+from itertools import groupby
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
-from photonfarm.shared.core.keys import Key, seed_of, view_key
+from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import (
     F32,
     LIT_POINTS,
@@ -40,9 +40,6 @@ from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
 
-ATTEMPTS = 3
-"""The seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
-
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
 
@@ -57,14 +54,11 @@ _PACKAGES = ("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "nu
 log = logging.getLogger(__name__)
 
 
-class SceneRenderer(Protocol):
+class SceneRenderer(Estimator, Protocol):
     """A loaded scene that is edited in place: the part of `renderer.scene.loaded_scene.LoadedScene` that jobs use."""
 
     def apply(self, modification: Modification) -> None:
         """Put the scene into a configuration."""
-
-    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
-        """Independent noisy estimates of radiance, one for each seed, (K, H, W, 3) linear."""
 
     def buffers(self, view: View) -> ViewBuffers:
         """The image-space buffers of a view."""
@@ -77,9 +71,6 @@ class SceneRenderer(Protocol):
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether a view sees points (N, 3) of the current configuration, (N,)."""
-
-    def photons(self, seed: int) -> Photons | None:
-        """Light sub-paths of the current configuration; None for a spec without photons."""
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud of the scene at rest."""
@@ -321,18 +312,24 @@ class _Rendering:
                 if photons is not None:
                     self._out.photons(modification_row, photons)
             points = rebuild(self._cloud, modification)
-            for sample in samples:
+            for together in _parts(samples, self._scene.samples_at_once):
                 self._on_progress(RENDERS_SAMPLES, done, len(rows.samples))
-                done += 1
-                view = rows.views[sample.view_row]
-                if sample.view_row in new_views:
-                    visibility = visibility_of(self._scene, view, points, photons)
-                    self._out.view(sample.view_row, self._buffers(sample, view), visibility)
-                    new_views.remove(sample.view_row)
-                halves, thrown = halves_of(self._scene, sample.key, view)
-                self._redrawn += thrown
-                self._out.radiance(sample.row, halves)
+                done += len(together)
+                for sample in together:
+                    if sample.view_row in new_views:
+                        view = rows.views[sample.view_row]
+                        visibility = visibility_of(self._scene, view, points, photons)
+                        self._out.view(sample.view_row, self._buffers(sample, view), visibility)
+                        new_views.remove(sample.view_row)
+                self._render_halves(together, rows)
         return self._redrawn
+
+    def _render_halves(self, samples: Sequence[SampleRow], rows: JobRows) -> None:
+        """Render the halves of samples together."""
+        found = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
+        for sample, (halves, thrown) in zip(samples, found, strict=True):
+            self._redrawn += thrown
+            self._out.radiance(sample.row, halves)
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """Render the buffers of a view, without a second attempt: they depend on no seed."""
@@ -341,60 +338,13 @@ class _Rendering:
         return buffers
 
 
+def _parts(samples: Sequence[SampleRow], most: int) -> Iterator[Sequence[SampleRow]]:
+    """The samples in parts of so many at most, in their order."""
+    return (samples[first : first + most] for first in range(0, len(samples), most))
+
+
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
     """Raise IncompleteError unless all values of arrays that depend on no seed are finite."""
     for name, values in arrays.items():
         if not np.isfinite(values.astype(np.float32)).all():
             raise IncompleteError(f"{name} of {what} came out non-finite{more}")
-
-
-def halves_of(scene: SceneRenderer, key: Key, view: View) -> tuple[F32, int]:
-    """Two independent estimates of a view, (2, H, W, 3), by a sample's key, and the number of discarded renders.
-
-    Raises IncompleteError if they stay non-finite.
-    """
-    purposes = ("half A", "half B")
-    seed_a = next(_seeds(key, purposes[0], ()))
-    seed_b = next(_seeds(key, purposes[1], (seed_a,)))
-    halves, thrown = scene.render_halves(view, (seed_a, seed_b)), 0
-    for half, purpose in enumerate(purposes):
-        if not np.isfinite(halves[half]).all():
-            halves[half], more = _drawn_again(scene, key, purpose, view, (seed_a, seed_b))
-            thrown += more
-    return halves, thrown
-
-
-def _drawn_again(scene: SceneRenderer, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
-    """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
-    _log_discarded(key, purpose)
-    for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):
-        image = scene.render_halves(view, (seed,))[0]
-        if np.isfinite(image).all():
-            return image, attempt
-        _log_discarded(key, purpose)
-    raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
-
-
-def photons_of(scene: SceneRenderer, key: Key) -> tuple[Photons | None, int]:
-    """The photons of the current configuration, by its key, and the number of attempts that were not finite.
-
-    None for a spec without photons. Raises IncompleteError if they stay non-finite.
-    """
-    for thrown, seed in enumerate(islice(_seeds(key, "photons", ()), ATTEMPTS)):
-        photons = scene.photons(seed)
-        if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
-            return photons, thrown
-        _log_discarded(key, "photons")
-    raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
-
-
-def _log_discarded(key: Key, purpose: str) -> None:
-    log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
-
-
-def _seeds(key: Key, purpose: str, taken: tuple[int, ...]) -> Iterator[int]:
-    """The seeds to try in turn, without end, none of them `taken`: equal seeds would make the halves equal."""
-    for attempt in count():
-        seed = seed_of(key, purpose if attempt == 0 else f"{purpose}, attempt {attempt}")
-        if seed not in taken:
-            yield seed

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer.jobs.render import SceneLoader, halves_of, load_scene, located, versions
+from photonfarm.renderer.jobs.estimates import halves_of
+from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.archives import write_arrays
@@ -157,7 +158,7 @@ def repeat(
         loaded = load(spec)
         loaded.apply(modification)
     with waiting(log, f"rendering pass {number} of the view in row {row}"):
-        halves, _ = halves_of(loaded, key, view)
+        ((halves, _),) = halves_of(loaded, [(key, view)])
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
 

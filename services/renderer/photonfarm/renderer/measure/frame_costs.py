@@ -17,7 +17,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs.render import lit_points, located, photons_of
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, located
 from photonfarm.renderer.measure.partial_film import PartialFilm
 from photonfarm.renderer.measure.surfaces import surface_kinds
 from photonfarm.renderer.scene.loaded_scene import LoadedScene

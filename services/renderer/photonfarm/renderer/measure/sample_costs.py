@@ -18,7 +18,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs.render import lit_points, photons_of, visibility_of
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene

@@ -33,6 +33,15 @@ CARD_VARIANT = "cuda_ad_rgb"
 LLVM_VERSIONS = ("19", "22")
 """The versions tested with Mitsuba's kernels, in order of preference."""
 
+PATH_BYTES = 128
+"""Memory for each path of a launch: the kept vertex of a light path, 76 bytes, and what kernels hand on to others."""
+
+MEMORY_SHARE = 4
+"""One over the share of a card's memory that paths may take."""
+
+MOST_PATHS = 1 << 25
+"""The most paths in a launch: a hundred and more for each thread of a large card, which leaves nothing to fill."""
+
 _FOLDERS = ("lib/*-linux-gnu", "lib64", "lib", "lib/llvm-*/lib", "local/lib")
 _INSTALL_LLVM = f"install LLVM 19 (Debian and Ubuntu: libllvm19), or set {LLVM_VARIABLE} to a libLLVM"
 
@@ -75,6 +84,16 @@ def _device(name: str, variant: str) -> Device:
     if card is None and found.cards:
         log.warning("rendering on the CPU, as %s", found.trouble)
     return Device(variant or (CARD_VARIANT if card else DEFAULT_VARIANT), card, found.driver if card else "")
+
+
+def paths_at_once() -> int | None:
+    """The most eye or light paths in a launch on the card, by its memory; None on a processor.
+
+    A quarter of the memory is for them, as the scene, other processes and a trainer may need theirs. MOST_PATHS bounds
+    them, which has not been measured on a card.
+    """
+    card = device().card
+    return None if card is None else max(1, min(card.memory_bytes // MEMORY_SHARE // PATH_BYTES, MOST_PATHS))
 
 
 def work_s() -> float:

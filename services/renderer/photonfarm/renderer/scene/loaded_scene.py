@@ -27,9 +27,13 @@ class LoadedScene:
 
     `scene` is the Mitsuba scene, for tests and comparisons; it belongs to this object. `boxes` (S, 2, 3) are the
     bounding boxes of its shapes at rest, by the scene's order; `still` (S,) says which shapes never move.
+
+    `samples_at_once` is the number of samples, of one configuration, whose images should be rendered together: 1 on a
+    processor, which gains nothing by more, and as many on a card as its memory holds.
     """
 
-    def __init__(self, spec: SceneSpec, scene: Any) -> None:
+    def __init__(self, spec: SceneSpec, scene: Any, paths_at_once: int | None = None) -> None:
+        """Take over a Mitsuba scene; `paths_at_once` are the most paths in a launch, by default as the device likes."""
         from photonfarm.renderer.bdpt import photons
         from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.scene import gbuffer, guides
@@ -41,7 +45,9 @@ class LoadedScene:
         self.spec = spec
         self.scene = scene
         self._sensor = AimedSensor(spec)
-        self._integrator = integrator_of(spec.transport)
+        paths_at_once = paths_at_once or backend.paths_at_once()
+        self._integrator = integrator_of(spec.transport, paths_at_once)
+        self.samples_at_once = 1 if paths_at_once is None else _samples_at_once(spec, paths_at_once)
         self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
         self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
         self._materials = Materials.of(scene)
@@ -56,8 +62,10 @@ class LoadedScene:
         self._state = rest(spec)
 
     @classmethod
-    def load(cls, spec: SceneSpec, beside: Path | None = None) -> Self:
+    def load(cls, spec: SceneSpec, beside: Path | None = None, **options: Any) -> Self:
         """The scene of a spec, at rest; `beside` is the spec's folder, where its scene file may lie.
+
+        Further `options` are those of the class.
 
         Raises SpecError for a scene that cannot be loaded or rendered, BackendError if Mitsuba does not work. Every
         movable group has been parked and brought back once, so that the kernels for this are compiled.
@@ -66,7 +74,7 @@ class LoadedScene:
         from photonfarm.renderer.scene.acceleration import expect_changes
         from photonfarm.renderer.scene.loading import load_scene
 
-        loaded = cls(spec, load_scene(spec, beside))
+        loaded = cls(spec, load_scene(spec, beside), **options)
         if spec.groups:
             expect_changes(loaded.scene)
         at_rest = rest(spec)
@@ -104,6 +112,15 @@ class LoadedScene:
         """
         spp = half_spp or self.spec.transport.half_spp
         return np.array(self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, spp), np.float32)
+
+    def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
+        """A half-estimate of each view by its seed, (K, H, W, 3), in as few launches as the device's memory allows.
+
+        They are those of `render_halves`, up to rounding.
+        """
+        places = np.stack([self._sensor.place(view) for view in views])
+        sensor, spp = self._sensor.at_origin, self.spec.transport.half_spp
+        return np.array(self._integrator.render_views(self.scene, sensor, places, seeds, spp), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
         """One half-estimate, (H, W, 3)."""
@@ -181,11 +198,21 @@ class LoadedScene:
         return geometry, cloud
 
 
-def integrator_of(transport: Transport) -> Any:
+def _samples_at_once(spec: SceneSpec, paths_at_once: int) -> int:
+    """The samples whose halves share a launch of so many paths; at least one."""
+    from photonfarm.renderer.bdpt.launches import images_at_once
+
+    pixels, transport = spec.film.width * spec.film.height, spec.transport
+    return max(1, images_at_once(pixels, transport.half_spp, transport.light_ratio, paths_at_once) // 2)
+
+
+def integrator_of(transport: Transport, paths_at_once: int | None = None) -> Any:
     """The integrator `bdpt` with the spec's parameters. Raises SpecError for those that it refuses."""
     import mitsuba as mi
 
     parameters = transport.model_dump(exclude={"half_spp"})
+    if paths_at_once is not None:
+        parameters["paths_at_once"] = paths_at_once
     try:
         return mi.load_dict({"type": "bdpt", "record": True, **parameters})
     except (RuntimeError, ValueError) as error:

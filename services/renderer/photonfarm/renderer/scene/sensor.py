@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.arrays import matrix
 from photonfarm.shared.scene.spec import SceneSpec
@@ -21,16 +23,24 @@ class AimedSensor:
         self.sensor = mi.load_dict(describe(spec))
         self._parameters = mi.traverse(self.sensor)
 
+    @cached_property
+    def at_origin(self) -> Any:
+        """A sensor that stays at the origin and looks along +z, for the integrator to place."""
+        return mi.load_dict(describe(self._spec))
+
     def aim(self, view: View) -> Any:
-        """The sensor, looking at this view. Mitsuba's camera looks along its +z with +x to the left and +y up."""
-        camera = Camera.of(view, self._spec)
-        to_world = np.eye(4)
-        to_world[:3] = np.stack([-camera.right, -camera.down, camera.forward, camera.origin], axis=1)
+        """The sensor, looking at this view."""
         kind = type(self._parameters["to_world"])
-        self._parameters["to_world"] = kind(matrix(to_world))
+        self._parameters["to_world"] = kind(matrix(self.place(view)))
         dr.make_opaque(self._parameters["to_world"])
         self._parameters.update()
         return self.sensor
+
+    def place(self, view: View) -> NDArray[np.float64]:
+        """The camera-to-world matrix (4, 4) of a view: Mitsuba's camera has +x to the left, +y up, +z ahead."""
+        camera, to_world = Camera.of(view, self._spec), np.eye(4)
+        to_world[:3] = np.stack([-camera.right, -camera.down, camera.forward, camera.origin], axis=1)
+        return to_world
 
 
 def describe(spec: SceneSpec) -> dict[str, Any]:

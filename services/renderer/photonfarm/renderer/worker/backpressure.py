@@ -16,6 +16,7 @@ from redis import Redis
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import store_errors
+from photonfarm.shared.core.waiting import pause_after_look
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.io.local import LocalStorage
 from photonfarm.shared.store.write.scene_store import Progress
@@ -24,7 +25,7 @@ AHEAD_MINIMUM = 256
 """The samples that may be committed before any is used, as a trainer first waits for some, held-out ones included."""
 
 AHEAD_LOOK_S = 5.0
-"""The seconds between two counts of committed samples, since each count lists every marker."""
+"""The seconds between two counts of committed samples, since each count looks at the markers."""
 
 FULL_S = 30.0
 """The seconds for which no job is taken after a disk refused a commit, even if it seems to have free space."""
@@ -96,15 +97,16 @@ class TrainerPace:
     def ahead(self) -> dict[str, str]:
         """The scenes of which no job should be taken now: the reason, by scene id. Raises redis.RedisError."""
         if self._clock() >= self._due:
+            began = self._clock()
             self._ahead = self._look()
-            self._due = self._clock() + AHEAD_LOOK_S
+            self._due = self._clock() + pause_after_look(self._clock() - began, AHEAD_LOOK_S)
         return self._ahead
 
     def _progress(self) -> dict[str, Progress]:
         """The progress of each scene, by its id; a scene that cannot be read holds back no jobs."""
         if self._scene_id is None:
-            return self._store.each(SceneStore.progress)[0]
-        return {self._scene_id: self._store.scene(self._scene_id).progress()}
+            return self._store.each(_progress)[0]
+        return {self._scene_id: _progress(self._store.scene(self._scene_id))}
 
     def _look(self) -> dict[str, str]:
         committed = {
@@ -119,3 +121,7 @@ class TrainerPace:
             for scene_id, samples in committed.items()
             if samples > self._ratio * used[scene_id]
         }
+
+
+def _progress(scene: SceneStore) -> Progress:
+    return scene.progress(followed=True)

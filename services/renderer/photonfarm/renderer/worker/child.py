@@ -136,12 +136,13 @@ class RenderWorker(QueueWorker):
         Raises StoreError if the store is gone: an empty folder in its place would seem to miss nothing.
         """
         self._store.check()
-        if queue.reconcile(self._store, self.connection, scene_id=self._settings.scene_id, wait_s=0):
+        only = self._settings.scene_id
+        found = queue.look(self._store, self.connection, scene_id=only, every_s=self._settings.idle_s)
+        if found == "queued" or (found == "waits" and not self._outcomes.not_here):  # what is left may not be for it
             return False
         self._store.sweep()
         if not self._settings.until_complete:
             return False
-        only = self._settings.scene_id
         missing, unreadable = missing_jobs(self._store, () if only is None else (only,))
         failed = queue.queue_status(self.connection).failed
         reasons = {name: failure.reason for name, failure in failed.items()}

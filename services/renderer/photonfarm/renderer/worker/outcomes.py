@@ -28,7 +28,7 @@ from photonfarm.shared.core.errors import (
     StoreError,
 )
 from photonfarm.shared.queue import RenderArguments
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store import Store
 
 NOT_HERE_S = 300.0
 """How long a scene whose files are missing here is left to other workers before its files are looked for again."""
@@ -162,14 +162,17 @@ def _resident_bytes() -> int:
 # ---------------------------------------------------------------------------------------------------------- at the end
 
 
-def missing_jobs(store: Store, scene_ids: tuple[str, ...]) -> tuple[dict[str, list[int]], dict[str, StoreError]]:
+def missing_jobs(
+    store: Store, scene_ids: tuple[str, ...], *, followed: bool = False
+) -> tuple[dict[str, list[int]], dict[str, StoreError]]:
     """The missing jobs of some scenes, or of all if none are named; and why scenes cannot be read. Both by scene id.
 
-    Raises StoreError if the store, or a scene that is named, cannot be read.
+    `followed` is as in `SceneStore.missing_jobs`. Raises StoreError if the store, or a scene that is named, cannot be
+    read.
     """
     if scene_ids:
-        return {scene_id: store.scene(scene_id).missing_jobs() for scene_id in scene_ids}, {}
-    return store.each(SceneStore.missing_jobs)
+        return {scene_id: store.scene(scene_id).missing_jobs(followed=followed) for scene_id in scene_ids}, {}
+    return store.each(lambda scene: scene.missing_jobs(followed=followed))
 
 
 def is_complete(

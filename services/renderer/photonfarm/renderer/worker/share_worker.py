@@ -20,11 +20,15 @@ from photonfarm.renderer.worker.settings import RECYCLED, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import StoreError, store_errors
 from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.waiting import pause_after_look
 from photonfarm.shared.queue import Share, job_name
 from photonfarm.shared.store import Store
 
 LOOK_S = 30.0
-"""The seconds after which the markers are listed again; in between a job costs one question to the store."""
+"""The seconds after which the markers are looked at again; in between a job costs one question to the store.
+
+Where a look takes long, it is done more rarely, as `pause_after_look` says.
+"""
 
 TAKEN_LOOK_S = 2.0
 """The seconds between two looks whether another worker has committed the job in hand."""
@@ -51,6 +55,7 @@ class ShareWorker:
         self._renderer = jobs.ShardRenderer(store, worker=settings.name, load=load, on_progress=self._on_progress)
         self._waiting: deque[tuple[str, int]] = deque()  # scene ids and jobs, in the order in which they are taken
         self._look_due = self._taken_look_due = 0.0
+        self._pause_s: float = settings.idle_s  # between looks that find nothing
         self._missing: Mapping[str, list[int]] = {}  # by scene id, at the last look
         self._unreadable: Mapping[str, StoreError] = {}
         self._left_alone: set[str] = set()  # names of jobs that have failed
@@ -77,7 +82,7 @@ class ShareWorker:
             return self._outcomes.after_job()
         if not held_back and self._nothing_is_left():
             return 0
-        self._stop.wait(self._settings.idle_s)
+        self._stop.wait(self._pause_s)
         return None
 
     # ---------------------------------------------------------------------------------------------------- taking a job
@@ -96,7 +101,11 @@ class ShareWorker:
     def _look(self) -> None:
         """List what is missing, without what has failed and what cannot be rendered here."""
         self._store.check()
-        self._missing, unreadable = missing_jobs(self._store, self._scenes())
+        began, scenes = time.monotonic(), self._scenes()
+        self._missing, unreadable = missing_jobs(self._store, scenes, followed=True)
+        if self._settings.until_complete and not any(self._missing.values()):  # this worker may end: is it really so?
+            self._missing, unreadable = missing_jobs(self._store, scenes)
+        self._pause_s = pause_after_look(time.monotonic() - began, self._settings.idle_s)
         for scene_id, error in unreadable.items():
             if scene_id not in self._unreadable:
                 log.warning("scene %s is passed over, and the others go on: %s", scene_id, error)
@@ -111,7 +120,7 @@ class ShareWorker:
             for job in self._share.order([job for job in missing if job_name(scene_id, job) not in self._left_alone])
         ]
         self._waiting = deque(sorted(found, key=lambda scene_and_job: not self._share.owns(scene_and_job[1])))
-        self._look_due = time.monotonic() + LOOK_S
+        self._look_due = time.monotonic() + max(LOOK_S, self._pause_s)
 
     def _scenes(self) -> tuple[str, ...]:
         """The scenes to render, of those that are named; a worker that waits for more lets them come later."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from photonfarm.shared.core.estimate import stated
 from photonfarm.trainer.runs import wait_times
+
+if TYPE_CHECKING:
+    from photonfarm.trainer.dry_run.dry_run import DryRun
 
 
 def record(of: dict[str, Any]) -> None:
@@ -27,6 +31,13 @@ def record(of: dict[str, Any]) -> None:
             + wait_times.stated(of["waits"], of["samples_per_used"]),
             err=True,
         )
+
+
+def dry_run(found: DryRun, as_json: bool) -> None:
+    """Print the estimate of a training."""
+    from photonfarm.trainer.dry_run.printed import document, text
+
+    click.echo(json.dumps(document(found), indent=2) if as_json else text(found))
 
 
 def _recovered(log_record: dict[str, Any]) -> str:

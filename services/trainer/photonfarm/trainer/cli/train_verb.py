@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.shared.cli.options import redis_option, store_option
+from photonfarm.shared.cli.options import json_option, redis_option, store_option
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
 from photonfarm.trainer.runs.user_code import is_own
 
@@ -116,9 +116,15 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @click.option("--grid", is_flag=True, help="Search optimisers, rates and decays by short runs on a complete store.")
 @click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
+@click.option("--dry-run", is_flag=True, help="Only estimate memory, and time here and on some cards, by a few steps "
+              "on made-up samples; write nothing.")  # fmt: skip
+@click.option("--film", type=click.IntRange(8), metavar="PIXELS",
+              help="With --dry-run: the side of images, instead of the spec's.")  # fmt: skip
+@json_option
 def train(
     spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...],
-    until_complete: bool, grid: bool, summary: bool, check: bool, **options: Any,
+    until_complete: bool, grid: bool, summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool,
+    **options: Any,
 ) -> None:  # fmt: skip
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
 
@@ -129,9 +135,12 @@ def train(
     from photonfarm.trainer import service
     from photonfarm.trainer.cli import show
 
-    instead = [name for name, asked in (("--grid", grid), ("--summary", summary), ("--check", check)) if asked]
+    others = (("--grid", grid), ("--summary", summary), ("--check", check), ("--dry-run", dry_run))
+    instead = [name for name, asked in others if asked]
     if len(instead) > 1:
         raise click.UsageError(f"{' and '.join(instead)} exclude each other; give one of them")
+    if (as_json or film is not None) and not dry_run:
+        raise click.UsageError(f"{'--json' if as_json else '--film'} goes with --dry-run alone")
     log = partial(click.echo, err=True)
     changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
     if check:
@@ -140,6 +149,8 @@ def train(
         click.echo(service.search(spec, store, run, preset, changes, log))
     elif summary:
         click.echo(service.summarise(spec, store, preset, changes))
+    elif dry_run:
+        show.dry_run(service.rehearse(spec, store, preset, changes, film), as_json)
     else:
         service.run(
             spec, store, run, preset, changes, redis_url, until_complete=until_complete, log=log, on_record=show.record

@@ -12,8 +12,10 @@ from typing import Any, Self
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.core.waiting import pause_after_look
 from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
+from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
@@ -24,9 +26,9 @@ class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
 
     Rows that are incomplete when they are read, for instance after a repair of the store, are left out of their batch,
-    until they are complete again. Only the feed's thread uses the source. There is no cache of samples besides the
-    batches: to read a sample from the system's cache, checked, takes less than half of the time to write it into a
-    batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
+    until they are complete again. Only the feed's thread uses the source. On a CPU there is no cache of samples besides
+    the batches, unless one is asked for: to read a sample from the system's cache, checked, takes less than half of the
+    time to write it into a batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
     """
 
     def __init__(
@@ -35,12 +37,17 @@ class Feed:
         settings: TrainSettings,
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
+        resident: ResidentSamples | None = None,
     ) -> None:
-        """Feed a batch with the inputs that the settings' network needs, or those in `needs`."""
+        """Feed a batch with the inputs that the settings' network needs, or those in `needs`.
+
+        With `resident`, samples are kept there, and batches are on its device.
+        """
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or kind_of(settings.network.architecture).needs
+        self._resident = resident if resident is not None and resident.keeps_any else None
         if self._needs.guides:
             source.follow_guides()
         self.geometry, self.cloud = source.base()
@@ -130,8 +137,9 @@ class Feed:
         due = self._clock()
         while True:
             if self._clock() >= due:
+                began = self._clock()
                 self._poll()
-                due = self._clock() + self._settings.poll_seconds
+                due = self._clock() + pause_after_look(self._clock() - began, self._settings.poll_seconds)
             try:
                 rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
             except queue.Empty:
@@ -145,6 +153,8 @@ class Feed:
         rows = [int(row) for row in self._source.refresh()]
         gone = [int(row) for row in self._source.taken_back]
         self._here.difference_update(gone)
+        if self._resident is not None:
+            self._resident.forget(gone)
         self._here.update(rows)
         self._known.update(rows)
         units = units_of(self._source, rows)
@@ -169,4 +179,7 @@ class Feed:
 
     def _read_complete(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
         there = [row for row in rows if row in self._here]
-        return read_into(memory, self._source, there, self._needs, self.cloud)
+        if self._resident is None:
+            return read_into(memory, self._source, there, self._needs, self.cloud)
+        fresh = read_into(memory, self._source, self._resident.lacking(there), self._needs, self.cloud)
+        return self._resident.batch(there, fresh)

@@ -14,6 +14,7 @@ from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.image_synthesis import ImageSynthesisLayer
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.projection import footprint, project_mean
+from photonfarm.trainer.runs.device import round_convolutions
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 IMAGE_CHANNELS = 10
@@ -91,7 +92,8 @@ class Network(nn.Module):
         return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
 
     def synthesise(self, channels: Tensor) -> Tensor:
-        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, which makes convolutions faster on CPUs."""
+        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, as CPUs and tensor cores take them."""
+        round_convolutions(channels.device, self.image_synthesis.precision)
         return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
     def coordinates(self, position: Tensor) -> Tensor:

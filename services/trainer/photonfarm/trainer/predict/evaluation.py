@@ -161,7 +161,7 @@ def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors
     for batch in found:
         units.extend(batch.units)
         error = error_of(batch)
-        for image, (half_a, half_b) in zip(predict(batch), batch.target.numpy(), strict=True):
+        for image, (half_a, half_b) in zip(predict(batch), batch.target.cpu().numpy(), strict=True):
             errors.append(error(image, half_a, half_b))
             shown.append(_shown(error, image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))

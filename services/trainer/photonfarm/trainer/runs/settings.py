@@ -24,12 +24,13 @@ Architecture = Literal[
     "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, given the guides of a view
     "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
 ]  # fmt: skip
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "tf32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
 EmissionScale = Literal["linear", "log"]
 PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
+Compilation = Literal["off", "on", "graphs"]
 Schedule = Literal["epochs", "cosine"]
 ReadyDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
@@ -71,7 +72,8 @@ class NetworkSettings(Frozen):
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
     # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
-    precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case
+    precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case;
+    # "tf32" is of NVIDIA's cards alone (docs/results/arithmetic.md)
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
@@ -128,6 +130,12 @@ class TrainSettings(Frozen):
     prefetch: Count = 2  # batches read ahead
     threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of torch on the CPU; renderers share the machine
     device: str = "auto"  # cuda where torch has one, and otherwise the cpu
+    compile: Compilation = (
+        "off"  # "on": torch.compile makes kernels for the U-Net, which takes minutes at the beginning
+    )
+    # and is slower than without on a CPU (docs/results/arithmetic.md); "graphs": with CUDA graphs too
+    resident_gb: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"  # of decoded samples that are kept on the
+    # device; "auto": on CUDA while a quarter of the card is free, and none on a CPU, beside whose memory the files lie
 
     @model_validator(mode="before")
     @classmethod

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.data.dataset import TrainingBatch
-from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import build, image_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.average import WeightAverage
+from photonfarm.trainer.training.compiled import compile_network
 from photonfarm.trainer.training.losses import loss_of
 from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
@@ -35,18 +37,35 @@ class DivergedError(IncompleteError):
         )
 
 
+class KnownScene(Protocol):
+    """What of a scene is known before any sample; a `Feed` knows it."""
+
+    @property
+    def spec(self) -> SceneSpec:
+        """The scene's spec."""
+
+    @property
+    def geometry(self) -> Geometry:
+        """Its triangles."""
+
+    @property
+    def cloud(self) -> BasePointCloud:
+        """Its base cloud."""
+
+
 class Learner:
     """The network of a scene, equal in all processes of a group, before and after each step."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, group: TrainingGroup = SINGLE_PROCESS) -> None:
-        """Make the untrained network of the feed's scene, on the device of this process."""
-        frame = SceneFrame.of(feed.spec, feed.geometry, feed.cloud, settings.network)
+    def __init__(self, scene: KnownScene, settings: TrainSettings, group: TrainingGroup = SINGLE_PROCESS) -> None:
+        """Make the untrained network of a scene, on the device of this process."""
+        frame = SceneFrame.of(scene.spec, scene.geometry, scene.cloud, settings.network)
         self._settings, self._group = settings, group
         self._device = group.device(settings.device)
         self.network = build(settings.network, frame, settings.seed).to(self._device)
         self._loss, self.verdict = loss_of(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(self.network.parameters(), settings)
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
+        compile_network(self.network, settings.compile, self._device)  # and not the average, copied before
         self.rate_factor = 1.0  # times the schedule; not part of the state below
 
     @property

@@ -21,6 +21,7 @@ from photonfarm.shared.core.processes import Stop
 from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.growth import BatchStream, Growth
+from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
@@ -30,6 +31,7 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SET
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
 from photonfarm.trainer.runs.wait_times import Stopwatch, TimeKind, samples_per_used, wait_shares
+from photonfarm.trainer.training.compiled import compiling
 from photonfarm.trainer.training.learner import DivergedError, Learner
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
@@ -99,7 +101,9 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
                 return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
-        with Feed(source, settings, hooks.clock) as feed, named_in_errors(**own):
+        resident = ResidentSamples(hooks.group.device(settings.device), settings.resident_gb)
+        fed = Feed(source, settings, hooks.clock, resident=resident)
+        with fed as feed, named_in_errors(**own), compiling(settings.compile):
             return Session(feed, settings, run, watch, hooks).run()
 
 

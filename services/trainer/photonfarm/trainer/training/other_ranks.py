@@ -9,10 +9,12 @@ import torch
 
 from photonfarm.trainer.data.dataset import SampleSource
 from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.compiled import compiling
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState
 
@@ -27,11 +29,13 @@ def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: 
     if command == "end":
         return
     own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
-    with Feed(source(value["scene_id"]), own) as feed:
+    resident = ResidentSamples(ranks.device(settings.device), settings.resident_gb)
+    with Feed(source(value["scene_id"]), own, resident=resident) as feed:
         good, step = GoodState(Learner(feed, settings, ranks)), value["step"]
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
-        _follow(ranks, feed, good, step)
+        with compiling(settings.compile):
+            _follow(ranks, feed, good, step)
 
 
 def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:

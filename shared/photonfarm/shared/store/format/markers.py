@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -53,7 +53,12 @@ class _Marker(_Stored):
 
 def name_of(scene: str, job: int) -> str:
     """The name of a job's marker; `scene` is the scene's folder."""
-    return f"{scene}/{COMMITTED}/{job:0{_DIGITS}d}.json"
+    return f"{scene}/{COMMITTED}/{file_of(job)}"
+
+
+def file_of(job: int) -> str:
+    """The file of a job's marker, in the folder of markers."""
+    return f"{job:0{_DIGITS}d}.json"
 
 
 def place(
@@ -109,4 +114,9 @@ def jobs(storage: Storage, scene: str) -> set[int]:
     """The jobs of a scene that have a marker; costs one listing."""
     with store_errors("list the markers", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{COMMITTED}")
+    return jobs_named(names)
+
+
+def jobs_named(names: Iterable[str]) -> set[int]:
+    """The jobs of those names in a folder of markers that are names of markers."""
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}

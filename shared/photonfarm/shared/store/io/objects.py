@@ -150,6 +150,20 @@ class ObjectStorage:
             self.require()
         return [path.rpartition("/")[2] for path in paths]
 
+    def names_behind(self, folder: str, name: str) -> list[str]:
+        """The names right below a folder without folders that come after a name, which need not be there.
+
+        Costs a request per thousand of these names. There are none if the store is gone.
+        """
+        offset = f"{folder}/{name}"
+        with os_errors(folder):
+            found = patiently(
+                lambda: [
+                    about["path"] for batch in obstore.list(self._objects, folder, offset=offset) for about in batch
+                ]
+            )
+        return [path.rpartition("/")[2] for path in found]
+
     def zarr(self, folder: str) -> ObjectStore[Any]:
         """A folder in the form that zarr-python reads."""
         return _Group(connect(f"{self._url}/{folder}", TIMEOUT_S), read_only=True)

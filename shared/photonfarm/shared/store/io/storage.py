@@ -101,6 +101,14 @@ class Copying(Protocol):
         """Make the copy of a name again, as `local` made it."""
 
 
+@runtime_checkable
+class Ordered(Protocol):
+    """A storage that lists names in order: listing those behind a name costs nothing for those before it."""
+
+    def names_behind(self, folder: str, name: str) -> list[str]:
+        """The names right below a folder without folders that come after a name, which need not be there."""
+
+
 def renew_copy(storage: Storage, name: str) -> bool:
     """Make this machine's damaged copy of a name again; False if the storage has no copies."""
     if not isinstance(storage, Copying):

@@ -26,7 +26,8 @@ from photonfarm.shared.plan.sampling import modification_keys, view_keys
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.format import markers, schema
+from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
 from photonfarm.shared.store.read.batch import Batch
@@ -68,11 +69,13 @@ class SceneReader:
         self._with_guides = guides
         self._guides: GuideStore | None = None
         self._guided: set[int] = set()  # jobs whose guides are there
+        self._guide_markers: FollowedMarkers | None = None
         self._storage = open_storage(root)
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
         self._spec: SceneSpec | None = None
         self._arrays: dict[str, schema.ArraySchema] = {}
+        self._markers = FollowedMarkers(self._storage, self._name)
         self._plans: list[StoredPlan] = []
         self.plan_requests: list[dict[str, Any]] = []  # the requests of the plans, from which all rows follow
         self._committed: set[int] = set()
@@ -90,6 +93,7 @@ class SceneReader:
             self._arrays = schema.output_arrays(self._spec)
             if self._with_guides:
                 self._guides = GuideStore(self._storage, self._name, self._spec)
+                self._guide_markers = FollowedMarkers(self._storage, self._guides.name)
                 self._arrays |= schema.guide_arrays(self._spec)
         return self._spec
 
@@ -125,7 +129,8 @@ class SceneReader:
     def refresh(self) -> NDArray[np.int64]:
         """Look for new samples; returns the rows of those completed since the last refresh, none without a scene.
 
-        Costs one listing of the markers and one of the plans. Raises StoreError for a store of another format.
+        Costs one listing of the plans, and what `FollowedMarkers` costs. Raises StoreError for a store of another
+        format.
         """
         self.taken_back = np.zeros(0, np.int64)
         if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
@@ -135,8 +140,8 @@ class SceneReader:
             if not is_there(self._storage, self._scene_id):
                 return np.zeros(0, np.int64)
         _ = self.spec
-        committed = markers.jobs(self._storage, self._name)  # before the plans: each one's plan is there by now
-        guided = self._guides.committed_jobs() if self._guides else set()
+        committed = self._markers.look()  # before the plans: each one's plan is there by now
+        guided = self._guide_markers.look() if self._guide_markers else set()
         self._load_plans()
         if committed == self._committed and guided == self._guided:
             return np.zeros(0, np.int64)
@@ -318,6 +323,8 @@ class SceneReader:
             try:
                 yield
             except CorruptError as error:
+                for followed in filter(None, (self._markers, self._guide_markers)):
+                    followed.doubt()  # a repair may have set the job aside
                 raise CorruptError(f"{error}; {REPAIR}") from error
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from bisect import bisect_left
 from collections.abc import Sequence, Set
 from dataclasses import replace
 from pathlib import Path
@@ -35,6 +36,9 @@ GUIDES = "guides"
 """The folder of a scene's guides, below the scene's."""
 
 SETTINGS = "settings.json"
+
+LOOKED_AT = 65536
+"""The rows of views that are looked at together for what lacks guides."""
 
 NOISY = ("direct", "gloss", "point_light")
 """The guides that are sampled, with seeds of their own; they are rounded."""
@@ -95,14 +99,17 @@ class GuideStore:
         """The marker of a job whose guides are there; raises as `SceneStore.marker` does."""
         return markers.read(self.storage, self.name, job)
 
-    def lacks(self, found: Sequence[StoredPlan]) -> list[int]:
-        """The jobs of these plans with new views that still lack guides, in order; none if the scene has no guides."""
-        return self.without(found) if self.settings() is not None else []
+    def lacks(self, found: Sequence[StoredPlan], among: Sequence[int]) -> list[int]:
+        """Which of some jobs, in order, have new views that still lack guides; none if the scene has no guides."""
+        if self.settings() is None:
+            return []
+        done = self.committed_jobs()
+        return jobs_with_views(found, [job for job in among if job not in done])
 
     def without(self, found: Sequence[StoredPlan]) -> list[int]:
         """The jobs of these plans with new views without guides, in order, even if the scene has no guides."""
         done = self.committed_jobs()
-        return [job for plan in found for job in jobs_with_views(plan) if job not in done]
+        return [job for job in jobs_with_views(found) if job not in done]
 
     def lacks_job(self, rows: JobRows) -> bool:
         """Whether a job has new views without guides, in a scene that has guides."""
@@ -145,11 +152,22 @@ def beside(plan: StoredPlan, guides: str) -> StoredPlan:
     return replace(plan, folder=plans.folder(guides, plan.number))
 
 
-def jobs_with_views(plan: StoredPlan) -> list[int]:
-    """The jobs of a plan that have new views, in order."""
-    used = np.flatnonzero(used_views([plan]))
-    jobs: list[int] = (plan.first_job + np.unique(used // plan.shard_rows)).tolist()
-    return jobs
+def jobs_with_views(found: Sequence[StoredPlan], among: Sequence[int] | None = None) -> list[int]:
+    """Which jobs of plans, or which of some of them that ascend, have new views.
+
+    They are looked at a few at a time, so that little of the plans is held.
+    """
+    if among is None:
+        among = [job for plan in found for job in range(plan.first_job, plan.end_job)]
+    having: list[int] = []
+    for plan in found:
+        jobs = np.array(among[bisect_left(among, plan.first_job) : bisect_left(among, plan.end_job)], np.int64)
+        at_once = max(LOOKED_AT // plan.shard_rows, 1)
+        for some in (jobs[first : first + at_once] for first in range(0, len(jobs), at_once)):
+            rows = (some[:, None] - plan.first_job) * plan.shard_rows + np.arange(plan.shard_rows)
+            views = plan.rows.some("view", rows.ravel())[:, 0].reshape(rows.shape)
+            having += some[~np.isnan(views).all(axis=1)].tolist()
+    return having
 
 
 def has_guides(found: Sequence[StoredPlan], done: Set[int]) -> NDArray[np.bool_]:

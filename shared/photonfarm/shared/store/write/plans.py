@@ -5,7 +5,10 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import json
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +21,16 @@ from photonfarm.shared.core.errors import CorruptError, store_errors
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import UNUSED, Expansion, PlannedContent, PlannedRows, Request, expand
+from photonfarm.shared.plan.request import (
+    UNUSED,
+    Expansion,
+    InputName,
+    InputRows,
+    PlannedContent,
+    PlannedRows,
+    Request,
+    expand,
+)
 from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
@@ -26,6 +38,7 @@ from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema
 from photonfarm.shared.store.format.plain_inputs import read_plain
 from photonfarm.shared.store.io.storage import Storage
+from photonfarm.shared.store.write.plan_rows import StoredRows
 
 PLANS = "plans"
 NAME_DIGITS = 6
@@ -50,7 +63,7 @@ _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredPlan:
-    """One plan of a scene with its inputs in memory."""
+    """One plan of a scene with its inputs, in memory or read when they are needed."""
 
     number: int
     folder: str  # its name in the storage
@@ -58,7 +71,7 @@ class StoredPlan:
     first_job: int
     jobs: int
     shard_rows: int
-    rows: PlannedRows
+    rows: InputRows
 
     @property
     def end_job(self) -> int:
@@ -82,8 +95,8 @@ class StoredPlan:
 
     def samples_in(self, job: int) -> int:
         """The number of samples in one of its jobs."""
-        first = (job - self.first_job) * self.shard_rows
-        return int(np.count_nonzero(self.rows.sample_modification[first : first + self.shard_rows] != UNUSED))
+        own = (job - self.first_job) * self.shard_rows + np.arange(self.shard_rows)
+        return int(np.count_nonzero(self.rows.some("sample_modification", own) != UNUSED))
 
     def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
         """The file of one job's rows of an array."""
@@ -171,14 +184,27 @@ def build(
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
-    """The plans of a scene in order, keeping those already loaded; all, or those before number `until`.
+    """The plans of a scene in order with all their inputs, keeping those already loaded; all, or those before `until`.
 
     Raises CorruptError if one is missing or is not as it was written: later rows refer to its rows, and its samples
     would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
-        end = count(storage, scene, len(loaded)) if until is None else until
-        return loaded + [_load(storage, scene, n) for n in range(len(loaded), end)]
+        found = declared(storage, scene, loaded, until=until)
+        for plan in found:
+            plan.rows.load()
+    return found
+
+
+def declared(storage: Storage, scene: str, known: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
+    """The plans of a scene in order, keeping those already known, whose inputs are read when they are needed.
+
+    It costs one listing, and one file of each new plan. Raises CorruptError if a plan is missing, or if that file is
+    not as it was written.
+    """
+    with store_errors("read the plans", f"{storage.where}/{scene}"):
+        end = count(storage, scene, len(known)) if until is None else until
+        return known + [_declared(storage, scene, n) for n in range(len(known), end)]
 
 
 def count(storage: Storage, scene: str, loaded: int = 0) -> int:
@@ -196,19 +222,33 @@ def count(storage: Storage, scene: str, loaded: int = 0) -> int:
     return found - 1 if is_being_written else found
 
 
-def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
-    """A plan with its inputs; raises CorruptError if it is not as it was written."""
+def _declared(storage: Storage, scene: str, number: int) -> StoredPlan:
+    """A plan by its attributes; raises CorruptError if it is missing or they are not as they were written."""
     name = folder(scene, number)
-    try:
-        attributes, inputs = read_plain(storage, name, INPUTS) or _through_zarr(storage, name)
+    with _unreadable(storage, name):
+        attributes = json.loads(storage.read(f"{name}/zarr.json"))["attributes"]
         check_version(attributes, f"{storage.where}/{name}")
-        rows = PlannedRows(**inputs)
         about = about_plan(attributes)
+    rows = StoredRows(storage, name, lambda: _load(storage, name))
+    return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+
+
+def _load(storage: Storage, name: str) -> PlannedRows:
+    """The inputs of a plan; raises CorruptError if one is not as it was written."""
+    with store_errors("read a plan", f"{storage.where}/{name}"), _unreadable(storage, name):
+        _, inputs = read_plain(storage, name, INPUTS) or _through_zarr(storage, name)
+        return PlannedRows(**inputs)
+
+
+@contextlib.contextmanager
+def _unreadable(storage: Storage, name: str) -> Iterator[None]:
+    """Turn what readers of a plan raise into CorruptError."""
+    try:
+        yield
     except FileNotFoundError as error:
         raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
-    except (ValueError, KeyError, RuntimeError) as error:
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
-    return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
 
 
 def _through_zarr(storage: Storage, name: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -248,14 +288,19 @@ def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
 
 def modification_at(plans: list[StoredPlan], row: int) -> Modification:
     """The modification in a modification row."""
-    plan = plan_of(plans, row)
-    return Modification.from_vector(plan.rows.modification[row - plan.first_row])
+    return Modification.from_vector(_at(plans, "modification", row))
 
 
 def view_at(plans: list[StoredPlan], row: int) -> View:
     """The view in a view row."""
+    return View.from_vector(_at(plans, "view", row))
+
+
+def _at(plans: list[StoredPlan], name: InputName, row: int) -> NDArray[Any]:
+    """An input in one row of the scene."""
     plan = plan_of(plans, row)
-    return View.from_vector(plan.rows.view[row - plan.first_row])
+    value: NDArray[Any] = plan.rows.some(name, np.array([row - plan.first_row]))[0]
+    return value
 
 
 def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
@@ -266,16 +311,20 @@ def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], r
 def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
     """The inputs of the sample in a row; None for an unused row."""
     plan = plan_of(plans, row)
-    inputs, i = plan.rows, row - plan.first_row
-    if inputs.sample_modification[i] == UNUSED:
-        return None
-    return SampleRow(
-        row,
-        int(inputs.sample_modification[i]),
-        int(inputs.sample_view[i]),
-        int(inputs.sample_pass[i]),
-        inputs.sample_key[i].tobytes(),
+    return _samples(plan, range(row, row + 1))[0]
+
+
+def _samples(plan: StoredPlan, rows: range) -> list[SampleRow | None]:
+    """The inputs of the samples in some rows of a plan, None for unused ones."""
+    within = np.arange(rows.start, rows.stop) - plan.first_row
+    modification, view, pass_ = (
+        plan.rows.some(name, within).tolist() for name in ("sample_modification", "sample_view", "sample_pass")
     )
+    keys = plan.rows.some("sample_key", within)
+    return [
+        None if modification[i] == UNUSED else SampleRow(row, modification[i], view[i], pass_[i], keys[i].tobytes())
+        for i, row in enumerate(rows)
+    ]
 
 
 def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
@@ -286,7 +335,7 @@ def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
     else:
         raise IndexError(f"job {job} belongs to no plan of this scene")
     own = range(job * plan.shard_rows, (job + 1) * plan.shard_rows)
-    samples = [sample for row in own if (sample := sample_at(plans, row))]
+    samples = [sample for sample in _samples(plan, own) if sample]
     samples.sort(key=lambda s: (s.modification_row, s.view_row, s.pass_))
     modifications = {s.modification_row: modification_at(plans, s.modification_row) for s in samples}
     views = {s.view_row: view_at(plans, s.view_row) for s in samples}
@@ -298,6 +347,14 @@ def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
         frozenset(row for row in modifications if row in own),
         frozenset(row for row in views if row in own),
     )
+
+
+def check_inputs(plans: list[StoredPlan], jobs: list[int]) -> None:
+    """Raise CorruptError if inputs of some jobs, which ascend, are damaged; what was read before is not read again."""
+    for plan in plans:
+        own = np.array(jobs[bisect_left(jobs, plan.first_job) : bisect_left(jobs, plan.end_job)], np.int64)
+        first = (own - plan.first_job) * plan.shard_rows
+        plan.rows.check(np.concatenate([first, first + plan.shard_rows - 1]))  # a job may lie in two chunks
 
 
 def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:

@@ -24,6 +24,7 @@ from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, R
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
+from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.commit import JobWriter
@@ -31,6 +32,10 @@ from photonfarm.shared.store.write.guides import GuideStore, GuideWriter, has_gu
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 SCENES = "scenes"
+
+CHECKED_JOBS = 10_000
+"""How many of the missing jobs are looked at for damaged inputs: as many as are queued. The next ones follow later."""
+
 _SCENE_ID = re.compile("[0-9a-f]{32}")
 
 
@@ -68,6 +73,7 @@ class SceneStore:
         self.spec = read_spec(storage, scene_id)
         self.guides = GuideStore(storage, self.name, self.spec)
         self._plans: list[StoredPlan] = []
+        self._followed = [FollowedMarkers(storage, name) for name in (self.name, self.guides.name)]
 
     @property
     def folder(self) -> Path:
@@ -77,8 +83,13 @@ class SceneStore:
     # ------------------------------------------------------------------------------------------------------------ plans
 
     def plans(self) -> list[StoredPlan]:
-        """The plans that are there by now, in order."""
+        """The plans that are there by now, in order, with all their inputs."""
         self._plans = plans.load_all(self.storage, self.name, self._plans)
+        return self._plans
+
+    def _declared(self) -> list[StoredPlan]:
+        """The plans that are there by now, in order, whose inputs are read when they are needed."""
+        self._plans = plans.declared(self.storage, self.name, self._plans)
         return self._plans
 
     def plan(
@@ -135,7 +146,7 @@ class SceneStore:
     def job_rows(self, job: int) -> JobRows:
         """The inputs and outputs of a job; raises IndexError for a job of no plan."""
         if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
-            self.plans()
+            self._declared()
         return plans.job_rows(self._plans, job)
 
     def job_writer(self, job: int) -> JobWriter:
@@ -150,18 +161,27 @@ class SceneStore:
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
-        found = self.plans()
+        found = self._declared()
         return found[-1].end_job if found else 0
 
     def committed_jobs(self) -> set[int]:
         """The jobs that have their marker."""
         return markers.jobs(self.storage, self.name)
 
-    def missing_jobs(self) -> list[int]:
-        """The jobs that are planned and not committed, or lack the guides that the scene has, in order."""
-        committed = self.committed_jobs()
-        missing = {job for job in range(self.jobs()) if job not in committed}
-        return sorted(missing.union(self.guides.lacks(self._plans)))
+    def missing_jobs(self, *, followed: bool = False) -> list[int]:
+        """The jobs that are planned and not committed, or lack the guides that the scene has, in order.
+
+        `followed` is for callers who ask often, as in `progress`: they may be told late of jobs that a repair has set
+        aside, and should ask without it before they take nothing to be missing. Raises CorruptError if inputs of the
+        first jobs are damaged: nobody could render them.
+        """
+        committed = self._followed[0].look() if followed else self.committed_jobs()
+        jobs = range(self.jobs())
+        uncommitted = {job for job in jobs if job not in committed}
+        unguided = self.guides.lacks(self._plans, [job for job in jobs if job in committed])
+        missing = sorted(uncommitted.union(unguided))
+        plans.check_inputs(self._plans, missing[:CHECKED_JOBS])
+        return missing
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
@@ -175,10 +195,17 @@ class SceneStore:
         """The marker of a committed job: its files and its figures."""
         return markers.read(self.storage, self.name, job)
 
-    def progress(self) -> Progress:
-        """The scene's progress; costs one listing of the markers, and of those of guides."""
-        committed, guided = self.committed_jobs(), self.guides.committed_jobs()
-        found = self.plans()
+    def progress(self, *, followed: bool = False) -> Progress:
+        """The scene's progress; costs one listing of the markers, and of those of guides.
+
+        It costs those who ask often less if it is `followed`: what a repair sets aside may then be seen late
+        (`FollowedMarkers`), and damage in inputs that are not needed is not seen.
+        """
+        if followed:
+            committed, guided = (each.look() for each in self._followed)
+        else:
+            committed, guided = self.committed_jobs(), self.guides.committed_jobs()
+        found = self._declared() if followed else self.plans()
         complete = plans.complete_rows(found, committed)
         usable = complete.copy()
         if self.guides.settings() is not None and found:

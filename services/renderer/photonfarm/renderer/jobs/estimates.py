@@ -1,0 +1,109 @@
+"""Estimates by seeds, which are functions of content keys: the halves of samples, and a configuration's photons.
+
+A render with a non-finite value is discarded and drawn again with the next seed of its kind; no value is replaced or
+clamped.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from itertools import count, islice
+from typing import Protocol
+
+import numpy as np
+
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.keys import Key, seed_of
+from photonfarm.shared.core.records import F32, Photons, arrays_of
+from photonfarm.shared.scene.view import View
+
+ATTEMPTS = 3
+"""The seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
+
+PURPOSES = ("half A", "half B")
+
+log = logging.getLogger(__name__)
+
+
+class Estimator(Protocol):
+    """A scene in a configuration, as far as estimates go."""
+
+    samples_at_once: int
+    """The number of samples that `halves_of` should be given at once."""
+
+    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
+        """Independent noisy estimates of radiance, one for each seed, (K, H, W, 3) linear."""
+
+    def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
+        """Such estimates of several views, one for each view and seed, rendered together."""
+
+    def photons(self, seed: int) -> Photons | None:
+        """Light sub-paths of the current configuration; None for a spec without photons."""
+
+
+def halves_of(scene: Estimator, samples: Sequence[tuple[Key, View]]) -> list[tuple[F32, int]]:
+    """Two independent estimates of each view, (2, H, W, 3), by a sample's key, and the number of discarded renders.
+
+    Samples given together are rendered together. Raises IncompleteError if estimates stay non-finite.
+    """
+    seeds = [first_seeds(key) for key, _ in samples]
+    if len(samples) == 1:
+        images = scene.render_halves(samples[0][1], seeds[0])
+    else:
+        views = [view for _, view in samples for _ in PURPOSES]
+        images = scene.render_images(views, [seed for pair in seeds for seed in pair])
+    pairs = images.reshape(len(samples), len(PURPOSES), *images.shape[1:])
+    return [_finite(scene, *each) for each in zip(samples, seeds, pairs, strict=True)]
+
+
+def first_seeds(key: Key) -> tuple[int, int]:
+    """The seeds of halves A and B of a sample, unless renders are discarded."""
+    seed_a = next(_seeds(key, PURPOSES[0], ()))
+    return seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))
+
+
+def _finite(scene: Estimator, sample: tuple[Key, View], seeds: tuple[int, int], halves: F32) -> tuple[F32, int]:
+    """A sample's halves, those that are not finite drawn again, and the number of discarded renders."""
+    thrown = 0
+    for half, purpose in enumerate(PURPOSES):
+        if not np.isfinite(halves[half]).all():
+            halves[half], more = _drawn_again(scene, sample[0], purpose, sample[1], seeds)
+            thrown += more
+    return halves, thrown
+
+
+def _drawn_again(scene: Estimator, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
+    """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
+    _log_discarded(key, purpose)
+    for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):
+        image = scene.render_halves(view, (seed,))[0]
+        if np.isfinite(image).all():
+            return image, attempt
+        _log_discarded(key, purpose)
+    raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
+
+
+def photons_of(scene: Estimator, key: Key) -> tuple[Photons | None, int]:
+    """The photons of the current configuration, by its key, and the number of attempts that were not finite.
+
+    None for a spec without photons. Raises IncompleteError if they stay non-finite.
+    """
+    for thrown, seed in enumerate(islice(_seeds(key, "photons", ()), ATTEMPTS)):
+        photons = scene.photons(seed)
+        if photons is None or all(np.isfinite(values).all() for values in arrays_of(photons).values()):
+            return photons, thrown
+        _log_discarded(key, "photons")
+    raise IncompleteError(f"photons of modification {key.hex()} came out non-finite {ATTEMPTS} times")
+
+
+def _log_discarded(key: Key, purpose: str) -> None:
+    log.warning("%s of %s is not finite; drawn again with another seed", purpose, key.hex())
+
+
+def _seeds(key: Key, purpose: str, taken: tuple[int, ...]) -> Iterator[int]:
+    """The seeds to try in turn, without end, none of them `taken`: equal seeds would make the halves equal."""
+    for attempt in count():
+        seed = seed_of(key, purpose if attempt == 0 else f"{purpose}, attempt {attempt}")
+        if seed not in taken:
+            yield seed

@@ -1,0 +1,97 @@
+"""A made-up scene and made-up samples, with the sizes of a spec: steps on them take as long as on stored ones.
+
+Shape letters: B batch, P points, K photon slots, L lit points, H W image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import Camera, View
+from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.networks import kind_of
+from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.runs.settings import TrainSettings
+
+METALS = 0.2
+"""The share of pixels whose specular albedo lets `guided_transport` sum light over their lobe."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MadeUpScene:
+    """A cube of side 2 about the origin, seen from inside, whose points are as many as the spec's."""
+
+    spec: SceneSpec
+    geometry: Geometry
+    cloud: BasePointCloud
+
+    @classmethod
+    def of(cls, spec: SceneSpec) -> Self:
+        """The scene for a spec; always the same."""
+        rng = np.random.default_rng(0)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)), np.float32)
+        faces = np.array([(0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6)], np.uint32)
+        geometry = Geometry(corners, faces, np.zeros(4, np.int32), np.array([STATIC], np.int16))
+        axis, side = rng.integers(0, 3, spec.points), rng.choice([-1.0, 1.0], spec.points)
+        position, normal = rng.uniform(-1, 1, (spec.points, 3)), np.zeros((spec.points, 3), np.float32)
+        every = np.arange(spec.points)
+        position[every, axis], normal[every, axis] = side, -side
+        group, face = np.full(spec.points, STATIC, np.int16), np.zeros(spec.points, np.uint32)
+        albedo, emission = (rng.random((spec.points, 3), np.float32) for _ in range(2))
+        return cls(spec, geometry, BasePointCloud(position.astype(np.float32), normal, albedo, emission, group, face))
+
+    def batch(self, size: int, settings: TrainSettings) -> TrainingBatch:
+        """A batch of so many samples, with all that the settings' network reads; half of the points are seen."""
+        spec, needs = self.spec, kind_of(settings.network.architecture).needs
+        points = min(settings.network.points or spec.points, spec.points)
+        batch = TrainingBatch.empty(size, points, spec, needs)
+        generator = torch.Generator().manual_seed(0)
+        map_tensors(lambda tensor: _fill(tensor, generator), batch.inputs)
+        _fill(batch.target, generator)
+        self._make_plausible(batch.inputs, generator)
+        return batch.filled(tuple(range(size)), (b"made up",) * size)
+
+    def _make_plausible(self, inputs: Inputs, generator: torch.Generator) -> None:
+        """Cameras within the cube, unit normals, points and photons on its walls, and as many metals as usual."""
+        views = 0.5 * torch.rand(len(inputs.depth), 2, 3, generator=generator).numpy()
+        for place, (origin, target) in enumerate(views):
+            camera = Camera.of(View(origin - 0.5, target + 0.5), self.spec)
+            inputs.world_to_camera[place] = torch.from_numpy(camera.world_to_camera)
+        inputs.depth.add_(0.5)
+        _to_unit(inputs.normal)
+        if inputs.points is not None:
+            inputs.points.position[:] = torch.from_numpy(self.cloud.position[: inputs.points.position.shape[1]])
+            inputs.points.present.fill_(True)
+        if (photons := inputs.photons) is not None:
+            photons.position[:] = torch.from_numpy(_again(self.cloud.position, photons.position.shape[1]))
+            photons.normal[:] = torch.from_numpy(_again(self.cloud.normal, photons.normal.shape[1]))
+            photons.direction[:] = -photons.normal
+            photons.bounce.mul_(self.spec.photons.depth).floor_()
+            photons.present.fill_(True)
+        if (guides := inputs.guides) is not None:
+            guides.specular.mul_((torch.rand(guides.roughness.shape, generator=generator) < METALS)[..., None])
+            for vectors in (guides.mean_normal, guides.beyond_normal):
+                _to_unit(vectors)
+
+
+def _fill(tensor: Tensor, generator: torch.Generator) -> Tensor:
+    """Fill a tensor with numbers uniform in [0, 1), or with flags of which half are set."""
+    values = torch.rand(tensor.shape, generator=generator)
+    return tensor.copy_(values < 0.5 if tensor.dtype == torch.bool else values)
+
+
+def _to_unit(vectors: Tensor) -> None:
+    vectors.sub_(0.5).div_(torch.linalg.vector_norm(vectors, dim=-1, keepdim=True))
+
+
+def _again(values: F32, count: int) -> F32:
+    """The first `count` rows, from the beginning again if there are fewer."""
+    return np.resize(values, (count, *values.shape[1:]))

@@ -131,6 +131,13 @@ def line(spec: Any, training: Compared, images: Compared, alone: Compared) -> li
     ]
 
 
+def figures(plan: Any) -> dict[str, Any]:
+    """The plan for the JSON file, without what is measured for photons."""
+    document = plan.document()
+    measured = document.pop("measurement").items()
+    return {**document, "measurement": {k: v for k, v in measured if k not in ("filled", "near", "power")}}
+
+
 def page(lines: list[list[Any]], pairs: int) -> str:
     header = ["spec", "views", "for images: best → plan", "for training: best → plan"]
     header += ["for training: images' best takes", "for images: training's best takes"]
@@ -162,7 +169,7 @@ def main() -> int:
         training, images, alone = compare(spec, options.seconds, options.pairs)
         lines.append(line(spec, training, images, alone))
         print(*lines[-1], sep=" | ", file=sys.stderr)
-        plans.append({"spec": name, "training": training.plan.document(), "images": images.plan.document()})
+        plans.append({"spec": name, "training": figures(training.plan), "images": figures(images.plan)})
     values = {"seconds": options.seconds, "pairs": options.pairs, "specs": plans}
     results.write("plan_purposes", page(lines, options.pairs), values, options.out)
     return 0

@@ -15,6 +15,7 @@ from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.strategy.objective.view_cost import timed
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, rest
@@ -110,7 +111,7 @@ def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:
     costs = sample_costs(scene, 5)
     view = View(np.array([0, 1, 3.5], np.float32), np.array([0, 1, 0], np.float32))
     scene.render_halves(view, (1, 2), 16)
-    measured_s = min(measuring._timed(lambda: scene.render_halves(view, (3, 4), 16))[0] for _ in range(3))
+    measured_s = min(timed(lambda: scene.render_halves(view, (3, 4), 16))[0] for _ in range(3))
     predicted_s = costs.seconds(32, configurations=0, views=0, samples=1)
     assert 0.4 < predicted_s / measured_s < 2.5
 

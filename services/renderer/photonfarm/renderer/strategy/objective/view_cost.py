@@ -11,9 +11,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.strategy.pilot_scene import PilotScene
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Photons
 from photonfarm.shared.scene.modification import Modification
@@ -45,34 +47,42 @@ FREE = ViewCost(0.0, 0.0)
 
 def measure(pilot_scene: PilotScene, views: Iterable[tuple[Modification, View]]) -> ViewCost:
     """The medians over some views, each of a configuration of its own, without the first one."""
-    cloud = pilot_scene.loaded.base()[1]
+    scene = pilot_scene.loaded
+    cloud = scene.base()[1]
     times = []
     for modification, view in views:
-        configuration_s, lit = _timed(partial(_configure, pilot_scene, cloud, modification))
-        view_s, _ = _timed(partial(_look, pilot_scene, cloud, modification, view, lit))
-        times.append((configuration_s, view_s))
+        configuration_s, (points, photons) = timed(partial(configure, scene, cloud, modification))
+        pilot_scene.apply(modification)  # so that it knows of the edit
+        view_s, _ = timed(partial(look, scene, view, points, photons))
+        guides_s, _ = timed(partial(guide, scene, view, cloud, modification))
+        times.append((configuration_s, view_s + guides_s))
     configuration_s, view_s = np.median(times[1:], axis=0).tolist()
     return ViewCost(configuration_s, view_s)
 
 
-_Lit = tuple[tuple[F32, NDArray[np.bool_]], Photons | None]
+def configure(
+    scene: LoadedScene, cloud: BasePointCloud, modification: Modification
+) -> tuple[tuple[F32, NDArray[np.bool_]], Photons | None]:
+    """Bring a scene into a configuration; returns its points, as `rebuild` does, and its photons."""
+    scene.apply(modification)
+    dr.sync_thread()  # pending evaluations would be charged to the view
+    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.scene_id))[0]
 
 
-def _configure(pilot_scene: PilotScene, cloud: BasePointCloud, modification: Modification) -> _Lit:
-    pilot_scene.apply(modification)
-    dr.sync_thread()  # else what is pending would be charged to the view
-    return rebuild(cloud, modification), pilot_scene.loaded.photons(SEED)
-
-
-def _look(pilot_scene: PilotScene, cloud: BasePointCloud, modification: Modification, view: View, lit: _Lit) -> None:
-    scene = pilot_scene.loaded
+def look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
+    """Render the buffers of a view, and which points and photons it sees."""
     scene.buffers(view)
-    visibility_of(scene, view, *lit)
+    visibility_of(scene, view, points, photons)
+
+
+def guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
+    """Render the guides of a view."""
     key = view_key(modification.key(scene.spec.scene_id), view.vector)
     scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
 
 
-def _timed(work: Callable[[], T]) -> tuple[float, T]:
+def timed(work: Callable[[], T]) -> tuple[float, T]:
+    """The processor seconds of some work, and its result."""
     begun = backend.work_s()
     result = work()
     return backend.work_s() - begun, result

@@ -15,7 +15,8 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
-from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions, exchanged
+from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
+from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
@@ -45,7 +46,7 @@ class EyeState:
 class Connectable:
     """Light vertices, and the choice of those that this pass's eye paths are joined to."""
 
-    vertices: LightVertices
+    vertices: KeptVertices
     seen: mi.UInt32  # number each was drawn from
     paths: mi.UInt32  # [1]: how many there are for each image
     image: mi.UInt32  # image of the launch that a lane belongs to
@@ -237,10 +238,9 @@ def _connect(
     ctx = mi.BSDFContext()
     drawn_from = dr.gather(mi.UInt32, connectable.seen, path, own.active)
     active = own.active & (drawn_from > 0)
-    vertex = dr.gather(LightVertices, connectable.vertices, path, active)
+    vertex = connectable.vertices.read(path, active)
     active &= own.depth + vertex.depth + 1 <= options.max_depth
-    other = _surface(vertex, active)
-    si = own.si
+    si, other = own.si, vertex.si
 
     offset = other.p - si.p
     r2 = dr.squared_norm(offset)
@@ -248,7 +248,6 @@ def _connect(
     d = offset * dr.rsqrt(r2)
     wo, wo_other = si.to_local(d), other.to_local(-d)
     cos_own, cos_other = dr.abs(dr.dot(si.n, d)), dr.abs(dr.dot(other.n, d))
-    cos_in = dr.abs(dr.dot(other.n, vertex.direction))
 
     # The eye vertex forward and backward; the light vertex with its directions exchanged, and forward
     f, p = own.bsdf.eval_pdf(ctx, si, wo, active)
@@ -263,17 +262,7 @@ def _connect(
     light_sum = p * cos_other * (count_other * vertex.dvcm + p_reverse_other * vertex.dvc)
     eye_sum = p_other * cos_own * (own.count * own.dvcm + p_reverse * own.dvc)
     w = weights.connection_over_r2(options.count, r2, light_sum, eye_sum)
-    value = own.throughput * f * vertex.throughput * f_other * (cos_other / cos_in * w * mi.Float(drawn_from))
+    value = own.throughput * f * vertex.throughput_over_cos * f_other * (cos_other * w * mi.Float(drawn_from))
     active &= dr.max(value) > 0
     active &= ~scene.ray_test(si.spawn_ray_to(other.p), active)
     return dr.select(active, value, 0)
-
-
-def _surface(vertex: LightVertices, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """The surface at a kept vertex, found again from its intersection record."""
-    pi = dr.zeros(mi.PreliminaryIntersection3f)
-    pi.t, pi.prim_uv, pi.prim_index = vertex.t, vertex.prim_uv, vertex.prim_index
-    pi.shape = dr.reinterpret_array(mi.ShapePtr, vertex.shape)
-    pi.instance = dr.reinterpret_array(mi.ShapePtr, vertex.instance)
-    pi.valid = mi.Bool(True)
-    return pi.compute_surface_interaction(mi.Ray3f(vertex.origin, vertex.direction), mi.RayFlags.All, active)

@@ -24,8 +24,10 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
+from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, empty_record
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.records import Record
 
 _MAX_THROUGHPUT_KEPT = 0.95
 
@@ -49,23 +51,6 @@ class PathOptions:
 
 
 @dataclass(slots=True)
-class LightVertices:
-    """One kept vertex for each of N light paths; its surface is computed again from the intersection record."""
-
-    origin: mi.Point3f  # the ray that reached it
-    direction: mi.Vector3f
-    t: mi.Float
-    prim_uv: mi.Point2f
-    prim_index: mi.UInt32
-    shape: mi.UInt32  # registry id
-    instance: mi.UInt32
-    throughput: mi.Spectrum
-    dvcm: mi.Float
-    dvc: mi.Float
-    depth: mi.UInt32  # edges from the light
-
-
-@dataclass(slots=True)
 class LightState:
     """Loop variables of a light path."""
 
@@ -78,17 +63,7 @@ class LightState:
     dvc: mi.Float
     depth: mi.UInt32  # edges up to this vertex
     seen: mi.UInt32  # vertices a connection could reach so far
-
-
-def empty_vertices(n: int) -> LightVertices:
-    """Memory for one vertex of each of n light paths."""
-    return LightVertices(
-        *(
-            dr.empty(kind, n)
-            for kind in (mi.Point3f, mi.Vector3f, mi.Float, mi.Point2f, mi.UInt32, mi.UInt32, mi.UInt32)
-        ),
-        *(dr.empty(kind, n) for kind in (mi.Spectrum, mi.Float, mi.Float, mi.UInt32)),
-    )
+    kept: Record  # of one of them, chosen uniformly; empty without connections
 
 
 def trace_light_paths(
@@ -101,7 +76,7 @@ def trace_light_paths(
     path: mi.UInt32,
     paths: mi.UInt32,
     splat: Splat,
-) -> tuple[LightVertices | None, mi.UInt32]:
+) -> tuple[KeptVertices | None, mi.UInt32]:
     """Trace a light path for each of n points of ``rng``, and add what the lens sees of them by ``splat``.
 
     ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch. Returns the kept vertices, or
@@ -109,29 +84,30 @@ def trace_light_paths(
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
-    vertices = empty_vertices(n) if options.connects else None
     (state,) = traced_once(
-        state=(first_state(scene, lights, start, rng),),
+        state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
         cond=lambda s: s.active,
-        body=partial(
-            vertex_bounce, scene=scene, sensor=sensor, options=options, start=start, splat=splat, vertices=vertices
-        ),
+        body=partial(vertex_bounce, scene=scene, sensor=sensor, options=options, start=start, splat=splat),
         labels=("light path",),
         label="bdpt light paths",
     )
-    if vertices is None:
+    if not options.connects:
         return None, state.seen
+    vertices = KeptVertices.empty(n)
+    vertices.write(dr.arange(mi.UInt32, n), state.kept, state.seen > 0)
     dr.eval(state.seen, vertices)
     return vertices, state.seen
 
 
-def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler) -> LightState:
+def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, kept: Record = ()) -> LightState:
     """The loop variables at the first hit; active are the light paths that hit a surface."""
     active = mi.Bool(start.valid)
     hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
-    return LightState(active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0))
+    return LightState(
+        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0), kept
+    )
 
 
 def vertex_bounce(
@@ -142,7 +118,6 @@ def vertex_bounce(
     options: PathOptions,
     start: Emission,
     splat: Splat,
-    vertices: LightVertices | None,
 ) -> tuple[LightState]:
     """Handle one vertex of a light path: join it to the lens, perhaps keep it, and scatter."""
     ctx = mi.BSDFContext()
@@ -176,16 +151,18 @@ def vertex_bounce(
     # ----------------------------- Keep for connections -----------------------------
 
     count_seen = mi.UInt32(s.seen)
-    if vertices is not None:
+    kept = s.kept
+    if options.connects:
         reachable = active & smooth & (depth + 1 < options.max_depth)
         count_seen[reachable] += 1
         keep = reachable & (s.rng.next_independent() * mi.Float(count_seen) < 1)
-        dr.scatter(vertices, _record(s, dvcm, dvc), dr.arange(mi.UInt32, dr.width(start.valid)), keep)
+        vertex = KeptVertex(si, s.throughput / cos_in, dvcm, dvc, depth).record()
+        kept = tuple(dr.select(keep, new, old) for new, old in zip(vertex, s.kept, strict=True))
 
     # ----------------------------------- Scatter -----------------------------------
 
     goes_on = active & (depth + 1 < options.max_depth)
-    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=count_seen)
+    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=count_seen, kept=kept)
     scatter(state, si, bsdf, cos_in, count)
     roulette(state, start, options)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
@@ -273,20 +250,3 @@ def start_weights(
     dvcm = dr.select(start.at_infinity, weights.light_start(selection / r2, start.factor), dvcm)
     dvc = dr.select(start.at_infinity, dr.rcp(start.factor * start.p_direction), dvc)
     return dvcm, dr.select(start.delta, 0, dvc)
-
-
-def _record(s: LightState, dvcm: mi.Float, dvc: mi.Float) -> LightVertices:
-    """The record of a light path's vertex, to be kept."""
-    return LightVertices(
-        s.ray.o,
-        s.ray.d,
-        s.hit.t,
-        s.hit.prim_uv,
-        s.hit.prim_index,
-        dr.reinterpret_array(mi.UInt32, s.hit.shape),
-        dr.reinterpret_array(mi.UInt32, s.hit.instance),
-        s.throughput,
-        dvcm,
-        dvc,
-        s.depth,
-    )

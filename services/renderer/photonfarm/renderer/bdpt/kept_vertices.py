@@ -1,0 +1,78 @@
+"""The kept vertices of light paths: one record of 32 numbers for each path, next to each other in memory.
+
+A connection reads all of a vertex, so one record is a few cache lines where columns would be a line for each number.
+The surface is kept as it was found. To find it again would take longer than to read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from photonfarm.renderer.bdpt.records import Record, as_float, as_uint, read, write
+
+_QUADS = 8  # vectors of 4 numbers in a record; Dr.Jit reads and writes one at once
+
+
+@dataclass(slots=True)
+class KeptVertex:
+    """A vertex of a light path as connections see it."""
+
+    si: mi.SurfaceInteraction3f  # what materials read: p, n, sh_frame, wi, uv, dp_du, dp_dv, shape and prim_index
+    throughput_over_cos: mi.Spectrum  # over |cos| of the direction of arrival with the geometric normal
+    dvcm: mi.Float  # on arrival: see weights.py
+    dvc: mi.Float
+    depth: mi.UInt32  # edges from the light
+
+    def record(self) -> Record:
+        """Everything in it, as it lies in memory."""
+        si = self.si
+        quads = (
+            (*si.p, as_float(self.depth)),
+            (*si.n, as_float(dr.reinterpret_array(mi.UInt32, si.shape))),
+            (*si.sh_frame.n, as_float(si.prim_index)),
+            (*si.sh_frame.s, self.dvcm),
+            (*si.wi, self.dvc),
+            (*self.throughput_over_cos, si.uv.x),
+            (*si.dp_du, si.uv.y),
+            (*si.dp_dv, mi.Float(0)),
+        )
+        return tuple(mi.Vector4f(*quad) for quad in quads)
+
+
+@dataclass(slots=True)
+class KeptVertices:
+    """Records of the kept vertices of N light paths."""
+
+    numbers: mi.Float  # [N · 32]
+
+    @classmethod
+    def empty(cls, n: int) -> KeptVertices:
+        """Memory for n records."""
+        return cls(dr.empty(mi.Float, n * 4 * _QUADS))
+
+    def write(self, path: mi.UInt32, record: Record, active: mi.Bool) -> None:
+        """Write the record of light path ``path``."""
+        write(self.numbers, path, record, active)
+
+    def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
+        """The kept vertex of light path ``path``, which must have one."""
+        record = read(self.numbers, path, _QUADS, active)
+        p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = record
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
+        si.t = mi.Float(0)  # finite: a surface was hit
+        si.p, si.n, si.wi = p.xyz, mi.Normal3f(n.xyz), wi.xyz
+        s, normal = frame_s.xyz, frame_n.xyz
+        si.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
+        si.dp_du, si.dp_dv = dp_du.xyz, dp_dv.xyz
+        si.uv = mi.Point2f(throughput.w, dp_du.w)
+        si.prim_index = as_uint(frame_n.w)
+        si.shape = dr.reinterpret_array(mi.ShapePtr, as_uint(n.w))
+        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, as_uint(p.w))
+
+
+def empty_record() -> Record:
+    """A record of zeros."""
+    return tuple(mi.Vector4f(0) for _ in range(_QUADS))

@@ -75,7 +75,7 @@ print(os.environ["CUDA_VISIBLE_DEVICES"], os.environ["CUDA_DEVICE_ORDER"])
     libraries = {"DRJIT_LIBCUDA_PATH": driver, "DRJIT_LIBOPTIX_PATH": driver, "DRJIT_LIBLLVM_PATH": "/nowhere"}
     done = run(code, PHOTONFARM_DEVICE="cuda:1", CUDA_VISIBLE_DEVICES="4,6", **libraries)
     chosen, refused, shown = done.stdout.splitlines()
-    assert (chosen, shown) == ("cuda_ad_rgb Test Card B 1 16777216", "6 PCI_BUS_ID")
+    assert (chosen, shown) == ("cuda_ad_rgb Test Card B 1 11184810", "6 PCI_BUS_ID")
     assert "'cuda_ad_rgb' cannot be used here" in refused
 
 

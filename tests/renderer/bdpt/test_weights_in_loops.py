@@ -76,7 +76,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
         return over_r2(count, r2, *sums)
 
     def keep_path(scene: Any, options: Any, connectable: Any, own: Any, path: Any) -> Any:
-        found.connected.append((path, dr.gather(mi.UInt32, connectable.vertices.depth, path, own.active)))
+        found.connected.append((path, connectable.vertices.read(path, own.active).depth))
         value = connect(scene, options, connectable, own, path)
         dr.eval(value, found.connected, found.r2, found.weights)
         return value

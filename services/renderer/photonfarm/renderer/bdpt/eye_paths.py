@@ -47,7 +47,6 @@ class Connectable:
     """Light vertices, and the choice of those that this pass's eye paths are joined to."""
 
     vertices: KeptVertices
-    seen: mi.UInt32  # number each was drawn from
     paths: mi.UInt32  # [1]: how many there are for each image
     image: mi.UInt32  # image of the launch that a lane belongs to
     first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
@@ -69,6 +68,7 @@ def trace_eye_paths(
     # Neighbouring lanes are neighbouring pixels, so that Embree may trace them as a bundle
     arrival = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
     reached = arrival.is_valid()
+    active &= _matters(scene, arrival)
     state = EyeState(
         active=active,
         rng=rng,
@@ -161,7 +161,13 @@ def _bounce(
     _scatter(state, ctx, si, bsdf, bs, bs_weight, count)
     _roulette(state, options)
     state.arrival = scene.ray_intersect_preliminary(state.ray, active=state.active)
+    state.active &= _matters(scene, state.arrival)
     return (state,)
+
+
+def _matters(scene: mi.Scene, arrival: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Whether a ray is to be followed to its end: where nothing shines around the scene, only if it hits a surface."""
+    return mi.Bool(True) if scene.environment() is not None else arrival.is_valid()
 
 
 def _scatter(
@@ -236,9 +242,8 @@ def _connect(
 ) -> mi.Spectrum:
     """One connection (Georgiev 2012, §4.3): both vertices' BSDFs, G without its cosines, visibility and weight."""
     ctx = mi.BSDFContext()
-    drawn_from = dr.gather(mi.UInt32, connectable.seen, path, own.active)
-    active = own.active & (drawn_from > 0)
-    vertex = connectable.vertices.read(path, active)
+    vertex = connectable.vertices.read(path, own.active)
+    active = own.active & (vertex.depth > 0)
     active &= own.depth + vertex.depth + 1 <= options.max_depth
     si, other = own.si, vertex.si
 
@@ -262,7 +267,7 @@ def _connect(
     light_sum = p * cos_other * (count_other * vertex.dvcm + p_reverse_other * vertex.dvc)
     eye_sum = p_other * cos_own * (own.count * own.dvcm + p_reverse * own.dvc)
     w = weights.connection_over_r2(options.count, r2, light_sum, eye_sum)
-    value = own.throughput * f * vertex.throughput_over_cos * f_other * (cos_other * w * mi.Float(drawn_from))
+    value = own.throughput * f * vertex.throughput_over_cos * f_other * (cos_other * w)
     active &= dr.max(value) > 0
     active &= ~scene.ray_test(si.spawn_ray_to(other.p), active)
     return dr.select(active, value, 0)

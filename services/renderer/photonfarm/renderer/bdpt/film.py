@@ -9,10 +9,35 @@ import mitsuba as mi
 
 
 @dataclass(slots=True)
+class Sums:
+    """Sums over the pixels of a stack of images, as (R, G, B, share of primary rays that hit a surface).
+
+    The four lie together, as Dr.Jit adds four neighbours at once in a quarter of the time that it takes one by one.
+    """
+
+    numbers: mi.Float  # [K·H·W·4]
+
+    @classmethod
+    def zero(cls, pixels: int) -> Sums:
+        """Sums of nothing, for ``pixels`` pixels in all."""
+        return cls(dr.zeros(mi.Float, 4 * pixels))
+
+    def add(self, pixel: mi.UInt32, value: mi.Spectrum, hit: mi.Float | float, active: mi.Bool | bool = True) -> None:
+        """Add to the pixels of these numbers in the stack."""
+        dr.scatter_add(self.numbers, mi.Vector4f(*value, hit), pixel, active)
+
+    def images(self) -> ImageStack:
+        """The sums as images."""
+        pixel = dr.arange(mi.UInt32, dr.width(self.numbers) // 4)
+        total = dr.gather(mi.Vector4f, self.numbers, pixel)
+        return ImageStack(mi.Spectrum(total.xyz), total.w)
+
+
+@dataclass(slots=True)
 class Splat:
     """A stack of images, to which what light paths send to the lens is added."""
 
-    image: mi.Spectrum  # [K·H·W]: sums, image after image
+    sums: Sums
     scale: mi.Float  # [1]: eye paths per light path over samples per pixel
     offset: mi.UInt32  # first pixel of the image that a lane's light path belongs to
     width: int  # of the crop window, pixels
@@ -22,7 +47,7 @@ class Splat:
         """Add ``value`` at ``position``, in pixels of the crop window; what falls outside is lost."""
         inside = active & dr.all((position >= 0) & (position < mi.ScalarVector2f(self.width, self.height)))
         pixel = mi.UInt32(position.y) * self.width + mi.UInt32(position.x)
-        dr.scatter_add(self.image, value * self.scale, self.offset + pixel, inside)
+        self.sums.add(self.offset + pixel, value * self.scale, 0, inside)
 
 
 @dataclass(slots=True)

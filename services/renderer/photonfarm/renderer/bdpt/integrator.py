@@ -11,7 +11,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
-from photonfarm.renderer.bdpt.film import ImageStack, Splat
+from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
@@ -174,15 +174,15 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
     """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch."""
-    splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
-    vertices = seen = None
+    splats, sums = (Sums.zero(lanes.images * lanes.pixels) for _ in range(2))
+    vertices = None
     if lights is not None and options.traces_light:
         image, path = lanes.light()
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
         lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
-        vertices, seen = trace_light_paths(
+        vertices = trace_light_paths(
             scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
         )
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
@@ -195,15 +195,13 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
     connectable = None
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
-        connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
+        connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
-    images = ImageStack.black(lanes.images * lanes.pixels)
-    place = image * lanes.pixels + pixel
-    dr.scatter_add(images.radiance, radiance * lanes.eye_scale, place)
-    dr.scatter_add(images.hit, lanes.eye_scale, place, hit)
-    dr.eval(images, splats)
-    images.radiance += splats
+    sums.add(image * lanes.pixels + pixel, radiance * lanes.eye_scale, dr.select(hit, lanes.eye_scale, 0))
+    dr.eval(sums, splats)
+    images = sums.images()
+    images.radiance += splats.images().radiance
     dr.eval(images)
     return images
 

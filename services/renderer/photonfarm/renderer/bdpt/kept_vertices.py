@@ -14,6 +14,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt.records import Record, as_float, as_uint, read, write
 
 _QUADS = 8  # vectors of 4 numbers in a record; Dr.Jit reads and writes one at once
+_POWER = 5  # the one that begins with the throughput
 
 
 @dataclass(slots=True)
@@ -49,16 +50,17 @@ class KeptVertices:
     numbers: mi.Float  # [N · 32]
 
     @classmethod
-    def empty(cls, n: int) -> KeptVertices:
-        """Memory for n records."""
-        return cls(dr.empty(mi.Float, n * 4 * _QUADS))
-
-    def write(self, path: mi.UInt32, record: Record, active: mi.Bool) -> None:
-        """Write the record of light path ``path``."""
-        write(self.numbers, path, record, active)
+    def of(cls, record: Record, drawn_from: mi.UInt32) -> KeptVertices:
+        """The kept vertices of all lanes' paths, each drawn from as many vertices of its path; 0: it has none."""
+        n = dr.width(drawn_from)
+        numbers = dr.empty(mi.Float, n * 4 * _QUADS)
+        power = record[_POWER]
+        scaled = mi.Vector4f(*(power[k] * mi.Float(drawn_from) for k in range(3)), power.w)
+        write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
+        return cls(numbers)
 
     def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
-        """The kept vertex of light path ``path``, which must have one."""
+        """The kept vertex of light path ``path``; its depth is 0 if there is none."""
         record = read(self.numbers, path, _QUADS, active)
         p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = record
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))

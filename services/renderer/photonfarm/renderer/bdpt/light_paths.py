@@ -76,13 +76,12 @@ def trace_light_paths(
     path: mi.UInt32,
     paths: mi.UInt32,
     splat: Splat,
-) -> tuple[KeptVertices | None, mi.UInt32]:
+) -> KeptVertices | None:
     """Trace a light path for each of n points of ``rng``, and add what the lens sees of them by ``splat``.
 
     ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch. Returns the kept vertices, or
-    None without connections, and the number of vertices that each was drawn from, [n].
+    None without connections.
     """
-    n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
     (state,) = traced_once(
         state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
@@ -92,17 +91,18 @@ def trace_light_paths(
         label="bdpt light paths",
     )
     if not options.connects:
-        return None, state.seen
-    vertices = KeptVertices.empty(n)
-    vertices.write(dr.arange(mi.UInt32, n), state.kept, state.seen > 0)
-    dr.eval(state.seen, vertices)
-    return vertices, state.seen
+        dr.eval(state.seen)
+        return None
+    vertices = KeptVertices.of(state.kept, state.seen)
+    dr.eval(vertices)
+    return vertices
 
 
 def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, kept: Record = ()) -> LightState:
     """The loop variables at the first hit; active are the light paths that hit a surface."""
     active = mi.Bool(start.valid)
-    hit = scene.ray_intersect_preliminary(start.ray, coherent=True, active=active)
+    # Rays of one light set out in like directions. Those of several cross, and as a bundle they would take longer
+    hit = scene.ray_intersect_preliminary(start.ray, coherent=lights.count == 1, active=active)
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(

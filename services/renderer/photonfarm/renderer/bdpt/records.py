@@ -1,6 +1,7 @@
 """Records in memory: vectors of four numbers, next to each other.
 
-What a path needs at once lies together, so it takes a few cache lines, where columns would take one for each number.
+What is needed at once lies together, so it takes a few cache lines, where columns would take one for each number; and
+Dr.Jit reads, writes and adds four neighbours at once.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ Record: TypeAlias = "tuple[mi.Vector4f, ...]"
 """What is read and written at once."""
 
 
-def write(memory: mi.Float, place: mi.UInt32, record: Record, active: mi.Bool) -> None:
+def write(memory: mi.Float, place: mi.UInt32, record: Record) -> None:
     """Write a record at ``place``, where no other lane writes."""
     for k, quad in enumerate(record):
-        dr.scatter(memory, quad, place * len(record) + k, active, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(memory, quad, place * len(record) + k, mode=dr.ReduceMode.NoConflicts)
 
 
 def read(memory: mi.Float, place: mi.UInt32, quads: int, active: mi.Bool) -> Record:

@@ -33,8 +33,8 @@ CARD_VARIANT = "cuda_ad_rgb"
 LLVM_VERSIONS = ("19", "22")
 """The versions tested with Mitsuba's kernels, in order of preference."""
 
-PATH_BYTES = 128
-"""Memory for each path of a launch: the kept vertex of a light path, 76 bytes, and what kernels hand on to others."""
+PATH_BYTES = 192
+"""Memory for each path of a launch: the kept vertex of a light path, 128 bytes, and what kernels hand on to others."""
 
 MEMORY_SHARE = 4
 """One over the share of a card's memory that paths may take."""

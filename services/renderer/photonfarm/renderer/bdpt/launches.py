@@ -17,6 +17,9 @@ Images follow from it, as eye paths are joined to light paths of their own launc
 the same mean. The number of images in a launch changes no image.
 """
 
+SQUARE = 4
+"""The edge of the squares of pixels whose eye paths a packet of 16 lanes traces."""
+
 
 @dataclass(frozen=True, slots=True)
 class Launch:
@@ -70,8 +73,9 @@ def _light_paths(eye_paths: int, light_ratio: float) -> int:
 class Lanes:
     """A launch as its kernels see it: the numbers that shape them as integers, those that may differ as data.
 
-    Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, and the
-    samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
+    Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, squares of
+    4 × 4 together where the window consists of such squares. Rays of a packet then meet the same surfaces more often.
+    The samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
     """
 
     images: int
@@ -127,7 +131,16 @@ class Lanes:
         pixels, samples, _ = self.counts
         layer = lane // pixels
         image = layer // samples if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
-        return image, layer - image * samples, lane - layer * pixels
+        return image, layer - image * samples, self._in_squares(lane - layer * pixels)
+
+    def _in_squares(self, place: mi.UInt32) -> mi.UInt32:
+        """The pixel at a place of the order."""
+        if self.width % SQUARE or self.height % SQUARE:
+            return place
+        strip = place // (SQUARE * self.width)
+        along = place - strip * (SQUARE * self.width)
+        square, inside = along // SQUARE**2, along % SQUARE**2
+        return (strip * SQUARE + inside // SQUARE) * self.width + square * SQUARE + inside % SQUARE
 
     def light(self) -> tuple[mi.UInt32, mi.UInt32]:
         """(image, number within the image) of each light path's lane."""

@@ -32,6 +32,14 @@ def test_means_are_equal_for_all_parameters(
     assert_equal_means(renders(scene, integrator, 256, SEEDS), references[name])
 
 
+@pytest.mark.parametrize("name", ["cornell", "rotated_envmap"])
+def test_several_samples_of_the_lights_leave_the_mean(name: str, renders: Any, assert_equal_means: Any) -> None:
+    """Direct light on rough and on smooth surfaces, from lights that paths also hit by themselves."""
+    scene = mi.load_dict(HARD_SCENES[name](SIZE), optimize=False)
+    images = renders(scene, {"type": "bdpt", "max_depth": 3, "light_samples": 3}, 256, SEEDS)
+    assert_equal_means(images, renders(scene, {"type": "path", "max_depth": 3}, 512, REFERENCE_SEEDS))
+
+
 def test_an_image_is_linear_in_radiance(renders: Any) -> None:
     scene = mi.load_dict(HARD_SCENES["cove"](SIZE), optimize=False)
     parameters = mi.traverse(scene)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
-from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
+from photonfarm.renderer.bdpt.emission import DirectSample, Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
@@ -114,6 +114,8 @@ def _bounce(
     if lights is not None:
         emitter = si.emitter(scene, s.active)
         p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.before, s.active & ~first)
+        if options.light_samples > 1:
+            p_direct *= dr.select(depth == 2, mi.Float(options.light_samples), 1)
         arrived_dvc = dr.select(depth == 2, 0, dr.select(si.is_valid(), dvc, s.dvc))  # no t=1 for direct light
         w = dr.select(first, 1, weights.hit_emitter(p_direct, p_emission, s.dvcm, arrived_dvc))
         emitted = emitter.eval(si, s.active)
@@ -132,20 +134,21 @@ def _bounce(
         wo = mi.Vector3f(0, 0, 1)
     value, p_forward, bs, bs_weight = bsdf.eval_pdf_sample(ctx, si, wo, s.rng.next_1d(), s.rng.next_2d(), active)
     if lights is not None:
-        joined = light.valid & (dr.max(value) > 0)
-        shadow = si.spawn_ray_to(light.p)
-        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), shadow)
-        joined &= ~scene.ray_test(shadow, joined)
+        joined = _lit(scene, si, light, light.valid & (dr.max(value) > 0))
         p_reverse = bsdf.pdf(ctx, *exchanged(si, wo), joined)
+        p_ratio, share = p_forward / light.density, mi.Float(1)
+        if options.light_samples > 1:
+            share = dr.select(first, mi.Float(1 / options.light_samples), 1)
+            radiance += _more_direct_light(scene, lights, options, s, si, bsdf, smooth & first)
         w = weights.next_event(
-            dr.select(light.delta, 0, p_forward / light.density),
+            dr.select(light.delta, 0, p_ratio * share),
             light.ratio_over_cos * dr.abs(dr.dot(si.n, light.d)),
             dr.select(first, 0, count),  # no t=1 for direct light
             p_reverse,
             dvcm,
             dvc,
         )
-        radiance += dr.select(joined, s.throughput * value * light.radiance_over_density * w, 0)
+        radiance += dr.select(joined, s.throughput * value * light.radiance_over_density * (w * share), 0)
 
     # -------------------------- Connect to light paths (s, t ≥ 2) --------------------------
 
@@ -168,6 +171,29 @@ def _bounce(
 def _matters(scene: mi.Scene, arrival: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Whether a ray is to be followed to its end: where nothing shines around the scene, only if it hits a surface."""
     return mi.Bool(True) if scene.environment() is not None else arrival.is_valid()
+
+
+def _lit(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: DirectSample, active: mi.Bool) -> mi.Bool:
+    """Whether nothing is between a surface point and the sampled point of a light."""
+    shadow = si.spawn_ray_to(light.p)
+    shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), shadow)
+    return active & ~scene.ray_test(shadow, active)
+
+
+def _more_direct_light(
+    scene: mi.Scene, lights: Lights, options: PathOptions, s: EyeState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr,
+    active: mi.Bool,
+) -> mi.Spectrum:  # fmt: skip
+    """Radiance at the first vertex from all samples of the lights but one; a light can only be hit instead (s=0)."""
+    n = options.light_samples
+    total = mi.Spectrum(0)
+    for _ in range(n - 1):
+        light = sample_direct(lights, si, s.rng, active)
+        value, p_forward = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+        joined = _lit(scene, si, light, light.valid & (dr.max(value) > 0))
+        w = weights.next_event(dr.select(light.delta, 0, p_forward / (n * light.density)), 0, 0, 0, 0, 0)
+        total += dr.select(joined, s.throughput * value * light.radiance_over_density * (w / n), 0)
+    return total
 
 
 def _scatter(

@@ -29,6 +29,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
       to half as many. Needs ``light_ratio`` > 0.
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
+    - ``light_samples`` (int ≥ 1, default 1): samples of the lights by next event estimation at the first eye vertex,
+      where most noise of direct light comes from; later vertices take one.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -44,6 +46,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.rr_depth = int(props.get("rr_depth", 5))
         self.connections = int(props.get("connections", 1))
         self.light_ratio = float(props.get("light_ratio", 1.0))
+        self.light_samples = int(props.get("light_samples", 1))
         self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
         self._check_parameters()
         self._recorder = Recorder(trace) if props.get("record", False) else None
@@ -57,6 +60,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             raise ValueError(
                 f"bdpt: light_ratio is {self.light_ratio}; allowed are light paths per eye path from 0 to 64"
             )
+        if self.light_samples < 1:
+            raise ValueError(f"bdpt: light_samples is {self.light_samples}; allowed are whole numbers from 1")
         if self.connections and not self.light_ratio:
             raise ValueError(
                 f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
@@ -169,6 +174,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             light_ratio=dr.opaque(mi.Float, launch.light_paths / (pixels * launch.samples)),
             connects=connects,
             traces_light=launch.light_paths > 0,
+            light_samples=self.light_samples,
         )
 
 

@@ -43,11 +43,12 @@ class PathOptions:
     light_ratio: mi.Float  # n_T, light paths per eye path
     connects: bool  # whether any connection is made
     traces_light: bool  # whether any light path is joined to the lens
+    light_samples: int = 1  # samples of the lights at the first eye vertex
 
     @property
     def kind(self) -> tuple[int, ...]:
         """The numbers for which the kernels are compiled."""
-        return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light
+        return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light, self.light_samples
 
 
 @dataclass(slots=True)

@@ -178,26 +178,29 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
     assert "stopping; a job in hand" in (folder / f"slurm/worker-{preempted}.log").read_text()
 
 
-def test_a_task_that_its_time_limit_ends_goes_on_in_its_next_turn(
+def test_tasks_that_their_time_limit_ends_go_on_in_their_next_turn(
     photonfarm_in: Any, folder: Path, launch: Launch, cluster: Cluster
 ) -> None:
+    """Two tasks, as one of an array has the array's own job id."""
     say("--- time limit of 3 minutes")
-    started = launch("--modifications", "10000", "--views", "1", "--shard-rows", "6", "--workers", "1", "--time", "3")
-    task, log = f"{started['workers']}_0", folder / "slurm" / f"worker-{started['workers']}_0.log"
-    wait_for(lambda: log.exists() and "the task is back in the queue" in log.read_text(), 240)
+    started = launch("--modifications", "10000", "--views", "1", "--shard-rows", "6", "--workers", "2", "--time", "3")
+    array, back = started["workers"], "the task is back in the queue"
+    tasks = [f"{array}_{number}" for number in range(2)]
+    files = [folder / "slurm" / f"worker-{task}.log" for task in tasks]
+    wait_for(lambda: all(log.exists() and back in log.read_text() for log in files), 240)
     markers = Markers(scene_of(folder))
     first = markers.look()
-    say(f"told near its limit, with {first} jobs committed; now {cluster.states(started['workers'])}")
+    say(f"told near their limit, with {first} jobs committed; now {cluster.states(array)}")
     assert first > 0
-    wait_for(lambda: cluster.states(started["workers"]).get(task) == "R", 240)
+    wait_for(lambda: cluster.states(array) == dict.fromkeys(tasks, "R"), 240)
     wait_for(lambda: markers.look() > first, 120)
-    assert int(cluster.about(task)["Restarts"]) == 1
-    say(f"goes on: {markers.look()} jobs committed")
+    assert [int(cluster.about(task)["Restarts"]) for task in tasks] == [1, 1]
+    say(f"go on: {markers.look()} jobs committed")
 
-    cluster.run("scancel", task)
-    wait_for(lambda: not cluster.states(started["workers"]), 60)
-    say("cancelled by its user, and not put back")
-    assert log.read_text().count("the task is back in the queue") == 1
+    cluster.run("scancel", array)
+    wait_for(lambda: not cluster.states(array), 60)
+    say("cancelled by their user, and not put back")
+    assert [log.read_text().count(back) for log in files] == [1, 1]
     assert not list((folder / "store").glob("failures/*"))
 
 

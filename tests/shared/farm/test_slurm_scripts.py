@@ -114,6 +114,37 @@ def test_a_script_ends_with_the_exit_code_of_its_worker(slurm: Launcher, tmp_pat
     assert "there is no store" in done.stderr
 
 
+@pytest.mark.parametrize("is_array", [True, False], ids=["array", "trainer"])
+def test_near_its_limit_a_task_asks_for_itself_alone_and_puts_itself_alone_back(
+    slurm: Launcher, tmp_path: Path, is_array: bool
+) -> None:
+    """One task of an array has the array's id as its job id, which means all tasks to SLURM's commands.
+
+    SLURM's two commands are stood in for, as bash functions that say what they were asked; test_slurm.py has the real
+    ones.
+    """
+    workers, trainer = slurm("cornell", "--train", "--dry-run").stdout.split("#!/usr/bin/env bash\n")[1:]
+    script, replaced = re.subn(
+        r"(?m)^.*photonfarm.* &$", "(trap 'exit 0' TERM; while :; do sleep 0.05; done) &",
+        workers if is_array else trainer,
+    )  # fmt: skip
+    assert replaced == 1
+    asked = f"""
+squeue() {{ echo "squeue $*" >> {tmp_path}/asked; echo RUNNING; }}
+scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
+(sleep 0.3; kill -TERM $$) &
+"""
+    here = os.environ | {"SLURM_JOB_ID": "7"}
+    here |= {"SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"} if is_array else {}
+    done = subprocess.run(["bash", "-c", asked + script], env=here, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "the task is back in the queue" in done.stderr
+    task = "7_3" if is_array else "7"
+    assert (tmp_path / "asked").read_text().splitlines() == [
+        f"squeue --noheader --jobs {task} --format %T", f"scontrol requeue {task}",
+    ]  # fmt: skip
+
+
 def test_the_launcher_needs_neither_mitsuba_nor_torch(tmp_path: Path) -> None:
     code = """
 import sys

@@ -127,11 +127,15 @@ _TEMPLATE = """\
 
 {variables}
 
+# One task of an array has the array's own SLURM_JOB_ID, by which SLURM means all of its tasks.
+task=${{SLURM_ARRAY_JOB_ID:+${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID}}
+task=${{task:-$SLURM_JOB_ID}}
+
 # Near the time limit SLURM tells this script alone. A cancelled or preempted job is told as a whole: then the process
 # below has its TERM already, and a second one would end it at once.
 near_limit=
 on_term() {{
-    case $(squeue --noheader --jobs "$SLURM_JOB_ID" --format %T 2>/dev/null) in
+    case $(squeue --noheader --jobs "$task" --format %T 2>/dev/null) in
         RUNNING | SIGNALING) near_limit=yes; kill -TERM "$process" ;;
         '') kill -TERM "$process" ;; # SLURM does not answer
     esac
@@ -146,7 +150,7 @@ wait "$process"
 code=$?
 
 if [[ $near_limit ]]; then
-    if ((${{SLURM_RESTART_COUNT:-0}} < {requeues})) && scontrol requeue "$SLURM_JOB_ID"; then
+    if ((${{SLURM_RESTART_COUNT:-0}} < {requeues})) && scontrol requeue "$task"; then
         echo "photonfarm: the time limit is near; the task is back in the queue, and goes on from what is stored" >&2
     else
         echo "photonfarm: the time limit is near; the same photonfarm slurm goes on from what is stored" >&2

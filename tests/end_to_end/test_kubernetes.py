@@ -34,6 +34,7 @@ VALUES: dict[str, dict[str, Any]] = {
     "autoscaling": {"autoscaling": {"enabled": True}, "plans": [{"name": "first", "spec": "room"}]},
     "bucket": {"bucket": BUCKET, "plans": [{"name": "a", "spec": "room"}, {"name": "b", "spec": "cornell"}]},
     "GPUs": {"renderer": {"gpus": 1, **GPU}, "trainer": {"gpus": 4, **GPU, "spec": "room"}, "bucket": BUCKET},
+    "metrics": {"metrics": {"enabled": True, "prometheusNamespace": "watch"}, "bucket": BUCKET},
     "all ours": {
         "data": {"existingClaim": "disk"}, "scenes": {"existingClaim": "scenes"}, "redis": {"existingSecret": "mine"},
         "image": {"registry": "registry.example:5000/team", "pullSecrets": ["pull"]}, "trainer": {"enabled": False},
@@ -51,6 +52,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "/plans/0/args/1": {"plans": [{"name": "first", "spec": "room", "args": ["--modifications", 64]}]},
     "/plans/0/name": {"plans": [{"name": "First", "spec": "room"}]},
     "/image/registry": {"image": {"registry": ""}},
+    "autoscaling.minReplicas = 9": {"autoscaling": {"enabled": True, "minReplicas": 9, "maxReplicas": 8}},
     "/reconcile/enabled": {"autoscaling": {"enabled": True}, "reconcile": {"enabled": False}},
 }
 """Values that should be refused, by what the message names."""

@@ -159,7 +159,11 @@ def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, pa
     assert renderer["resources"]["limits"] == {"memory": "9Gi", "nvidia.com/gpu": 1}
     variables = {variable["name"]: variable["value"] for variable in renderer["env"]}
     assert variables["PHOTONFARM_DEVICE"] == "cuda"
-    assert "graphics" in variables["NVIDIA_DRIVER_CAPABILITIES"]
+    with_card = yaml.safe_load((ROOT / "docker-compose.gpu.yml").read_text())["services"]["renderer"]["environment"]
+    assert with_card.keys() <= variables.keys()
+    may = [sorted(given["NVIDIA_DRIVER_CAPABILITIES"].split(",")) for given in (with_card, variables)]
+    assert may[0] == may[1]
+    assert with_card["OPTIX_CACHE_PATH"] == variables["OPTIX_CACHE_PATH"]
     ((_, job),) = [item for item in found.items() if item[0][0] == "Job"]
     spec = job["spec"]["template"]["spec"]
     assert spec["runtimeClassName"] == "nvidia"

@@ -135,7 +135,8 @@ scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
 (sleep 0.3; kill -TERM $$) &
 """
     here = os.environ | {"SLURM_JOB_ID": "7"}
-    here |= {"SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"} if is_array else {}
+    array = "7" if is_array else "5"  # of a task that submitted it, which a trainer may have in its environment
+    here |= {"SLURM_ARRAY_JOB_ID": array, "SLURM_ARRAY_TASK_ID": "3"}
     done = subprocess.run(["bash", "-c", asked + script], env=here, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "the task is back in the queue" in done.stderr

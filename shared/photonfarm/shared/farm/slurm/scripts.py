@@ -18,6 +18,12 @@ SIGNAL_S = 60
 LEAST_LIMIT_S = 180
 """The shortest time limit: below it, TERM may come before the first job is rendered."""
 
+WORKER_TASK = '"${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"'
+"""A worker's task, for the shell. One of an array's has the array's own SLURM_JOB_ID, by which SLURM means them all."""
+
+TRAINER_TASK = '"$SLURM_JOB_ID"'
+"""The trainer's job, for the shell."""
+
 REQUEUES = 50
 """How often a task that its time limit ends puts itself back: a job longer than the limit would otherwise never end."""
 
@@ -68,13 +74,13 @@ def worker_script(at: Surroundings, resources: Resources, workers: int, specs: S
     verb = f"{shlex.join(command('work'))} --until-complete {name} {which}".rstrip()
     options = (f"--array=0-{workers - 1}", f"--output={_pattern(at.logs)}/worker-%A_%a.log")
     device = [("PHOTONFARM_DEVICE", "cuda")] if resources.gpu else []
-    return _script(at, resources, "photonfarm", options, verb, device)
+    return _script(at, resources, "photonfarm", options, verb, WORKER_TASK, device)
 
 
 def trainer_script(at: Surroundings, resources: Resources, arguments: Sequence[str]) -> str:
     """The script of the trainer, whose verb has these arguments."""
     options = (f"--output={_pattern(at.logs)}/trainer-%j.log",)
-    return _script(at, resources, "photonfarm-train", options, shlex.join(command(*arguments)))
+    return _script(at, resources, "photonfarm-train", options, shlex.join(command(*arguments)), TRAINER_TASK)
 
 
 def _script(
@@ -83,6 +89,7 @@ def _script(
     name: str,
     options: Sequence[str],
     verb: str,
+    task: str,
     further: Sequence[tuple[str, str]] = (),
 ) -> str:
     asked = [
@@ -94,7 +101,7 @@ def _script(
     asked += ["--gres=gpu:1"] if resources.gpu else []
     directives = "\n".join(f"#SBATCH {_directive(option)}" for option in (*asked, *resources.further))
     variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further))
-    return _TEMPLATE.format(directives=directives, variables=variables, verb=verb, requeues=REQUEUES)
+    return _TEMPLATE.format(directives=directives, variables=variables, task=task, verb=verb, requeues=REQUEUES)
 
 
 def _variables(at: Surroundings) -> list[tuple[str, str]]:
@@ -127,9 +134,7 @@ _TEMPLATE = """\
 
 {variables}
 
-# One task of an array has the array's own SLURM_JOB_ID, by which SLURM means all of its tasks.
-task=${{SLURM_ARRAY_JOB_ID:+${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID}}
-task=${{task:-$SLURM_JOB_ID}}
+task={task}
 
 # Near the time limit SLURM tells this script alone. A cancelled or preempted job is told as a whole: then the process
 # below has its TERM already, and a second one would end it at once.

@@ -69,6 +69,21 @@ def test_gpus_are_asked_for_where_they_are_used(slurm: Launcher) -> None:
     assert "PHOTONFARM_DEVICE" not in trainer
 
 
+@pytest.mark.parametrize(("given", "seen"), [(None, ""), ("2,3", "2,3")])
+def test_cards_of_a_node_that_slurm_has_not_given_to_a_task_are_hidden_from_it(
+    slurm: Launcher, given: str | None, seen: str
+) -> None:
+    """Workers take any card that they see, and so does torch."""
+    for script in slurm("cornell", "--train", "--dry-run").stdout.split("#!/usr/bin/env bash\n")[1:]:
+        (line,) = re.findall(r"(?m)^export CUDA_VISIBLE_DEVICES=.*$", script)
+        here = {"PATH": os.environ["PATH"], **({} if given is None else {"CUDA_VISIBLE_DEVICES": given})}
+        command = f'{line}\necho "<$CUDA_VISIBLE_DEVICES>"'
+        said = subprocess.run(["bash", "-c", command], env=here, capture_output=True, text=True, check=True).stdout
+        assert said == f"<{seen}>\n"
+    scripts = slurm("cornell", "--gpus", "--train", "--train-gpus", "--dry-run").stdout
+    assert "CUDA_VISIBLE_DEVICES" not in scripts
+
+
 def test_the_trainer_has_options_of_its_own_which_come_last(slurm: Launcher, tmp_path: Path) -> None:
     asked = ("--train", "--train-steps", "20", "--sbatch=--account=lab", "--train-sbatch=--partition=big one")
     workers, trainer = slurm("cornell", *asked, "--partition", "low", "--dry-run").stdout.split("#!/usr/bin")[1:]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.farm.devices import CUDA, DEVICE_VARIABLE, VISIBLE_VARIABLE
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
 SIGNAL_S = 60
@@ -73,7 +74,7 @@ def worker_script(at: Surroundings, resources: Resources, workers: int, specs: S
         which = f"--scene {scene_id}" if scene_id else ""
     verb = f"{shlex.join(command('work'))} --until-complete {name} {which}".rstrip()
     options = (f"--array=0-{workers - 1}", f"--output={_pattern(at.logs)}/worker-%A_%a.log")
-    device = [("PHOTONFARM_DEVICE", "cuda")] if resources.gpu else []
+    device = [(DEVICE_VARIABLE, CUDA)] if resources.gpu else []
     return _script(at, resources, "photonfarm", options, verb, WORKER_TASK, device)
 
 
@@ -100,7 +101,10 @@ def _script(
     asked += [f"--time={resources.time}"] if resources.time else []
     asked += ["--gres=gpu:1"] if resources.gpu else []
     directives = "\n".join(f"#SBATCH {_directive(option)}" for option in (*asked, *resources.further))
-    variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further))
+    cards = (
+        [] if resources.gpu else [(VISIBLE_VARIABLE, f"${{{VISIBLE_VARIABLE}-}}")]
+    )  # those that SLURM gives, or none
+    variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further, *cards))
     return _TEMPLATE.format(directives=directives, variables=variables, task=task, verb=verb, requeues=REQUEUES)
 
 

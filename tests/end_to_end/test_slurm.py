@@ -29,7 +29,7 @@ pytestmark = [
         os.environ.get("PHOTONFARM_TEST_SLURM") != "1", reason="starts a SLURM; run by: make test-slurm"
     ),
     pytest.mark.skipif(bool(slurm_cluster.lacking()), reason=slurm_cluster.lacking() or "SLURM is installed"),
-    pytest.mark.timeout(1200),
+    pytest.mark.timeout(1500),
 ]
 
 BEGAN = time.monotonic()
@@ -137,7 +137,7 @@ def assert_complete(photonfarm_in: Any, folder: Path, markers: Markers, jobs: in
 def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
     photonfarm_in: Any, folder: Path, launch: Launch, cluster: Cluster, with_redis: bool
 ) -> None:
-    jobs, rows = 2000, 6  # SLURM takes 40 s to give a node up; a quick machine renders 15 jobs a second meanwhile
+    jobs, rows = 1500, 6  # more than four workers commit before SLURM gives up the node, after 40 s
     say(f"--- array of 4, {'with Redis' if with_redis else 'without Redis'}")
     with ExitStack() as stack:
         named = ("--redis", stack.enter_context(EmbeddedRedis(folder / "redis")).url) if with_redis else ()
@@ -167,7 +167,7 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
         say(f"n2 is {cluster.run('sinfo', '--noheader', '--nodes', 'n2', '--format', '%T')}; {lost} requeued; "
             f"{markers.look()} jobs committed")  # fmt: skip
         assert markers.look() < jobs, "the plan was complete before the node was lost"
-        wait_for(lambda: markers.look() == jobs, 600)
+        wait_for(lambda: markers.look() == jobs, 900)
         assert_complete(photonfarm_in, folder, markers, jobs)
         returned.close()
         wait_for(lambda: not cluster.states(array), 400)

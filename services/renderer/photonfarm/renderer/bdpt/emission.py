@@ -25,6 +25,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from photonfarm.renderer.bdpt import guiding
 from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, read_selection
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 
@@ -62,6 +63,9 @@ class Lights:
     cos_cutoff: mi.Float  # [N]: −1 for lights that shine everywhere
     centre: mi.Point3f  # [1]: centre of the scene's sphere
     radius: mi.Float  # [1]: its radius
+    emitters: Any = None
+    split: Any = ()
+    guide: guiding.Guide | None = None
 
     def only(self, kind: int) -> bool:
         """Whether all lights that can be selected are of this kind; the host knows it, so other kinds cost nothing."""
@@ -128,7 +132,7 @@ def read_lights(scene: mi.Scene) -> Lights:
     dr.scatter(emission_by_id, emission, index)
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
-        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
+        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius,
     )
 
 
@@ -283,6 +287,8 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
     shape_factor = dr.select(lights.is_kind(index, INFINITE), ds.pdf, shape_factor)
     shape_factor = dr.select(lights.is_kind(index, POSITION), dr.rcp(dr.square(ds.dist)), shape_factor)
     ratio = lights.emission_factor(emitter) * shape_factor / density
+    if lights.guide is not None:
+        ratio *= guiding.gain_of(lights.guide, lights, emitter, ds.n, -ds.d, si.p, ds.uv, valid)
     return DirectSample(
         d=ds.d,
         p=ds.p,
@@ -308,7 +314,11 @@ def hit_densities(
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
     factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
-    return lights.nee_probability(emitter, vertex) * p_direction, lights.emission_factor(emitter) * factor
+    emission = lights.emission_factor(emitter) * factor
+    if lights.guide is not None:
+        hit = dr.reinterpret_array(mi.UInt32, emitter) != 0
+        emission *= guiding.gain_of(lights.guide, lights, emitter, si.sh_frame.n, -ds.d, vertex, si.uv, active & hit)
+    return lights.nee_probability(emitter, vertex) * p_direction, emission
 
 
 # ------------------------------------------------ Emission (from y₀) ------------------------------------------------
@@ -328,15 +338,30 @@ class Emission:
     at_infinity: mi.Bool  # INFINITE or DIRECTION
     delta: mi.Bool  # POSITION or DIRECTION
     valid: mi.Bool
+    cell: mi.UInt32
 
 
 def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UInt32) -> Emission:
     """Start the light paths of number ``path`` among ``paths`` [1]: neighbours in number set out in like directions."""
     n = dr.width(rng.index)
-    index = _choose_start(lights, rng)
-    emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
-    factor = lights.emission_factor(emitter)
-    u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng)
+    if lights.guide is None:
+        index = _choose_start(lights, rng)
+        emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
+        factor = lights.emission_factor(emitter)
+        cell = mi.UInt32(0)
+        u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng)
+    else:
+        g = lights.guide
+        place = mi.Float64(rng.next_1d()) + mi.Float64(rng.next_independent()) / (1 << 24)
+        place = (mi.Float64(path) + place) / mi.Float64(paths)
+        index, cell, where, u_guided, gain = guiding.choose(g, place)
+        emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
+        factor = lights.emission_factor(emitter) * gain
+        other = rng.next_2d()
+        if g.split > 1:
+            other = dr.select(dr.gather(mi.UInt32, g.splits, index) > 0, (where + other) / g.split, other)
+        far = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
+        u_position, u_direction = dr.select(far, u_guided, other), dr.select(far, other, u_guided)
     out = Emission(
         ray=dr.zeros(mi.Ray3f, n),
         throughput=mi.Spectrum(0),
@@ -348,9 +373,10 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
         at_infinity=lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION),
         delta=lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION),
         valid=factor > 0,
+        cell=cell,
     )
     if lights.has(AREA):
-        _start_on_area(out, u_position, u_direction, out.valid & out.is_area)
+        _start_on_area(out, u_position, u_direction, out.valid & out.is_area, lights.guide is not None)
     if lights.has(INFINITE) or lights.has(DIRECTION):
         _start_at_infinity(out, lights, u_position, u_direction, out.valid & out.at_infinity)
     if lights.has(POSITION):
@@ -360,9 +386,13 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
     return out
 
 
-def _start_on_area(out: Emission, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool) -> None:
+def _start_on_area(
+    out: Emission, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool, guided: bool
+) -> None:
     ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
+    if guided:
+        si.sh_frame = guiding.frame(ps.n)
     si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
     out.throughput[mask] = out.emitter.eval(si, mask)
     out.ray = dr.select(mask, si.spawn_ray(si.to_world(si.wi)), out.ray)
@@ -376,7 +406,8 @@ def _start_at_infinity(
     reference.p = lights.centre
     ds, weight = out.emitter.sample_direction(reference, u_direction, mask)
     disk = mi.warp.square_to_uniform_disk_concentric(u_position)
-    offset = mi.Frame3f(ds.d).to_world(mi.Vector3f(disk.x, disk.y, 1))
+    axes = mi.Frame3f(ds.d) if lights.guide is None else guiding.frame(ds.d)
+    offset = axes.to_world(mi.Vector3f(disk.x, disk.y, 1))
     ray = mi.Ray3f(lights.centre + lights.radius * offset, -ds.d)
     out.throughput[mask] = weight
     out.ray = dr.select(mask, ray, out.ray)

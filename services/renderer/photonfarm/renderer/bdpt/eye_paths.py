@@ -51,6 +51,7 @@ class Connectable:
     image: mi.UInt32  # image of the launch that a lane belongs to
     first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
     shifts: mi.UInt32  # see randomness.shifts
+    tally: object = None
 
 
 def trace_eye_paths(
@@ -226,7 +227,12 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
         active = own.active if k < later else own.active & near
         shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
         path = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
-        total += _connect(scene, options, connectable, replace(own, active=active), path)
+        value = _connect(scene, options, connectable, replace(own, active=active), path)
+        if connectable.tally is not None:
+            tally, cells, tile, scale = connectable.tally
+            cell = dr.gather(mi.UInt32, cells, path, active)
+            tally.add(cell, tile, value * scale * dr.select(near, mi.Float(1 / options.connections), 1 / later), active)
+        total += value
     return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
 
 

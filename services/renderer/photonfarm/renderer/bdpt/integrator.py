@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from photonfarm.renderer.bdpt import randomness
+from photonfarm.renderer.bdpt import guiding, randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
@@ -45,6 +46,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.connections = int(props.get("connections", 1))
         self.light_ratio = float(props.get("light_ratio", 1.0))
         self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
+        self.guiding = None
         self._check_parameters()
         self._recorder = Recorder(trace) if props.get("record", False) else None
 
@@ -137,6 +139,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
             lights = read_lights(scene) if scene.emitters() else None
+            if lights is not None and self.guiding is not None and self.light_ratio:
+                lights.emitters = list(scene.emitters())
+                lights.guide = self.guiding
             light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
             images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
@@ -150,13 +155,41 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 images.add(part, launch.first_image * pixels)
             return images
 
+    def learn(self, scene, sensor, seed, spp, *, side=16, split=1, alpha=0.25, prior=4.0, relative=True, power=0.5,
+              share=1.0):
+        with dr.suspend_grad():
+            width, height = (int(n) for n in sensor.film().crop_size())
+            pixels = width * height
+            lights = read_lights(scene)
+            lights.emitters = list(scene.emitters())
+            shapes = {int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(s.emitter()))[0]): s for s in scene.shapes() if s.is_emitter()}
+            lights.split = []
+            for e in lights.emitters:
+                s = shapes.get(int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]))
+                lights.split.append(s is not None and s.class_name() == "Rectangle")
+            lights.guide = guiding.uniform(lights, side, split)
+            total = lights.count * (side * split) ** 2
+            tally = guiding.Tally(dr.zeros(mi.Float, total * guiding.TILES**2), dr.zeros(mi.Float, total))
+            ratio = self.light_ratio
+            image = 0
+            for launch in launches(1, pixels, spp, ratio, 1 << 20):
+                options = self._options(launch, pixels)
+                own = [seed]
+                shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
+                lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts, None)
+                images = trace(scene, sensor, lights, options, lanes, tally)
+                image = image + np.array(images.tensor(width, height))[0]
+            self.guiding = guiding.learned(lights, side, split, tally, image, alpha=alpha, prior=prior, relative=relative, power=power)
+            return tally, image
+
     def _trace(
         self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
     ) -> ImageStack:
         if self._recorder is None:
             return trace(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
-        kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping)
+        g = lights.guide if lights else None
+        kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping, g and (g.side, g.split))
         return self._recorder(kind, scene, sensor, lights, options, lanes)
 
     def _options(self, launch: Launch, pixels: int) -> PathOptions:
@@ -172,7 +205,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
+def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes,
+          tally=None) -> ImageStack:
     """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch."""
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
@@ -182,6 +216,8 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
         lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
+        if tally is not None:
+            splat = guiding.TallySplat(splat, tally)
         vertices, seen = trace_light_paths(
             scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
         )
@@ -196,6 +232,10 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
         connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
+        if tally is not None:
+            row, column = pixel // lanes.width, pixel % lanes.width
+            tile = row * guiding.TILES // lanes.height * guiding.TILES + column * guiding.TILES // lanes.width
+            connectable.tally = (tally, splat.cell, tile, lanes.eye_scale)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     images = ImageStack.black(lanes.images * lanes.pixels)

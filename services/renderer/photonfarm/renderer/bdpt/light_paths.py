@@ -109,6 +109,10 @@ def trace_light_paths(
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
+    if hasattr(splat, "tally"):
+        splat.cell = start.cell
+        dr.eval(start.cell)
+        dr.scatter_add(splat.tally.starts, 1.0, start.cell)
     vertices = empty_vertices(n) if options.connects else None
     (state,) = traced_once(
         state=(first_state(scene, lights, start, rng),),

@@ -15,6 +15,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import Lights, hit_densities, sample_direct
+from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
 from photonfarm.renderer.bdpt.light_paths import LightVertices, PathOptions, exchanged
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
@@ -51,7 +52,7 @@ class Connectable:
     image: mi.UInt32  # image of the launch that a lane belongs to
     first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
     shifts: mi.UInt32  # see randomness.shifts
-    tally: object = None
+    tally: TalliedConnections | None = None  # where a guide is learned
 
 
 def trace_eye_paths(
@@ -221,6 +222,7 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
     """
     later = (options.connections + 1) // 2
     near = own.depth <= _NEAR_VERTICES
+    share = dr.select(near, mi.Float(1 / options.connections), 1 / later)
     total = mi.Spectrum(0)
     for k in range(options.connections):
         row = connectable.image * SHIFTS + own.depth % SHIFTS
@@ -229,11 +231,9 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
         path = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
         value = _connect(scene, options, connectable, replace(own, active=active), path)
         if connectable.tally is not None:
-            tally, cells, tile, scale = connectable.tally
-            cell = dr.gather(mi.UInt32, cells, path, active)
-            tally.add(cell, tile, value * scale * dr.select(near, mi.Float(1 / options.connections), 1 / later), active)
+            connectable.tally.add(path, value * share, active)
         total += value
-    return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
+    return total * share
 
 
 def _connect(

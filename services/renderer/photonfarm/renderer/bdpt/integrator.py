@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from photonfarm.renderer.bdpt import guiding, randomness
+from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat
+from photonfarm.renderer.bdpt.guiding.learning import Effort, SparseLanes, learned
+from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
+from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
@@ -30,6 +34,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
       to half as many. Needs ``light_ratio`` > 0.
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
+    - ``guided`` (bool, default false): let light paths start where they reach what the camera sees. `render` learns a
+      guide from a few paths of its own first, unless it is given one by `learn_guide`.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -46,9 +52,10 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.connections = int(props.get("connections", 1))
         self.light_ratio = float(props.get("light_ratio", 1.0))
         self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
-        self.guiding = None
+        self.guided = bool(props.get("guided", False))
         self._check_parameters()
-        self._recorder = Recorder(trace) if props.get("record", False) else None
+        record = props.get("record", False)
+        self._recorder, self._learning_recorder = (Recorder(trace), Recorder(explore)) if record else (None, None)
 
     def _check_parameters(self) -> None:
         if self.rr_depth < 1:
@@ -87,15 +94,17 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
+        guide: StartGuide | None = None,
     ) -> mi.TensorXf:
         """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
         ``sensor`` is a sensor or the number of one; ``spp`` of 0 stands for the samples per pixel of its sampler.
+        A ``guided`` integrator without a ``guide`` learns one for this image.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         seed = int(seed if isinstance(seed, int) else seed[0])
-        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count())
+        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count(), guide=guide)
         with dr.suspend_grad():
             film.prepare([])
             images.put(film)
@@ -106,43 +115,101 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 dr.eval(image)
             return image
 
-    def render_seeds(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> mi.TensorXf:
+    def render_seeds(
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, guide: StartGuide | None = None
+    ) -> mi.TensorXf:
         """Independent images of one view, [K, H, W, 3], one for each seed; several small images share a launch.
 
         Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
         an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
-        their order. Raises as ``render`` does.
+        their order. A ``guided`` integrator without a ``guide`` learns one from the first seed for all of the images.
+        Raises as ``render`` does.
         """
         width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp).tensor(width, height)
+        return self._render(scene, sensor, seeds, spp, guide=guide).tensor(width, height)
 
     def render_views(
-        self, scene: mi.Scene, sensor: mi.Sensor, places: Places, seeds: Sequence[int], spp: int
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        places: Places,
+        seeds: Sequence[int],
+        spp: int,
+        guide: StartGuide | None = None,
     ) -> mi.TensorXf:
         """Images of K views, [K, H, W, 3], one for each place and seed; as many as may be share a launch.
 
         ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
         has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
-        does.
+        does. A ``guided`` integrator without a ``guide`` learns one from the first seed for all of the views.
         """
         width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp, places).tensor(width, height)
+        return self._render(scene, sensor, seeds, spp, places, guide).tensor(width, height)
 
-    def _render(
-        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None = None
-    ) -> ImageStack:
+    def learn_guide(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        places: Places | None = None,
+        effort: Effort | None = None,
+    ) -> StartGuide | None:
+        """A guide for light paths that reach what a sensor sees, or what it sees from several ``places``.
+
+        It is learned from random numbers of its own, so images that are rendered with it stay independent of each
+        other, and unbiased. None where light paths cannot be guided, as there are none. Raises as ``render`` does.
+        """
+        if not (self.guided and self._has_light_paths(scene)):
+            return None
+        self._check(scene, sensor)
+        effort = effort or Effort()
+        with dr.suspend_grad():
+            width, height = (int(n) for n in sensor.film().crop_size())
+            lights = read_lights(scene)
+            layout = Layout.of(lights.count)
+            lights = lights.guided_by(StartGuide.neutral(layout), scene)
+            images = 1 if places is None else len(places)
+            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, images)
+            launch = effort.launch(images)
+            options = self._options(launch, width * height)
+            options = replace(options, light_ratio=dr.opaque(mi.Float, self.light_ratio))
+            shifts = randomness.shifts(seeds, launch, self.connections) if options.connects else None
+            poses = None if places is None else Poses.of(places)
+            keys = randomness.image_keys(seeds)
+            lanes = SparseLanes.of(launch, (width, height), 1, keys, shifts, poses)
+            lanes.thin(effort.eye_paths // images)
+            found = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes)
+            return learned(layout, lights.emit_probability, *found, lanes)
+
+    def _has_light_paths(self, scene: mi.Scene) -> bool:
+        return bool(self.light_ratio > 0 and self.max_depth > 2 and scene.emitters())
+
+    def _check(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         sensor.sampler().seed(0, 1)  # else the state left by another integrator would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
+
+    def _render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seeds: Sequence[int],
+        spp: int,
+        places: Places | None = None,
+        guide: StartGuide | None = None,
+    ) -> ImageStack:
+        self._check(scene, sensor)
         with dr.suspend_grad():
             seeds = [seed & 0xFFFFFFFF for seed in seeds]
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
+            if self.guided and guide is None:
+                effort = Effort.of_image(pixels * spp * len(seeds), self.light_ratio)
+                guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
-            if lights is not None and self.guiding is not None and self.light_ratio:
-                lights.emitters = list(scene.emitters())
-                lights.guide = self.guiding
-            light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
+            light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
+            if lights is not None and guide is not None and light_ratio:
+                lights = lights.guided_by(guide, scene)
             images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
                 options = self._options(launch, pixels)
@@ -155,42 +222,27 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 images.add(part, launch.first_image * pixels)
             return images
 
-    def learn(self, scene, sensor, seed, spp, *, side=16, split=1, alpha=0.25, prior=4.0, relative=True, power=0.5,
-              share=1.0):
-        with dr.suspend_grad():
-            width, height = (int(n) for n in sensor.film().crop_size())
-            pixels = width * height
-            lights = read_lights(scene)
-            lights.emitters = list(scene.emitters())
-            shapes = {int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(s.emitter()))[0]): s for s in scene.shapes() if s.is_emitter()}
-            lights.split = []
-            for e in lights.emitters:
-                s = shapes.get(int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0]))
-                lights.split.append(s is not None and s.class_name() == "Rectangle")
-            lights.guide = guiding.uniform(lights, side, split)
-            total = lights.count * (side * split) ** 2
-            tally = guiding.Tally(dr.zeros(mi.Float, total * guiding.TILES**2), dr.zeros(mi.Float, total))
-            ratio = self.light_ratio
-            image = 0
-            for launch in launches(1, pixels, spp, ratio, 1 << 20):
-                options = self._options(launch, pixels)
-                own = [seed]
-                shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
-                lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts, None)
-                images = trace(scene, sensor, lights, options, lanes, tally)
-                image = image + np.array(images.tensor(width, height))[0]
-            self.guiding = guiding.learned(lights, side, split, tally, image, alpha=alpha, prior=prior, relative=relative, power=power)
-            return tally, image
-
     def _trace(
         self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
     ) -> ImageStack:
-        if self._recorder is None:
-            return trace(scene, sensor, lights, options, lanes)
+        images: ImageStack = self._call(trace, self._recorder, scene, sensor, lights, options, lanes)
+        return images
+
+    def _call(
+        self,
+        function: Callable[..., Any],
+        recorder: Recorder | None,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        lights: Lights | None,
+        options: PathOptions,
+        lanes: Lanes,
+    ) -> Any:
+        if recorder is None:
+            return function(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
-        g = lights.guide if lights else None
-        kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping, g and (g.side, g.split))
-        return self._recorder(kind, scene, sensor, lights, options, lanes)
+        kind = (lanes.kind, options.kind, lights.kind_of_kernels if lights else None, clipping)
+        return recorder(kind, scene, sensor, lights, options, lanes)
 
     def _options(self, launch: Launch, pixels: int) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0
@@ -205,9 +257,28 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes,
-          tally=None) -> ImageStack:
-    """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch."""
+def explore(
+    scene: mi.Scene, sensor: mi.Sensor, lights: Lights, options: PathOptions, lanes: SparseLanes
+) -> tuple[ImageStack, mi.Float, mi.Float]:
+    """(images, what `Tally` holds) of a launch from which a guide is learned."""
+    tally = Tally.empty(Layout.of(lights.count), lanes.images)
+    images = trace(scene, sensor, lights, options, lanes, tally)
+    dr.eval(tally.squares, tally.starts)
+    return images, tally.squares, tally.starts
+
+
+def trace(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    lights: Lights | None,
+    options: PathOptions,
+    lanes: Lanes,
+    tally: Tally | None = None,
+) -> ImageStack:
+    """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch.
+
+    What the light paths add is noted in ``tally``.
+    """
     splats = dr.zeros(mi.Spectrum, lanes.images * lanes.pixels)
     vertices = seen = None
     if lights is not None and options.traces_light:
@@ -215,9 +286,10 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
         lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
-        rng = randomness.sampler(sequence, path + lanes.first_light_path)
         if tally is not None:
-            splat = guiding.TallySplat(splat, tally)
+            weight = dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2]))
+            splat = TalliedSplat.of(splat, tally, image, weight)
+        rng = randomness.sampler(sequence, path + lanes.first_light_path)
         vertices, seen = trace_light_paths(
             scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
         )
@@ -231,11 +303,8 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
     connectable = None
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
-        connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts)
-        if tally is not None:
-            row, column = pixel // lanes.width, pixel % lanes.width
-            tile = row * guiding.TILES // lanes.height * guiding.TILES + column * guiding.TILES // lanes.width
-            connectable.tally = (tally, splat.cell, tile, lanes.eye_scale)
+        noted = None if tally is None else TalliedConnections.of(tally, splat.cell, image, pixel, lanes)
+        connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts, noted)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     images = ImageStack.black(lanes.images * lanes.pixels)

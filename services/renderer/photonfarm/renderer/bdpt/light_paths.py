@@ -24,6 +24,7 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
+from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
@@ -109,10 +110,8 @@ def trace_light_paths(
     """
     n = dr.width(rng.index)
     start = sample_emission(lights, rng, path, paths)
-    if hasattr(splat, "tally"):
-        splat.cell = start.cell
-        dr.eval(start.cell)
-        dr.scatter_add(splat.tally.starts, 1.0, start.cell)
+    if isinstance(splat, TalliedSplat):
+        splat.begin(start.cell)
     vertices = empty_vertices(n) if options.connects else None
     (state,) = traced_once(
         state=(first_state(scene, lights, start, rng),),

@@ -14,7 +14,8 @@ from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat
-from photonfarm.renderer.bdpt.guiding.learning import Effort, SparseLanes, learned
+from photonfarm.renderer.bdpt.guiding.learning import Effort, learned
+from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
@@ -55,7 +56,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.guided = bool(props.get("guided", False))
         self._check_parameters()
         record = props.get("record", False)
-        self._recorder, self._learning_recorder = (Recorder(trace), Recorder(explore)) if record else (None, None)
+        self._recorder = Recorder(trace) if record else None
+        self._learning_recorder = Recorder(explore) if record else None
 
     def _check_parameters(self) -> None:
         if self.rr_depth < 1:
@@ -168,18 +170,18 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             lights = read_lights(scene)
             layout = Layout.of(lights.count)
             lights = lights.guided_by(StartGuide.neutral(layout), scene)
-            images = 1 if places is None else len(places)
-            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, images)
-            launch = effort.launch(images)
+            views = 1 if places is None else len(places)
+            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)
+            launch = effort.launch(views)
             options = self._options(launch, width * height)
             options = replace(options, light_ratio=dr.opaque(mi.Float, self.light_ratio))
             shifts = randomness.shifts(seeds, launch, self.connections) if options.connects else None
             poses = None if places is None else Poses.of(places)
             keys = randomness.image_keys(seeds)
             lanes = SparseLanes.of(launch, (width, height), 1, keys, shifts, poses)
-            lanes.thin(effort.eye_paths // images)
-            found = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes)
-            return learned(layout, lights.emit_probability, *found, lanes)
+            lanes.thin(effort.eye_paths // views)
+            images, tally = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes)
+            return learned(layout, lights.emit_probability, images, Tally(*tally), lanes)
 
     def _has_light_paths(self, scene: mi.Scene) -> bool:
         return bool(self.light_ratio > 0 and self.max_depth > 2 and scene.emitters())
@@ -259,12 +261,12 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
 def explore(
     scene: mi.Scene, sensor: mi.Sensor, lights: Lights, options: PathOptions, lanes: SparseLanes
-) -> tuple[ImageStack, mi.Float, mi.Float]:
-    """(images, what `Tally` holds) of a launch from which a guide is learned."""
-    tally = Tally.empty(Layout.of(lights.count), lanes.images)
+) -> tuple[ImageStack, tuple[mi.Float, mi.Float, mi.Float]]:
+    """(images, sums of a `Tally`) of a launch from which a guide is learned."""
+    tally = Tally.empty(Layout.of(lights.count), lanes)
     images = trace(scene, sensor, lights, options, lanes, tally)
-    dr.eval(tally.squares, tally.starts)
-    return images, tally.squares, tally.starts
+    dr.eval(tally.sums)
+    return images, tally.sums
 
 
 def trace(
@@ -287,8 +289,7 @@ def trace(
         lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
         if tally is not None:
-            weight = dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2]))
-            splat = TalliedSplat.of(splat, tally, image, weight)
+            splat = TalliedSplat.of(splat, tally, image, dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2])))
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         vertices, seen = trace_light_paths(
             scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
@@ -303,7 +304,7 @@ def trace(
     connectable = None
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
-        noted = None if tally is None else TalliedConnections.of(tally, splat.cell, image, pixel, lanes)
+        noted = None if tally is None else TalliedConnections.of(tally, image, pixel, lanes)
         connectable = Connectable(vertices, seen, lanes.counts[2], image, first, lanes.shifts, noted)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 

@@ -122,6 +122,8 @@ def trace_light_paths(
         labels=("light path",),
         label="bdpt light paths",
     )
+    if isinstance(splat, TalliedSplat):
+        splat.end(state.depth)
     if vertices is None:
         return None, state.seen
     dr.eval(state.seen, vertices)

@@ -12,7 +12,7 @@ from photonfarm.renderer.bdpt.film import ImageStack
 from photonfarm.renderer.bdpt.guiding.densities import gains
 from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.guiding.tally import Tally
+from photonfarm.renderer.bdpt.guiding.tally import Tally, column_of, tiles_of
 from photonfarm.renderer.bdpt.launches import Launch
 
 EPSILON = 1e-2
@@ -43,28 +43,29 @@ class Effort:
         return Launch(images, 0, 1, 0, max(1, self.light_paths // images), 0)
 
 
-def learned(
-    layout: Layout, probability: mi.Float, images: ImageStack, squares: mi.Float, starts: mi.Float, lanes: SparseLanes
-) -> StartGuide:
+def learned(layout: Layout, probability: mi.Float, images: ImageStack, tally: Tally, lanes: SparseLanes) -> StartGuide:
     """The guide that the images and the tally of a launch suggest, given default probabilities of lights [N]."""
-    width, height, radiance = lanes.width, lanes.height, images.radiance
-    tally = Tally(squares, starts, Tally.tiles_of(lanes.images), lanes.images)
+    tiles = tiles_of(lanes.images)
+    weight = _weights(images.radiance, lanes, tiles)
+    columns = lanes.images * tiles**2
+    column = dr.arange(mi.UInt32, layout.cells * columns) % columns
+    sums = dr.block_sum(tally.squares * dr.gather(mi.Float, weight, column), columns)
+    found = [np.array(values, np.float64) for values in (sums, tally.starts, tally.edges, probability)]
+    return StartGuide.of(layout, gains(layout, *found))
+
+
+def _weights(radiance: mi.Spectrum, lanes: SparseLanes, tiles: int) -> mi.Float:
+    """What the variance of pixels counts for in the error, for each tile of images [V·H·W]; 0 in black images."""
     pixel = dr.arange(mi.UInt32, dr.width(radiance))
-    image = pixel // (width * height)
-    within = pixel - image * (width * height)
-    row = within // width
-    x, y = (mi.Float(within - row * width) + 0.5) / width, (mi.Float(row) + 0.5) / height
-    columns = tally.images * tally.tiles**2
-    grey, pixels = dr.zeros(mi.Float, columns), dr.zeros(mi.Float, columns)
-    column = tally.column(image, x, y)
+    image = pixel // lanes.pixels
+    within = pixel - image * lanes.pixels
+    row = within // lanes.width
+    x, y = (mi.Float(within - row * lanes.width) + 0.5) / lanes.width, (mi.Float(row) + 0.5) / lanes.height
+    column = column_of(image, x, y, tiles)
+    grey, pixels = (dr.zeros(mi.Float, lanes.images * tiles**2) for _ in range(2))
     dr.scatter_add(grey, (radiance[0] + radiance[1] + radiance[2]) / 3, column)
     dr.scatter_add(pixels, 1, column)
     grey /= dr.maximum(pixels, 1)
-    of_image = tally.tiles**2
-    mean = dr.repeat(dr.block_sum(grey, of_image), of_image) / of_image
+    mean = dr.repeat(dr.block_sum(grey, tiles**2), tiles**2) / tiles**2
     level = dr.square(grey) + EPSILON * dr.square(mean)
-    weight = dr.select(level > 0, dr.rcp(level), 0)
-    column = dr.arange(mi.UInt32, layout.cells * columns) % columns
-    sums = dr.block_sum(tally.squares * dr.gather(mi.Float, weight, column), columns)
-    found = [np.array(values, np.float64) for values in (sums, tally.starts, probability)]
-    return StartGuide.of(layout, gains(layout, *found))
+    return dr.select(level > 0, dr.rcp(level), 0)

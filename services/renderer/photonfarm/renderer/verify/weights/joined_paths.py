@@ -357,7 +357,7 @@ def _light_densities(
     emission = np.where(
         area, 1 / (surface * np.pi), np.where(infinite, per_angle / disk, 1 / (2 * np.pi * (1 - cutoff)))
     )
-    return next_event, started * emission
+    return next_event, started * emission * _column(kept, _gain(lights, joined))
 
 
 def _selection(lights: Lights, index: Any, seen_from: F64) -> tuple[F64, F64]:

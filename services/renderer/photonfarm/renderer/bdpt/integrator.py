@@ -124,8 +124,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
         Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
         an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
-        their order. A ``guided`` integrator without a ``guide`` learns one from the first seed for all of the images.
-        Raises as ``render`` does.
+        their order. A ``guided`` integrator without a ``guide`` learns one for each image. Raises as ``render`` does.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp, guide=guide).tensor(width, height)
@@ -143,7 +142,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
         ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
         has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
-        does. A ``guided`` integrator without a ``guide`` learns one from the first seed for all of the views.
+        does. A ``guided`` integrator without a ``guide`` learns one for each view.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp, places, guide).tensor(width, height)
@@ -201,12 +200,14 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         guide: StartGuide | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)
+        if self.guided and guide is None and len(seeds) > 1:
+            return self._render_with_own_guides(scene, sensor, seeds, spp, places)
         with dr.suspend_grad():
             seeds = [seed & 0xFFFFFFFF for seed in seeds]
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
             if self.guided and guide is None:
-                effort = Effort.of_image(pixels * spp * len(seeds), self.light_ratio)
+                effort = Effort.of_image(pixels * spp, self.light_ratio)
                 guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
@@ -223,6 +224,17 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 part = self._trace(scene, sensor, lights, options, lanes)
                 images.add(part, launch.first_image * pixels)
             return images
+
+    def _render_with_own_guides(
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None
+    ) -> ImageStack:
+        """The images that are rendered alone, each with a guide of its own."""
+        width, height = sensor.film().crop_size()
+        images = ImageStack.black(len(seeds) * width * height)
+        for k, seed in enumerate(seeds):
+            image = self._render(scene, sensor, [seed], spp, None if places is None else places[k : k + 1])
+            images.add(image, k * width * height)
+        return images
 
     def _trace(
         self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes

@@ -21,12 +21,17 @@ FOLDER = ROOT / "deploy/kustomize"
 NAME = "photonfarm"
 """The name of the release and of the namespace, which kustomization.yaml sets too."""
 
-VALUES = {"autoscaling": {"enabled": True}, "plans": [{"name": "first", "spec": "room"}]}
+VALUES = {
+    "autoscaling": {"enabled": True},
+    "metrics": {"enabled": True},
+    "plans": [{"name": "first", "spec": "room"}],
+}
 """What the chart must be asked for to render the files that are not of the base."""
 
 PLACES = {
     "base": ("data", "networkpolicy", "reconcile", "redis", "renderer", "trainer"),
     "autoscaling": ("autoscaling",),
+    "metrics": ("metrics",),
     "plan": ("plan",),
 }
 """The folders and the chart's templates that lie in them; the Secret is not among them: users make it."""

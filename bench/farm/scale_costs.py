@@ -1,4 +1,4 @@
-"""The costs that grow with a farm, what is still borne of each, and where that ends."""
+"""The costs that grow with a farm, a limit for each, and the size where it is reached."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ AHEAD_LOOK_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """One cost: where it is measured, and how much of it is borne."""
+    """One cost: where it is measured, and its limit."""
 
     step: str  # of the measurement
     name: str  # in it
     axis: Axis
     about: str
     unit: Unit
-    borne: float
-    why: str  # that much is borne
+    limit: float
+    why: str  # the limit is that
 
 
 COSTS = (
@@ -87,7 +87,7 @@ COSTS = (
         "worker",
         "held_bytes",
         "samples",
-        "a worker before its first job: memory that it keeps",
+        "a worker before its first job: memory it keeps",
         "MB",
         1e9,
         "as much as it renders with",
@@ -106,17 +106,17 @@ COSTS = (
         "ahead",
         "again_core_s",
         "samples",
-        "a worker with --ahead, its looks, each 5 s or rarer: processor time",
+        "a look of a worker with --ahead, every 5 s or less often: processor time",
         "s",
         2.5,
         "half a core",
     ),
-    Cost("reconcile", "core_s", "samples", "an empty queue filled: processor time", "s", 5.0, "workers wait for it"),
+    Cost("reconcile", "core_s", "samples", "filling an empty queue: processor time", "s", 5.0, "workers wait for it"),
     Cost(
         "reconcile",
         "again_core_s",
         "samples",
-        "a full queue compared with the store: processor time",
+        "comparing a full queue with the store: processor time",
         "s",
         5.0,
         "as above",
@@ -145,7 +145,7 @@ COSTS = (
         "reader",
         "idle_core_s",
         "samples",
-        "a reader's look without news, once a second: processor time",
+        "a reader's look that finds nothing new, once a second: processor time",
         "s",
         0.5,
         "half a core",
@@ -173,7 +173,7 @@ COSTS = (
         "bucket missing",
         "requests",
         "samples",
-        "bucket: all that is missing, at the end and where the queue is filled: requests",
+        "bucket: a list of all missing jobs: requests",
         "",
         300.0,
         "30 s at 0.1 s each",
@@ -182,7 +182,7 @@ COSTS = (
         "bucket refresh",
         "requests",
         "samples",
-        "bucket: a reader's look without news, once a second: requests",
+        "bucket: a reader's look that finds nothing new, once a second: requests",
         "",
         LIST_PATIENCE,
         "1 s at 0.1 s each",
@@ -200,7 +200,7 @@ COSTS = (
         "bucket pace",
         "requests",
         "samples",
-        "bucket: a worker's look with --ahead, each 5 s: requests",
+        "bucket: a look of a worker with --ahead, every 5 s: requests",
         "",
         S3_PER_S * AHEAD_LOOK_S / TARGETS["workers"],
         "5500 a second in all, with 1000 workers",
@@ -247,7 +247,7 @@ COSTS = (
         "workers",
         "idle_listings",
         "workers",
-        "all wait for the last job: listings of all markers",
+        "listings of all markers while all wait for the last job",
         "/s",
         17.0,
         "313 requests each, 5500 a second in all",
@@ -290,8 +290,8 @@ class Grown:
 
     @property
     def breaks_at(self) -> float:
-        """The size from which on the cost is no longer borne."""
-        return self.growth.size_of(self.cost.borne)
+        """The size from which on the cost is above its limit."""
+        return self.growth.size_of(self.cost.limit)
 
     @property
     def room(self) -> float:
@@ -322,5 +322,5 @@ def grown(measured: Measured) -> list[Grown]:
 
 
 def first_to_break(costs: Sequence[Grown]) -> list[Grown]:
-    """Those that are no longer borne at the target, the one that ends first foremost."""
+    """The costs above their limits at the target, ordered by the size where they reach them."""
     return sorted((each for each in costs if each.room < 1), key=lambda each: each.room)

@@ -1,4 +1,4 @@
-"""The page on what breaks first: the table of costs with their exponents, and the order in which they end."""
+"""The page on what breaks first: the table of costs with their exponents, and the order in which they pass limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.harness import results
 
 ORDERED: tuple[Axis, ...] = ("samples", "workers", "plans")
 SOON = 4
-"""How many of the costs that are borne are named as the next to end."""
+"""How many of the costs below their limits are named as the next to pass them."""
 
 SAMPLE_BYTES = 1.0e6
 """A sample with its guides, as docs/results/store.md has it for `room`: 0.8 to 1.7 MB."""
@@ -24,12 +24,15 @@ def page(now: Sequence[Grown], before: Mapping[Cost, Grown], commit: str, kept: 
     """
     tables = "\n\n".join(_table(axis, now, before) for axis in ORDERED if any(e.cost.axis == axis for e in now))
     product = f"the product at commit {commit.partition(' ')[0]}, measured by this bench"
-    earlier = f"\nIn brackets is what was before [what is mended](#mended): {product}." if before else ""
+    earlier = (
+        f"\nThe figures in brackets are from before [the improvements below](#improved): {product}." if before else ""
+    )
     return f"""# What breaks first
 
-Ten million samples (10 TB of `{SPEC}`), a thousand workers, a thousand plans: which cost is the first that nobody can
-bear? Costs are measured at sizes that fit this machine, and fitted by constant + factor · size ^ exponent. *Borne* is
-what we say can still be borne, and why; *ends at* is the size from which on it is more.{earlier}
+Think of a farm with ten million samples (10 TB of `{SPEC}`), a thousand workers and a thousand plans. Which cost passes
+its limit first? Each cost is measured at sizes that fit this machine, fitted by constant + factor · size ^ exponent,
+and extrapolated. Its *limit* is our choice, with the reason beside it; *reached at* is the size where the cost passes
+it.{earlier}
 
 {_verdict(now, before)}
 
@@ -52,7 +55,7 @@ jobs and more. Commands include those within scripts.
 
 {_files()}
 
-{MENDED}{_kept(kept or {})}"""
+{IMPROVED}{_kept(kept or {})}"""
 
 
 def _kept(kept: Mapping[str, str]) -> str:
@@ -65,23 +68,23 @@ def _kept(kept: Mapping[str, str]) -> str:
 
 
 def _verdict(now: Sequence[Grown], before: Mapping[Cost, Grown]) -> str:
-    """What ends first, now and before."""
+    """Which costs pass their limits first, now and before."""
     lines = []
     for title, broken in (("Now", first_to_break(now)), ("Before", first_to_break(list(before.values())))):
         if title == "Before" and not before:
             continue
         named = [f"{i}. {_told(each)}" for i, each in enumerate(broken, 1)]
         lines.append(
-            f"**{title}**, {len(named)} costs are more than can be borne, the first to end first:\n\n"
+            f"**{title}**, {len(named)} costs were above their limits, ordered by the size where they reach them:\n\n"
             + "\n".join(named)
             if named
-            else f"**{title}**, every cost is borne. The next to end:\n\n{_next(now)}"
+            else f"**{title}**, every cost is below its limit. The next to reach it:\n\n{_next(now)}"
         )
     return "\n\n".join(lines)
 
 
 def _next(costs: Sequence[Grown]) -> str:
-    """The costs that are borne and end first."""
+    """The costs below their limits that reach them first."""
     soon = sorted(costs, key=lambda each: each.room)[:SOON]
     return "\n".join(f"{i}. {_told(each)}" for i, each in enumerate(soon, 1))
 
@@ -89,15 +92,15 @@ def _next(costs: Sequence[Grown]) -> str:
 def _told(each: Grown) -> str:
     cost = each.cost
     return (
-        f"{cost.about}: ends at {_size(each.breaks_at)} {cost.axis}; {_value(each.at_target, cost)} at "
-        f"{_size(TARGETS[cost.axis])}, of {_value(cost.borne, cost)} borne"
+        f"{cost.about}: at {_size(each.breaks_at)} {cost.axis}; {_value(each.at_target, cost)} at "
+        f"{_size(TARGETS[cost.axis])}, limit {_value(cost.limit, cost)}"
     )
 
 
 def _table(axis: Axis, now: Sequence[Grown], before: Mapping[Cost, Grown]) -> str:
     largest = max(max(each.sizes) for each in now if each.cost.axis == axis)
     header = [
-        f"cost over {axis}", f"at {_size(largest)}", "exponent", f"at {_size(TARGETS[axis])}", "borne", "ends at"
+        f"cost over {axis}", f"at {_size(largest)}", "exponent", f"at {_size(TARGETS[axis])}", "limit", "reached at"
     ]  # fmt: skip
     rows = []
     for each in now:
@@ -108,13 +111,13 @@ def _table(axis: Axis, now: Sequence[Grown], before: Mapping[Cost, Grown]) -> st
             now_ if was is None else f"{now_} ({was_})"
             for now_, was_ in zip(_cells(each), _cells(was or each), strict=True)
         ]
-        borne = f"{_value(each.cost.borne, each.cost)}: {each.cost.why}"
-        rows.append([each.cost.about, *cells[:3], borne, cells[3]])
+        limit = f"{_value(each.cost.limit, each.cost)}: {each.cost.why}"
+        rows.append([each.cost.about, *cells[:3], limit, cells[3]])
     return results.table(header, rows)
 
 
 def _cells(each: Grown) -> list[str]:
-    """The cost at the largest size, its exponent, the cost at the target, and where it ends."""
+    """The cost at the largest size, its exponent, the cost at the target, and the size where it reaches its limit."""
     at_largest, at_target = _value(each.values[-1], each.cost), _value(each.at_target, each.cost)
     return [at_largest, str(each.growth), at_target, _size(each.breaks_at)]
 
@@ -136,7 +139,7 @@ def _size(size: float) -> str:
 
 
 def _files() -> str:
-    """How many files and names there are: arithmetic, from the arrays that a scene has."""
+    """The number of files and names, computed from the arrays that a scene has."""
     from photonfarm.shared.scene.spec_loading import NamedSpec
     from photonfarm.shared.store.format import schema
 
@@ -161,9 +164,9 @@ ext4 holds some ten million names of this length in a folder (without `large_dir
 16 kB of its size. `--shard-rows` sets the samples of a job, in a scene's first plan."""
 
 
-MENDED = """## Mended
+IMPROVED = """## Improved
 
-Nothing of it changes the store's format, or what a commit guarantees; each has a test that counts operations.
+None of this changes the store's format, or what a commit guarantees; each has a test that counts operations.
 
 - **Waiting workers.** Each idle worker listed all markers every two seconds, and read all of Redis' keys three to nine
   times: listings by workers × markers, and commands that grew faster than the workers. Now one looks, and Redis keeps
@@ -179,7 +182,7 @@ Nothing of it changes the store's format, or what a commit guarantees; each has 
   with `--ahead` or `--share`, now wait twenty times as long as a look took, a minute at most: from some 10^6 samples on
   that is longer than before, and looks take a twentieth of the time. (`test_dataset.py`, `test_trainer_pace.py`)
 
-## Not mended, and not measured
+## Not improved, and not measured
 
 - `status`, and the first look of `web` and `serve-metrics`, read every marker: linear, and in a bucket 312,500 requests
   at 10 million samples, eight at a time.

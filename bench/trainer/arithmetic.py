@@ -285,7 +285,7 @@ def bias_section(found: Sequence[Trained], steps: int) -> str:
 the same batches of 2, less those of float32, as shares of the length of float32's mean gradient: of one batch (root
 mean square), of the mean over all batches, and beside it the standard error of float32's own mean by the noise of
 samples. TF32 is rounded here, in every convolution of the U-Net and of its gradient. At the last weights the mean
-gradient is almost 0, so that shares of it are large; the last column, bias over noise, is the one to compare.
+gradient is almost 0, so that shares of it are large; the last column, mean over noise, is the one to compare.
 
 {results.table(("precision", "weights", "one batch", "mean of all", "noise of the mean", "mean over noise"), gradients)}
 

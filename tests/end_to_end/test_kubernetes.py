@@ -34,6 +34,7 @@ VALUES: dict[str, dict[str, Any]] = {
     "autoscaling": {"autoscaling": {"enabled": True}, "plans": [{"name": "first", "spec": "room"}]},
     "bucket": {"bucket": BUCKET, "plans": [{"name": "a", "spec": "room"}, {"name": "b", "spec": "cornell"}]},
     "GPUs": {"renderer": {"gpus": 1, **GPU}, "trainer": {"gpus": 4, **GPU, "spec": "room"}, "bucket": BUCKET},
+    "metrics": {"metrics": {"enabled": True, "prometheusNamespace": "watch"}, "bucket": BUCKET},
     "all ours": {
         "data": {"existingClaim": "disk"}, "scenes": {"existingClaim": "scenes"}, "redis": {"existingSecret": "mine"},
         "image": {"registry": "registry.example:5000/team", "pullSecrets": ["pull"]}, "trainer": {"enabled": False},
@@ -51,6 +52,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "/plans/0/args/1": {"plans": [{"name": "first", "spec": "room", "args": ["--modifications", 64]}]},
     "/plans/0/name": {"plans": [{"name": "First", "spec": "room"}]},
     "/image/registry": {"image": {"registry": ""}},
+    "autoscaling.minReplicas = 9": {"autoscaling": {"enabled": True, "minReplicas": 9, "maxReplicas": 8}},
     "/reconcile/enabled": {"autoscaling": {"enabled": True}, "reconcile": {"enabled": False}},
 }
 """Values that should be refused, by what the message names."""
@@ -157,7 +159,11 @@ def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, pa
     assert renderer["resources"]["limits"] == {"memory": "9Gi", "nvidia.com/gpu": 1}
     variables = {variable["name"]: variable["value"] for variable in renderer["env"]}
     assert variables["PHOTONFARM_DEVICE"] == "cuda"
-    assert "graphics" in variables["NVIDIA_DRIVER_CAPABILITIES"]
+    with_card = yaml.safe_load((ROOT / "docker-compose.gpu.yml").read_text())["services"]["renderer"]["environment"]
+    assert with_card.keys() <= variables.keys()
+    may = [sorted(given["NVIDIA_DRIVER_CAPABILITIES"].split(",")) for given in (with_card, variables)]
+    assert may[0] == may[1]
+    assert with_card["OPTIX_CACHE_PATH"] == variables["OPTIX_CACHE_PATH"]
     ((_, job),) = [item for item in found.items() if item[0][0] == "Job"]
     spec = job["spec"]["template"]["spec"]
     assert spec["runtimeClassName"] == "nvidia"

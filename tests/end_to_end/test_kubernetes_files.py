@@ -9,6 +9,7 @@ import re
 import runpy
 import tomllib
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import yaml
 from redis import Redis
 
 from photonfarm.shared import queue
+from photonfarm.shared.farm.running_farm import METRICS_PORT
 
 ROOT = Path(__file__).parents[2]
 CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
@@ -53,7 +55,7 @@ def named(kind: str, name: str) -> dict[str, Any]:
 
 
 def test_there_are_the_parts_of_the_farm_and_no_others() -> None:
-    parts = ("plan-first", "reconcile", "redis", "renderer", "trainer")
+    parts = ("metrics", "plan-first", "reconcile", "redis", "renderer", "trainer")
     assert set(PODS) == {f"photonfarm-{part}" for part in parts}
 
 
@@ -67,7 +69,8 @@ def test_the_images_are_those_of_the_compose_file_in_a_registry_that_nobody_has(
 
 def test_every_command_and_probe_of_photonfarm_has_a_verb_and_options_that_there_are(parse) -> None:
     lines = [container["command"] for _, container in containers()]
-    lines += [c[probe]["exec"]["command"] for _, c in containers() for probe in c if probe.endswith("Probe")]
+    probes = [c[probe] for _, c in containers() for probe in c if probe.endswith("Probe")]
+    lines += [probe["exec"]["command"] for probe in probes if "exec" in probe]
     for patch in yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["patches"]:
         lines += [operation["value"] for operation in yaml.safe_load(patch["patch"])]
     ours = [line[1:] for line in lines if line[0] == "photonfarm"]
@@ -94,7 +97,7 @@ def test_variables_are_those_of_the_compose_file_and_on_the_page_of_the_configur
         "PHOTONFARM_REDIS_URL": "redis://photonfarm-redis:6379/0",
     }
     for name, container in containers():
-        variables = {variable["name"]: variable["value"] for variable in container["env"]}
+        variables = {variable["name"]: variable["value"] for variable in container["env"] if "value" in variable}
         assert variables == ({"REDIS_DATA": "/queue"} if name == "photonfarm-redis" else wanted)
     in_templates = "".join(path.read_text() for path in (CHART / "templates").iterdir())
     for variable in {*wanted, *re.findall(r"\bPHOTONFARM_\w+", in_templates)} - {"HOME"}:
@@ -125,6 +128,7 @@ def test_a_pod_is_nobody_in_particular_and_writes_to_nothing_but_its_volumes(nam
 def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but_redis_and_names() -> None:
     redis, farm = (named("NetworkPolicy", f"photonfarm-{part}")["spec"] for part in ("redis", "farm"))
     component = "app.kubernetes.io/component"
+    metrics = named("NetworkPolicy", "photonfarm-metrics")["spec"]
     covered = farm["podSelector"]["matchExpressions"][0]["values"]
     labels = {name: pod["metadata"]["labels"] for name, pod in PODS.items()}
     assert {label[component] for label in labels.values()} == {"redis", *covered}
@@ -139,6 +143,26 @@ def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but
     to_redis, names = farm["egress"]
     assert to_redis["to"] == [{"podSelector": redis["podSelector"]}]
     assert {port["port"] for port in names["ports"]} == {53}
+    assert metrics["podSelector"]["matchLabels"] == labels["photonfarm-metrics"]
+    assert (metrics["policyTypes"], "egress" in metrics) == (["Ingress"], False)
+    (entry,) = metrics["ingress"]
+    namespaces = {"matchLabels": {"kubernetes.io/metadata.name": "monitoring"}}
+    assert entry == {"from": [{"namespaceSelector": namespaces}], "ports": [{"protocol": "TCP", "port": "metrics"}]}
+
+
+def test_metrics_are_answered_by_the_names_that_a_prometheus_of_the_cluster_asks_by(parse) -> None:
+    """The server answers to no other name: by the Service's, or the pod's address where pods are found one by one."""
+    service, (container,) = named("Service", "photonfarm-metrics"), PODS["photonfarm-metrics"]["spec"]["containers"]
+    arguments = container["command"][1:]
+    parse(arguments)
+    names = {value for option, value in pairwise(arguments) if option == "--name"}
+    assert names >= {"photonfarm-metrics", "photonfarm-metrics.photonfarm.svc", "$(POD_IP)"}
+    assert {"name": "POD_IP", "valueFrom": {"fieldRef": {"fieldPath": "status.podIP"}}} in container["env"]
+    assert service["spec"]["selector"].items() <= PODS["photonfarm-metrics"]["metadata"]["labels"].items()
+    assert [port["port"] for port in service["spec"]["ports"]] == [METRICS_PORT]
+    assert container["ports"] == [{"name": service["spec"]["ports"][0]["targetPort"], "containerPort": METRICS_PORT}]
+    page = (ROOT / "docs/kubernetes.md").read_text()
+    assert f"farm-photonfarm-metrics.farm.svc:{METRICS_PORT}" in page
 
 
 def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(connection: Redis) -> None:
@@ -189,7 +213,7 @@ def test_podman_gets_pods_whose_volumes_are_their_own_and_whose_ports_nobody_rea
     made = list(convert(DOCUMENTS, left_out))
     pods = {document["metadata"]["name"]: document["spec"] for document in made if document["kind"] == "Pod"}
     assert set(pods) == {
-        *(f"photonfarm-{part}" for part in ("plan-first", "redis", "renderer-0", "renderer-1", "trainer"))
+        *(f"photonfarm-{part}" for part in ("metrics", "plan-first", "redis", "renderer-0", "renderer-1", "trainer"))
     }
     assert [document["kind"] for document in made if document["kind"] != "Pod"] == ["PersistentVolumeClaim"]
     assert {name.partition("/")[0] for name in left_out} == {

@@ -29,7 +29,7 @@ pytestmark = [
         os.environ.get("PHOTONFARM_TEST_SLURM") != "1", reason="starts a SLURM; run by: make test-slurm"
     ),
     pytest.mark.skipif(bool(slurm_cluster.lacking()), reason=slurm_cluster.lacking() or "SLURM is installed"),
-    pytest.mark.timeout(1200),
+    pytest.mark.timeout(1500),
 ]
 
 BEGAN = time.monotonic()
@@ -137,7 +137,7 @@ def assert_complete(photonfarm_in: Any, folder: Path, markers: Markers, jobs: in
 def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
     photonfarm_in: Any, folder: Path, launch: Launch, cluster: Cluster, with_redis: bool
 ) -> None:
-    jobs, rows = 600, 6
+    jobs, rows = 1500, 6  # more than four workers commit before SLURM gives up the node, after 40 s
     say(f"--- array of 4, {'with Redis' if with_redis else 'without Redis'}")
     with ExitStack() as stack:
         named = ("--redis", stack.enter_context(EmbeddedRedis(folder / "redis")).url) if with_redis else ()
@@ -159,15 +159,17 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
         (preempted,) = [task for task, state in cluster.states(array).items() if state == "PD"]
         say(f"job {high} of partition high preempted {preempted}: {cluster.about(preempted)['Reason']}")
         cluster.kill_node("n2")
+        returned = stack.enter_context(ExitStack())
+        returned.callback(cluster.start_node, "n2")  # also for the next test, if this one fails
         say(f"slurmd of n2 killed; {markers.look()} jobs committed")
         lost = [task for task, node in nodes.items() if node == "n2"]
         wait_for(lambda: all(cluster.about(task)["JobState"] != "RUNNING" for task in lost), 120)
         say(f"n2 is {cluster.run('sinfo', '--noheader', '--nodes', 'n2', '--format', '%T')}; {lost} requeued; "
             f"{markers.look()} jobs committed")  # fmt: skip
         assert markers.look() < jobs, "the plan was complete before the node was lost"
-        wait_for(lambda: markers.look() == jobs, 600)
+        wait_for(lambda: markers.look() == jobs, 900)
         assert_complete(photonfarm_in, folder, markers, jobs)
-        cluster.start_node("n2")
+        returned.close()
         wait_for(lambda: not cluster.states(array), 400)
         restarts = {task: int(cluster.about(task)["Restarts"]) for task in tasks}
         states = {task: cluster.about(task)["JobState"] for task in tasks}
@@ -178,26 +180,29 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
     assert "stopping; a job in hand" in (folder / f"slurm/worker-{preempted}.log").read_text()
 
 
-def test_a_task_that_its_time_limit_ends_goes_on_in_its_next_turn(
+def test_tasks_that_their_time_limit_ends_go_on_in_their_next_turn(
     photonfarm_in: Any, folder: Path, launch: Launch, cluster: Cluster
 ) -> None:
+    """Two tasks, as one of an array has the array's own job id."""
     say("--- time limit of 3 minutes")
-    started = launch("--modifications", "10000", "--views", "1", "--shard-rows", "6", "--workers", "1", "--time", "3")
-    task, log = f"{started['workers']}_0", folder / "slurm" / f"worker-{started['workers']}_0.log"
-    wait_for(lambda: log.exists() and "the task is back in the queue" in log.read_text(), 240)
+    started = launch("--modifications", "60000", "--views", "1", "--shard-rows", "6", "--workers", "2", "--time", "3")
+    array, back = started["workers"], "the task is back in the queue"
+    tasks = [f"{array}_{number}" for number in range(2)]
+    files = [folder / "slurm" / f"worker-{task}.log" for task in tasks]
+    wait_for(lambda: all(log.exists() and back in log.read_text() for log in files), 240)
     markers = Markers(scene_of(folder))
     first = markers.look()
-    say(f"told near its limit, with {first} jobs committed; now {cluster.states(started['workers'])}")
+    say(f"told near their limit, with {first} jobs committed; now {cluster.states(array)}")
     assert first > 0
-    wait_for(lambda: cluster.states(started["workers"]).get(task) == "R", 240)
+    wait_for(lambda: cluster.states(array) == dict.fromkeys(tasks, "R"), 240)
     wait_for(lambda: markers.look() > first, 120)
-    assert int(cluster.about(task)["Restarts"]) == 1
-    say(f"goes on: {markers.look()} jobs committed")
+    assert [int(cluster.about(task)["Restarts"]) for task in tasks] == [1, 1]
+    say(f"go on: {markers.look()} jobs committed")
 
-    cluster.run("scancel", task)
-    wait_for(lambda: not cluster.states(started["workers"]), 60)
-    say("cancelled by its user, and not put back")
-    assert log.read_text().count("the task is back in the queue") == 1
+    cluster.run("scancel", array)
+    wait_for(lambda: not cluster.states(array), 60)
+    say("cancelled by their user, and not put back")
+    assert [log.read_text().count(back) for log in files] == [1, 1]
     assert not list((folder / "store").glob("failures/*"))
 
 

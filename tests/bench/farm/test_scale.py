@@ -48,12 +48,12 @@ def test_what_does_not_grow_is_constant_and_never_ends() -> None:
 
 
 def measured(exponent: float, at_target: float) -> dict[str, dict[float, dict[str, float]]]:
-    """A store's first and later plans: the first grows so, to so many times what is borne; the later ones linearly."""
+    """A store's first and later plans: the first grows so, to so many times its limit; the later ones linearly."""
     first, later = (next(cost for cost in COSTS if cost.step == step) for step in ("plan", "plan_more"))
     target = TARGETS["samples"]
     return {
-        "plan": {n: {first.name: at_target * first.borne * (n / target) ** exponent} for n in SIZES},
-        "plan_more": {n: {later.name: 2 * later.borne * n / target} for n in SIZES},
+        "plan": {n: {first.name: at_target * first.limit * (n / target) ** exponent} for n in SIZES},
+        "plan_more": {n: {later.name: 2 * later.limit * n / target} for n in SIZES},
     }
 
 
@@ -61,8 +61,8 @@ def test_what_ends_first_is_told_first() -> None:
     found = grown(measured(exponent=2, at_target=100))
     assert [each.cost.step for each in first_to_break(found)] == ["plan", "plan_more"]
     assert [round(each.room, 2) for each in first_to_break(found)] == [0.1, 0.5]
-    borne = grown(measured(exponent=2, at_target=0.5))
-    assert [each.cost.step for each in first_to_break(borne)] == ["plan_more"]
+    below = grown(measured(exponent=2, at_target=0.5))
+    assert [each.cost.step for each in first_to_break(below)] == ["plan_more"]
 
 
 def test_the_page_sets_what_was_before_beside_what_is_now(tmp_path: Path) -> None:

@@ -193,7 +193,7 @@ def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
     assert plain(scene) == []
     looks.clear()
     assert worker._step() == 0
-    assert looks == [True, False] * 2, "followed ones, and since they found nothing, whole ones"
+    assert looks == [True, False], "a followed one, and since it found nothing, a whole one"
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,21 @@ def test_gpus_are_asked_for_where_they_are_used(slurm: Launcher) -> None:
     assert "PHOTONFARM_DEVICE" not in trainer
 
 
+@pytest.mark.parametrize(("given", "seen"), [(None, ""), ("2,3", "2,3")])
+def test_cards_of_a_node_that_slurm_has_not_given_to_a_task_are_hidden_from_it(
+    slurm: Launcher, given: str | None, seen: str
+) -> None:
+    """Workers take any card that they see, and so does torch."""
+    for script in slurm("cornell", "--train", "--dry-run").stdout.split("#!/usr/bin/env bash\n")[1:]:
+        (line,) = re.findall(r"(?m)^export CUDA_VISIBLE_DEVICES=.*$", script)
+        here = {"PATH": os.environ["PATH"], **({} if given is None else {"CUDA_VISIBLE_DEVICES": given})}
+        command = f'{line}\necho "<$CUDA_VISIBLE_DEVICES>"'
+        said = subprocess.run(["bash", "-c", command], env=here, capture_output=True, text=True, check=True).stdout
+        assert said == f"<{seen}>\n"
+    scripts = slurm("cornell", "--gpus", "--train", "--train-gpus", "--dry-run").stdout
+    assert "CUDA_VISIBLE_DEVICES" not in scripts
+
+
 def test_the_trainer_has_options_of_its_own_which_come_last(slurm: Launcher, tmp_path: Path) -> None:
     asked = ("--train", "--train-steps", "20", "--sbatch=--account=lab", "--train-sbatch=--partition=big one")
     workers, trainer = slurm("cornell", *asked, "--partition", "low", "--dry-run").stdout.split("#!/usr/bin")[1:]
@@ -112,6 +127,38 @@ def test_a_script_ends_with_the_exit_code_of_its_worker(slurm: Launcher, tmp_pat
     done = subprocess.run(["bash", tmp_path / "worker.sh"], env=here, capture_output=True, text=True, check=False)
     assert done.returncode == StoreError.exit_code
     assert "there is no store" in done.stderr
+
+
+@pytest.mark.parametrize("is_array", [True, False], ids=["array", "trainer"])
+def test_near_its_limit_a_task_asks_for_itself_alone_and_puts_itself_alone_back(
+    slurm: Launcher, tmp_path: Path, is_array: bool
+) -> None:
+    """One task of an array has the array's id as its job id, which means all tasks to SLURM's commands.
+
+    SLURM's two commands are stood in for, as bash functions that say what they were asked; test_slurm.py has the real
+    ones.
+    """
+    workers, trainer = slurm("cornell", "--train", "--dry-run").stdout.split("#!/usr/bin/env bash\n")[1:]
+    script, replaced = re.subn(
+        r"(?m)^.*photonfarm.* &$", "(trap 'exit 0' TERM; while :; do sleep 0.05; done) &",
+        workers if is_array else trainer,
+    )  # fmt: skip
+    assert replaced == 1
+    asked = f"""
+squeue() {{ echo "squeue $*" >> {tmp_path}/asked; echo RUNNING; }}
+scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
+(sleep 0.3; kill -TERM $$) &
+"""
+    here = os.environ | {"SLURM_JOB_ID": "7"}
+    array = "7" if is_array else "5"  # of a task that submitted it, which a trainer may have in its environment
+    here |= {"SLURM_ARRAY_JOB_ID": array, "SLURM_ARRAY_TASK_ID": "3"}
+    done = subprocess.run(["bash", "-c", asked + script], env=here, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "the task is back in the queue" in done.stderr
+    task = "7_3" if is_array else "7"
+    assert (tmp_path / "asked").read_text().splitlines() == [
+        f"squeue --noheader --jobs {task} --format %T", f"scontrol requeue {task}",
+    ]  # fmt: skip
 
 
 def test_the_launcher_needs_neither_mitsuba_nor_torch(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm import running_farm, waits
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import announced
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_of
+from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, queue_of, since_commit_s
 from photonfarm.shared.farm.training import RunFolder
 from photonfarm.shared.farm.watch import STEADY_S, FarmWatch
 from photonfarm.shared.plan.request import Request
@@ -189,6 +190,26 @@ def test_status_without_a_redis_is_no_error_for_who_named_none(
     assert done.exit_code == 0
     assert "no Redis" not in done.output
     assert "`photonfarm up` goes on with the 8 samples" in done.output
+
+
+def test_what_workers_without_redis_commit_shows_that_they_are_at_work(
+    scene: SceneStore, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("photonfarm.shared.queue.connect", _refuses)
+    assert since_commit_s(store) is None
+    now = [0.0]
+    watch = FarmWatch(store, f"unix://{tmp_path}/none", named_redis=False, clock=lambda: now[0])
+    assert "  no farm is at work here" in lines(watch.look())
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    now[0] = 2 * STEADY_S
+    assert any("workers without Redis are at work" in line for line in lines(watch.look()))
+    said = CliRunner().invoke(umbrella, ["status"]).stdout
+    assert re.search(r"a job was committed \d s ago, so workers without Redis may be at work .*; 6 samples are", said)
+    os.utime(scene.folder / "committed", (time.time() - 2 * RECENT_S,) * 2)
+    assert since_commit_s(store) == pytest.approx(2 * RECENT_S, abs=60)
+    assert "`photonfarm up` goes on with the 6 samples" in CliRunner().invoke(umbrella, ["status"]).stdout
 
 
 def _refuses(*_: Any, **__: Any) -> None:

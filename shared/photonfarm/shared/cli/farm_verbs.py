@@ -154,7 +154,7 @@ def status(
     """
     from photonfarm.shared.cli import show_status
     from photonfarm.shared.farm.running_farm import running_farm
-    from photonfarm.shared.farm.status import check_read, queue_of
+    from photonfarm.shared.farm.status import check_read, queue_of, since_commit_s
     from photonfarm.shared.farm.training import RunFolder
     from photonfarm.shared.store import Store, store_status
 
@@ -173,7 +173,8 @@ def status(
         show_status.document(scenes, queue_of(opened, url), store, running, trainings)
     else:
         show_status.scenes(scenes)  # before Redis is asked, which may not answer
-        show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named)
+        since_s = since_commit_s(opened)
+        show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named, since_commit_s=since_s)
         show_status.trainings(trainings)
     check_read(scenes)
 

@@ -12,7 +12,7 @@ import click
 from photonfarm.shared.cli.show import print_json, print_table
 from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.running_farm import RunningFarm
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, lost_plan, unread_markers
+from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, lost_plan, unread_markers
 from photonfarm.shared.farm.training import TrainingProgress
 from photonfarm.shared.farm.waits import idle
 from photonfarm.shared.store import SceneStatus
@@ -77,25 +77,32 @@ def queue(
     running: RunningFarm | None,
     *,
     named_redis: bool,
+    since_commit_s: float | None = None,
 ) -> None:
     """Print what the queue of a store with these scenes holds, or why nothing is known of it.
 
-    Unless a user has `named_redis`, a store without one is nothing to worry about.
+    Unless a user has `named_redis`, a store without one is nothing to worry about. `since_commit_s` is the time since a
+    job was committed, if that is known.
     """
     if running is not None:
         click.echo("`photonfarm up` is at work here" + (f"; watch it at {running.web}" if running.web else ""))
     missing = sum(scene.samples_planned - scene.samples_complete for scene in scenes)
     if isinstance(found, NoQueue):
-        click.echo(f"queue: {found.reason if named_redis else _without_redis(missing)}")
+        click.echo(f"queue: {found.reason if named_redis else _without_redis(missing, since_commit_s)}")
     else:
         _known_queue(found, scenes, store, missing)
     _failures("failed before", found.kept, store)
 
 
-def _without_redis(missing: int) -> str:
+def _without_redis(missing: int, since_commit_s: float | None) -> str:
     """What a store without a queue means to someone who has named no Redis."""
     if not missing:
         return "none is needed: all that is planned is there"
+    if since_commit_s is not None and since_commit_s <= RECENT_S:
+        return (
+            f"none is known here, but a job was committed {in_words(since_commit_s)} ago, so workers without Redis may "
+            f"be at work (`work --share`, `slurm`); {missing} samples are missing"
+        )
     return f"no farm is at work here; `photonfarm up` goes on with the {missing} samples that are missing"
 
 

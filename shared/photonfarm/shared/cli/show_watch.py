@@ -69,7 +69,7 @@ def _below(view: FarmView) -> Iterator[str]:
     """Which scenes cannot be read, what workers and trainers do, and what waits for what."""
     yield from (f"  scene {each.scene_id} cannot be read: {each.error}" for each in view.scenes if each.error)
     if isinstance(view.queue, NoQueue):
-        yield "  no farm is at work here" if not view.named_redis else f"  {view.queue.reason}"
+        yield f"  {view.queue.reason if view.named_redis else _without_redis(view)}"
     else:
         status = view.queue.status
         yield f"  {status.queued} jobs queued, {status.running} running, {status.workers} workers"
@@ -78,6 +78,13 @@ def _below(view: FarmView) -> Iterator[str]:
     yield from (f"  {training.line}" for training in view.trainings)
     yield from (f"  {wait}" for wait in view.waits)
     yield from (f"  before: {failed(cause)}" for cause in view.queue.kept)
+
+
+def _without_redis(view: FarmView) -> str:
+    """What is known of workers without a queue: only what they commit."""
+    if any(scene.rate for scene in view.scenes):
+        return "no queue is known here; workers without Redis are at work (`work --share`, `slurm`)"
+    return "no farm is at work here"
 
 
 def _counted(scene: SceneView) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -11,6 +12,10 @@ from urllib.parse import urlsplit
 
 from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError, store_errors
 from photonfarm.shared.store import SceneStatus, Store
+from photonfarm.shared.store.format.markers import COMMITTED
+from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.shared.store.write.guides import GUIDES
+from photonfarm.shared.store.write.scene_store import SCENES
 from photonfarm.shared.store.write.store import FAILURES_FOLDER
 
 if TYPE_CHECKING:
@@ -18,6 +23,10 @@ if TYPE_CHECKING:
 
 ANSWER_S = 5.0
 """How long `status` waits for an answer of Redis; workers wait longer."""
+
+
+RECENT_S = 300.0
+"""The age up to which a commit is a sign that workers are at work: jobs are meant to take 5 to 30 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +74,20 @@ def queue_now(store: Store, redis_url: str) -> StoreQueue | NoQueue:
         return queue_of(store, redis_url)
     except RedisError as error:
         return NoQueue(f"Redis failed: {error}")
+
+
+def since_commit_s(store: Store) -> float | None:
+    """The seconds since a job was last committed, or its marker removed: all that is seen of workers without Redis.
+
+    They follow from the times of folders, which the store's disk sets. None without a commit, and for a bucket.
+    """
+    if not isinstance(store.storage, LocalStorage):
+        return None
+    scenes = [store.storage.root / SCENES / scene_id for scene_id in store.scene_ids()]
+    with store_errors("look for the last commit", store.storage.where):
+        folders = [folder for scene in scenes for folder in (scene / COMMITTED, scene / GUIDES / COMMITTED)]
+        times = [folder.stat().st_mtime for folder in folders if folder.is_dir()]
+    return max(0.0, time.time() - max(times)) if times else None
 
 
 def _refused(redis_url: str) -> str | None:

@@ -83,6 +83,7 @@ function progress(state) {
 
 function workers(state) {
   const queue = state.queue ? `${state.queue.workers} workers, ${state.queue.queued} jobs queued, ${state.queue.running} running`
+    : state.scenes.some((scene) => scene.rate) ? "No queue is known here; workers without Redis are at work."
     : "No farm is at work here. “photonfarm up”, or “photonfarm work” beside a Redis, goes on with what is missing.";
   const list = state.workers.map((worker) => h("div", { class: "worker" }, h("span", {}, worker.name),
     worker.total ? track(worker.done, worker.total) : h("span", { class: "figure" }, "…"),

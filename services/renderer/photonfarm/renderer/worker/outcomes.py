@@ -193,8 +193,9 @@ def is_complete(
         raise unreadable[min(unreadable)]
     if scene_of and not not_failed:
         first = min(scene_of)
+        failures = "1 job has" if len(scene_of) == 1 else f"{len(scene_of)} jobs have"
         raise IncompleteError(
-            f"{len(scene_of)} jobs have failed; {first}: {failed[first]}. `photonfarm status` has the causes, and "
-            "commands that repeat them"
+            f"{failures} failed; {first}: {failed[first]}. `photonfarm status` has the causes, and commands that "
+            "repeat them"
         )
     return not scene_of

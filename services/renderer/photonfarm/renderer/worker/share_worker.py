@@ -89,8 +89,9 @@ class ShareWorker:
 
     def _next(self) -> tuple[str, int] | None:
         """The next job that is still missing, if there is one."""
-        for _ in range(2):  # what was left at the last look may have been rendered by others
-            if not self._waiting or time.monotonic() >= self._look_due:
+        looked = False
+        while not looked:  # what was left at the last look may have been rendered by others
+            if looked := not self._waiting or time.monotonic() >= self._look_due:
                 self._look()
             while self._waiting:
                 scene_id, job = self._waiting.popleft()

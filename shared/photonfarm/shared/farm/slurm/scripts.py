@@ -10,6 +10,7 @@ from pathlib import Path
 
 from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.farm.devices import CUDA, DEVICE_VARIABLE, VISIBLE_VARIABLE
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 
 SIGNAL_S = 60
@@ -17,6 +18,12 @@ SIGNAL_S = 60
 
 LEAST_LIMIT_S = 180
 """The shortest time limit: below it, TERM may come before the first job is rendered."""
+
+WORKER_TASK = '"${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"'
+"""A worker's task, for the shell. One of an array's has the array's own SLURM_JOB_ID, by which SLURM means them all."""
+
+TRAINER_TASK = '"$SLURM_JOB_ID"'
+"""The trainer's job, for the shell."""
 
 REQUEUES = 50
 """How often a task that its time limit ends puts itself back: a job longer than the limit would otherwise never end."""
@@ -67,14 +74,14 @@ def worker_script(at: Surroundings, resources: Resources, workers: int, specs: S
         which = f"--scene {scene_id}" if scene_id else ""
     verb = f"{shlex.join(command('work'))} --until-complete {name} {which}".rstrip()
     options = (f"--array=0-{workers - 1}", f"--output={_pattern(at.logs)}/worker-%A_%a.log")
-    device = [("PHOTONFARM_DEVICE", "cuda")] if resources.gpu else []
-    return _script(at, resources, "photonfarm", options, verb, device)
+    device = [(DEVICE_VARIABLE, CUDA)] if resources.gpu else []
+    return _script(at, resources, "photonfarm", options, verb, WORKER_TASK, device)
 
 
 def trainer_script(at: Surroundings, resources: Resources, arguments: Sequence[str]) -> str:
     """The script of the trainer, whose verb has these arguments."""
     options = (f"--output={_pattern(at.logs)}/trainer-%j.log",)
-    return _script(at, resources, "photonfarm-train", options, shlex.join(command(*arguments)))
+    return _script(at, resources, "photonfarm-train", options, shlex.join(command(*arguments)), TRAINER_TASK)
 
 
 def _script(
@@ -83,6 +90,7 @@ def _script(
     name: str,
     options: Sequence[str],
     verb: str,
+    task: str,
     further: Sequence[tuple[str, str]] = (),
 ) -> str:
     asked = [
@@ -93,8 +101,11 @@ def _script(
     asked += [f"--time={resources.time}"] if resources.time else []
     asked += ["--gres=gpu:1"] if resources.gpu else []
     directives = "\n".join(f"#SBATCH {_directive(option)}" for option in (*asked, *resources.further))
-    variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further))
-    return _TEMPLATE.format(directives=directives, variables=variables, verb=verb, requeues=REQUEUES)
+    cards = (
+        [] if resources.gpu else [(VISIBLE_VARIABLE, f"${{{VISIBLE_VARIABLE}-}}")]
+    )  # those that SLURM gives, or none
+    variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further, *cards))
+    return _TEMPLATE.format(directives=directives, variables=variables, task=task, verb=verb, requeues=REQUEUES)
 
 
 def _variables(at: Surroundings) -> list[tuple[str, str]]:
@@ -127,11 +138,13 @@ _TEMPLATE = """\
 
 {variables}
 
+task={task}
+
 # Near the time limit SLURM tells this script alone. A cancelled or preempted job is told as a whole: then the process
 # below has its TERM already, and a second one would end it at once.
 near_limit=
 on_term() {{
-    case $(squeue --noheader --jobs "$SLURM_JOB_ID" --format %T 2>/dev/null) in
+    case $(squeue --noheader --jobs "$task" --format %T 2>/dev/null) in
         RUNNING | SIGNALING) near_limit=yes; kill -TERM "$process" ;;
         '') kill -TERM "$process" ;; # SLURM does not answer
     esac
@@ -146,7 +159,7 @@ wait "$process"
 code=$?
 
 if [[ $near_limit ]]; then
-    if ((${{SLURM_RESTART_COUNT:-0}} < {requeues})) && scontrol requeue "$SLURM_JOB_ID"; then
+    if ((${{SLURM_RESTART_COUNT:-0}} < {requeues})) && scontrol requeue "$task"; then
         echo "photonfarm: the time limit is near; the task is back in the queue, and goes on from what is stored" >&2
     else
         echo "photonfarm: the time limit is near; the same photonfarm slurm goes on from what is stored" >&2

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import shutil
 from bisect import bisect_left
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -99,11 +99,16 @@ class GuideStore:
         """The marker of a job whose guides are there; raises as `SceneStore.marker` does."""
         return markers.read(self.storage, self.name, job)
 
-    def lacks(self, found: Sequence[StoredPlan], among: Sequence[int]) -> list[int]:
-        """Which of some jobs, in order, have new views that still lack guides; none if the scene has no guides."""
+    def lacks(
+        self, found: Sequence[StoredPlan], among: Sequence[int], look: Callable[[], Set[int]] | None = None
+    ) -> list[int]:
+        """Which of some jobs, in order, have new views that still lack guides; none if the scene has no guides.
+
+        `look` gives the jobs whose guides are there, where that costs less than to list all markers.
+        """
         if self.settings() is None:
             return []
-        done = self.committed_jobs()
+        done = (look or self.committed_jobs)()
         return jobs_with_views(found, [job for job in among if job not in done])
 
     def without(self, found: Sequence[StoredPlan]) -> list[int]:

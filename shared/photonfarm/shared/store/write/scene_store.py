@@ -175,10 +175,13 @@ class SceneStore:
         aside, and should ask without it before they take nothing to be missing. Raises CorruptError if inputs of the
         first jobs are damaged: nobody could render them.
         """
-        committed = self._followed[0].look() if followed else self.committed_jobs()
+        rendered, guided = self._followed
+        committed = rendered.look() if followed else self.committed_jobs()
         jobs = range(self.jobs())
         uncommitted = {job for job in jobs if job not in committed}
-        unguided = self.guides.lacks(self._plans, [job for job in jobs if job in committed])
+        unguided = self.guides.lacks(
+            self._plans, [job for job in jobs if job in committed], guided.look if followed else None
+        )
         missing = sorted(uncommitted.union(unguided))
         plans.check_inputs(self._plans, missing[:CHECKED_JOBS])
         return missing

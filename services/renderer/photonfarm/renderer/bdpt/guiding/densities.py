@@ -19,7 +19,7 @@ DEFAULT_SHARE = 0.35
 """The share of light paths that start as without a guide: no light is lost, and no density is below this part."""
 
 PRIOR = 16.0
-"""The number of light paths that the estimate of the coarser cell counts for: rare bright ones would mislead without."""
+"""The number of light paths that the estimate of the coarser cell counts for; rare bright ones would mislead else."""
 
 
 def gains(layout: Layout, sums: F64, starts: F64, edges: F64, probability: F64) -> F64:

@@ -92,6 +92,7 @@ def rows(measured: Any, renders: list[Any], purpose: Any, exposure: float, pairs
         CandidateRow(
             connections=row.connections,
             light_ratio=row.light_ratio,
+            guided=row.guided,
             errors=rounds.errors(row.candidate),
             missed=rounds.missed(row.candidate),
             fixed_s=launches * row.fixed_s,
@@ -112,7 +113,7 @@ def compared(spec: Any, measurement: Any) -> Compared:
 
 def short(candidate: Any) -> str:
     """A candidate as (connections, light ratio)."""
-    return f"({candidate.connections}, {candidate.light_ratio:g})"
+    return f"({candidate.connections}, {candidate.light_ratio:g}{', guided' * candidate.guided})"
 
 
 def line(spec: Any, training: Compared, images: Compared, alone: Compared) -> list[Any]:

@@ -44,7 +44,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--clock", choices=["wall", "cpu"], default="cpu", help="what equal time means (default cpu)")
     parser.add_argument("--reference", type=float, default=16, help="time of a reference, in budgets (default 16)")
     parser.add_argument("--pilot-seconds", type=float, default=20, help="CPU time of the pilot of each scene")
-    parser.add_argument("--chosen", default="", metavar="C,R", help="settings of the method chosen, without a pilot")
+    parser.add_argument(
+        "--chosen", default="", metavar="C,R[,guided]", help="settings of the method chosen, without a pilot"
+    )
     parser.add_argument("--json", type=Path, help="write all results into this file too")
     parser.add_argument("--quick", action="store_true", help="a test run: 64², 0.2 s, 4 seeds, short pilot")
     arguments = parser.parse_args()

@@ -22,14 +22,16 @@ from typing import Any
 def settings(text: str) -> Any:
     from photonfarm.renderer.verify.scenes.case import BdptSettings
 
-    connections, light_ratio = text.split(",")
-    return BdptSettings(int(connections), float(light_ratio))
+    connections, light_ratio, *guided = text.split(",")
+    if guided not in ([], ["guided"]):
+        raise ValueError(text)
+    return BdptSettings(int(connections), float(light_ratio), bool(guided))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[], help="rows (1 … 36) or scenes")
-    parser.add_argument("--settings", nargs="+", type=settings, default=[], help="connections,light_ratio")
+    parser.add_argument("--settings", nargs="+", type=settings, default=[], help="connections,light_ratio[,guided]")
     parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="as in the tests")
     parser.add_argument("--threads", type=int, default=1, help="threads of Dr.Jit")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,20 +22,31 @@ class Chosen:
     light_ratio: float
     pilot_wall_s: float  # with the compilation of all candidates; 0 for settings that were given
     why: str
+    guided: bool = False
 
     def parameters(self) -> dict[str, Any]:
         """The settings as the plugin takes them."""
-        return {"connections": self.connections, "light_ratio": self.light_ratio}
+        guided = {"guided": True} if self.guided else {}
+        return {"connections": self.connections, "light_ratio": self.light_ratio, **guided}
+
+
+def words(parameters: dict[str, Any]) -> str:
+    """The settings in brackets, "(1, 0.25)" or "(1, 0.25, guided)"."""
+    guided = ", guided" if parameters.get("guided") else ""
+    return f"({parameters['connections']}, {parameters['light_ratio']:g}{guided})"
 
 
 def given(text: str) -> Chosen:
-    """Settings from "CONNECTIONS,LIGHT_RATIO". Raises ValueError for anything else."""
+    """Settings from "CONNECTIONS,LIGHT_RATIO" or "CONNECTIONS,LIGHT_RATIO,guided". Raises ValueError for others."""
     try:
-        connections, light_ratio = text.split(",")
-        return Chosen(int(connections), float(light_ratio), 0.0, "given")
+        connections, light_ratio, *more = text.split(",")
+        if more not in ([], ["guided"]):
+            raise ValueError(text)
+        return Chosen(int(connections), float(light_ratio), 0.0, "given", bool(more))
     except ValueError:
         raise ValueError(
-            f"chosen settings are {text!r}; allowed is CONNECTIONS,LIGHT_RATIO such as 0,1, or nothing to run the pilot"
+            f"chosen settings are {text!r}; allowed is CONNECTIONS,LIGHT_RATIO such as 0,1, or with ',guided' after "
+            "it, or nothing to run the pilot"
         ) from None
 
 
@@ -63,8 +74,7 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
     def render(candidate: Any, seed: int, spp: int) -> Any:
         if candidate not in plugins:
             common = {"type": "bdpt", "record": True, "max_depth": max_depth, "rr_depth": 5}
-            settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
-            plugins[candidate] = mi.load_dict({**common, **settings})
+            plugins[candidate] = mi.load_dict({**common, **asdict(candidate)})
         image = np.array(mi.render(scene, integrator=plugins[candidate], spp=spp, seed=seed))
         return np.ascontiguousarray(image[..., :3], np.float32)
 
@@ -73,4 +83,5 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
     candidates, _ = content.restrict(found, max_depth, 1.0, measurement.GRID)
     choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
     best = choice.candidate
-    return Chosen(best.connections, best.light_ratio, time.perf_counter() - start, "; ".join(choice.reasons))
+    spent_s = time.perf_counter() - start
+    return Chosen(best.connections, best.light_ratio, spent_s, "; ".join(choice.reasons), best.guided)

@@ -31,7 +31,7 @@ class MeasureSettings:
     clock: str  # 'wall' or 'cpu'
     reference: float  # time of each reference, in budgets
     pilot_seconds: float  # CPU time of the pilot
-    chosen: str  # settings given instead of a pilot, "CONNECTIONS,LIGHT_RATIO", or ""
+    chosen: str  # settings given instead of a pilot, "CONNECTIONS,LIGHT_RATIO[,guided]", or ""
 
     @property
     def budgets_s(self) -> tuple[float, ...]:

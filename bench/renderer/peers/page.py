@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bench.harness.results import table
+from bench.renderer.peers.chosen import words
 from bench.renderer.peers.plans import BASELINE, PLAN_SECONDS
 from bench.renderer.peers.verdict import verdict
 from bench.renderer.peers.wording import LABELS, SAME_SCENE, Z_LIMIT, figure, mark
@@ -93,11 +94,7 @@ def scenes(results: list[dict[str, Any]]) -> list[str]:
     lines = []
     for r in results:
         picked = r["chosen"]
-        chosen = (
-            f"({picked['connections']}, {picked['light_ratio']:g}), pilot {picked['pilot_wall_s']:.0f} s"
-            if picked
-            else "–"
-        )
+        chosen = f"{words(picked)}, pilot {picked['pilot_wall_s']:.0f} s" if picked else "–"
         lux = r["absent"].get("pyluxcore") or "; ".join(r["differences"]) or "the same"
         lux = lux if "pyluxcore" in r["absent"] or "pyluxcore" in r["rows"] else "–"
         lines.append((r["line"], r["scene"], r["max_depth"], r["reference"], chosen, lux, r["note"]))

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from bench.harness.results import table
+from bench.renderer.peers.chosen import words
 from bench.renderer.peers.plans import FIXED, PEERS
 from bench.renderer.peers.wording import LABELS, figure, mark
 
@@ -48,7 +49,7 @@ def losses(results: list[dict[str, Any]]) -> list[str]:
     for result in results:
         for fixed, gains in ((name, gains) for name, gains in result["gains"].items() if name in FIXED):
             if any(gain["value"] + gain["standard_error"] < 1 for gain in gains.values()):
-                picked = f"({result['chosen']['connections']}, {result['chosen']['light_ratio']:g})"
+                picked = words(result["chosen"])
                 lines.append(
                     f"- In {result['line']} *chosen*, {picked}, is worse than {LABELS[fixed]}: it has "
                     f"{figure(gains['full'])} of its efficiency in all pixels, {figure(gains['trimmed'])} trimmed."

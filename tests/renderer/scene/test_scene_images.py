@@ -9,7 +9,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.scene.modification import rest, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.shared.scene.view import Camera, View, sample_view
 
 
 def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene, somewhere: View) -> None:
@@ -54,6 +54,26 @@ def test_a_static_scene_has_one_configuration(small: Callable[..., SceneSpec]) -
     cornell.apply(rest(cornell.spec))
     view = View(np.array([0, 1, 1.5], np.float32), np.array([0, 1, -1], np.float32))
     assert cornell.render_half(view, 0).mean() > 0.05
+
+
+def test_guided_light_paths_follow_from_the_configuration_alone(small: Callable[..., SceneSpec]) -> None:
+    plain = small(load_spec("room"))
+    spec = plain.model_copy(update={"transport": plain.transport.model_copy(update={"guided": True})})
+    room = LoadedScene.load(spec)
+    moved = sample_modification(spec, 0, 0)
+    views = [sample_view(spec, moved.key(spec.scene_id), 0, i, moved) for i in range(2)]
+    room.apply(moved)
+    halves = room.render_halves(views[0], (1, 2))
+    room.render_halves(views[1], (3, 4))
+    room.apply(rest(spec))
+    at_rest = room.render_halves(views[0], (1, 2))
+    room.apply(moved)
+    np.testing.assert_array_equal(room.render_halves(views[0], (1, 2)), halves)
+    room.forget_guides()
+    np.testing.assert_array_equal(room.render_halves(views[0], (1, 2)), halves)
+    np.testing.assert_allclose(room.render_images(views[:1] * 2, (1, 2)), halves, rtol=1e-3, atol=1e-3)
+    assert np.any(halves[0] != halves[1])
+    assert np.any(at_rest != halves)
 
 
 def test_no_photons_are_traced_where_the_spec_wants_none(small: Callable[..., SceneSpec]) -> None:

@@ -8,9 +8,11 @@ from photonfarm.renderer.verify.pictures import keep
 from photonfarm.renderer.verify.report import FAILURES
 from photonfarm.renderer.verify.rows import REFUSALS, ROWS, SCENES
 from photonfarm.renderer.verify.runner import message_of, run
-from photonfarm.renderer.verify.scenes.case import HardScene, Refusal
+from photonfarm.renderer.verify.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
 
 SLOW = ("18-mask-veils", "25-hundred-lights-at-once")
+GUIDED_QUICK = ("07-updated-sun", "10-sphere-light", "22-mirrored-mesh-light", "26-narrow-spot")
+"""The rows that are rendered with guided light paths in every run of the tests; the others are slow."""
 QUICK = [scene for scene in SCENES if scene.quick is not None]
 
 
@@ -20,7 +22,23 @@ QUICK = [scene for scene in SCENES if scene.quick is not None]
     [pytest.param(scene, marks=[pytest.mark.slow] if scene.label in SLOW else [], id=scene.label) for scene in QUICK],
 )
 def test_a_hard_scene_looks_like_its_truth(scene: HardScene) -> None:
-    for outcome in run(scene, quick=True):
+    check(scene)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(scene, marks=[] if scene.label in GUIDED_QUICK else [pytest.mark.slow], id=scene.label)
+        for scene in QUICK
+        if GUIDED in scene.settings
+    ],
+)
+def test_a_hard_scene_looks_like_its_truth_with_guided_light_paths(scene: HardScene) -> None:
+    check(scene, GUIDED)
+
+
+def check(scene: HardScene, *settings: BdptSettings) -> None:
+    for outcome in run(scene, quick=True, settings=settings):
         if outcome.result.faults:
             folder = keep(outcome, FAILURES).resolve()
             pytest.fail(

@@ -1,6 +1,7 @@
 import json
 import tomllib
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
     """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
     return CandidateRow(
-        connections=candidate.connections, light_ratio=candidate.light_ratio, missed=0.0,
+        connections=candidate.connections, light_ratio=candidate.light_ratio, guided=candidate.guided, missed=0.0,
         errors=RelativeErrors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
     )  # fmt: skip
 
@@ -150,6 +151,25 @@ def test_the_guides_whose_time_belongs_to_a_sample_enter_the_digest_for_training
     assert cache.digest(more, Purpose.TRAINING) != cache.digest(spec, Purpose.TRAINING)
 
 
+def test_a_plan_writes_guided_only_where_it_is_or_was_set() -> None:
+    guided = Candidate(0, 1.0, guided=True)
+    rows = (
+        row(PLAIN, 0.2, 0.01, 0.01),
+        row(LIGHT, 0.05, 0.02, 0.02),
+        row(guided, 0.02, 0.02, 0.02),
+        row(JOINED, 0.05, 0.02, 0.04),
+    )
+    found = plan_of(spec_with(), measurement(*rows), cached=False)
+    assert found.candidate == guided
+    assert found.changes["transport"]["guided"] is True
+    assert "guided" in text_of(found).splitlines()[0]
+    worse = (*rows[:2], row(guided, 0.9, 0.02, 0.02), rows[3])
+    back = plan_of(spec_with(connections=0, guided=True), measurement(*worse), cached=False)
+    assert back.candidate == LIGHT
+    assert back.settings["transport"]["guided"] is False
+    assert "guided" not in plan_of(spec_with(), measurement(), cached=False).settings["transport"]
+
+
 @pytest.mark.parametrize("seed", range(200))
 def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -157,7 +177,7 @@ def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int
     plain = tuple(rows[0].errors.own)
     rows = [r.model_copy(update={"errors": r.errors.model_copy(update={"plain": plain})}) for r in rows]
     now = GRID[rng.integers(len(GRID))]
-    transport = {"connections": now.connections, "light_ratio": now.light_ratio, "half_spp": int(rng.integers(1, 9))}
+    transport = {**asdict(now), "half_spp": int(rng.integers(1, 9))}
     half_s = next(r for r in rows if r.candidate == now).cost.time_s(transport["half_spp"])
     found = measurement(*rows).model_copy(update={"half_s": half_s})
     if seed % 2:  # for training, where samples take more than their half-estimates
@@ -259,13 +279,13 @@ def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:
     text = lines(plan_of(spec_with(), measurement(), cached=False))
     first = next(i for i, line in enumerate(text) if line.startswith("connections  light ratio"))
     assert text[first : first + 4] == [
-        "connections  light ratio  images  half_spp  relMSE     ms  error × time",
-        "          0            0      12         9  0.0444  100.0   1",
-        "          0            1      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
-        "          1            1      12         2  0.0500  100.0   1.13 ± 0.06",
+        "connections  light ratio  guided  images  half_spp  relMSE     ms  error × time",
+        "          0            0      no      12         9  0.0444  100.0   1",
+        "          0            1      no      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
+        "          1            1      no      12         2  0.0500  100.0   1.13 ± 0.06",
     ]
     legend = "\n".join(text[first + 4 :])
-    for column in ("connections:", "light ratio:", "half_spp:", "relMSE and ms:", "error × time:"):
+    for column in ("connections:", "light ratio:", "guided:", "half_spp:", "relMSE and ms:", "error × time:"):
         assert column in legend
     assert all(line == line.rstrip() for line in text)
 

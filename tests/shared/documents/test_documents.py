@@ -80,6 +80,8 @@ def test_the_page_of_the_scene_spec_lists_every_key_and_its_default(section: str
     for name, field in fields.items():
         if field.is_required():
             assert told[name] == "required", name
+        elif isinstance(field.default, bool):
+            assert told[name] == str(field.default).lower(), name
         elif isinstance(field.default, int | float):
             assert float(told[name]) == field.default, name
 

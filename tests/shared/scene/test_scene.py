@@ -68,6 +68,10 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(exposure=0), "exposure = 0"),
         (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
         (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0;"),
+        (
+            changed(transport={"light_ratio": 0, "connections": 0, "guided": True}),
+            "transport: has guided = true and light_ratio = 0",
+        ),
         (changed(flm={}), "flm: .*nearest: film"),
         (changed(objects=tomllib.loads(SPEC)["objects"] * 2), "'ball'"),
         ({k: v for k, v in changed().items() if k != "view"}, "view: "),
@@ -106,6 +110,13 @@ def test_plain_path_tracing_and_light_paths_without_connections_are_allowed(scen
     for transport in ({"light_ratio": 0, "connections": 0}, {"connections": 0}, {"light_ratio": 0.25}):
         spec = parse_spec(changed(transport=transport), where="spec")
         assert SceneSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+def test_a_spec_without_guided_light_paths_has_the_id_it_always_had(scenes: Path) -> None:
+    plain, off, on = (parse_spec(changed(transport=t), where="spec") for t in ({}, {"guided": False}, {"guided": True}))
+    assert "guided" not in plain.identity()["transport"]
+    assert plain.scene_id == off.scene_id != on.scene_id
+    assert SceneSpec.model_validate_json(on.model_dump_json()) == on
 
 
 def test_a_folder_does_not_hide_the_spec_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

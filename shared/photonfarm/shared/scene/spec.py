@@ -140,6 +140,7 @@ class Transport(Frozen):
     connections: Annotated[int, Field(ge=0, le=64)] = 1  # light vertices joined to each eye vertex
     light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
+    guided: bool = Field(default=False, exclude_if=lambda said: not said)  # let light paths start where views see them
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
@@ -147,6 +148,11 @@ class Transport(Frozen):
             raise ValueError(
                 f"has connections = {self.connections} and light_ratio = 0; light_ratio = 0 has no light paths to "
                 "connect to, so connections = 0 or a light_ratio above 0 is required"
+            )
+        if self.guided and not self.light_ratio:
+            raise ValueError(
+                "has guided = true and light_ratio = 0, which has no light paths to guide; guided = false or a "
+                "light_ratio above 0 is required"
             )
         return self
 

@@ -19,14 +19,16 @@ P is the selection probability, A the area, R the radius of a sphere around the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, read_selection
+from photonfarm.renderer.bdpt.guiding import squares
+from photonfarm.renderer.bdpt.guiding.starts import GuidedStarts, StartGuide, rectangles
+from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, is_flat, read_selection, sampling_weight
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
+from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 
 AREA, INFINITE, POSITION, DIRECTION, EYE_ONLY, HIT_ONLY = range(6)
 """The kinds of light. Light paths never start at EYE_ONLY; HIT_ONLY is found by hits alone, which have weight 1."""
@@ -40,10 +42,6 @@ _KIND_BY_CLASS = {
     "Projector": POSITION,
     "DirectionalEmitter": DIRECTION,
 }
-BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
-"""The first parts of the names of parameters that scale a light's brightness."""
-
-_FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 
 
 @dataclass(slots=True)
@@ -62,6 +60,7 @@ class Lights:
     cos_cutoff: mi.Float  # [N]: −1 for lights that shine everywhere
     centre: mi.Point3f  # [1]: centre of the scene's sphere
     radius: mi.Float  # [1]: its radius
+    guided: GuidedStarts | None = None  # how light paths start where they are guided
 
     def only(self, kind: int) -> bool:
         """Whether all lights that can be selected are of this kind; the host knows it, so other kinds cost nothing."""
@@ -89,6 +88,48 @@ class Lights:
         """The ê of the given emitters; 0 for the null pointer."""
         return dr.gather(mi.Float, self.emission, dr.reinterpret_array(mi.UInt32, emitter))
 
+    @property
+    def kind_of_kernels(self) -> tuple[object, ...]:
+        """The properties for which kernels are compiled."""
+        return self.kinds, self.guided and self.guided.layout
+
+    @property
+    def emit_probability(self) -> mi.Float:
+        """The probabilities [N] by which light paths choose their light without a guide."""
+        lane = dr.arange(mi.UInt32, self.count)
+        before = dr.gather(mi.Float, self.emit_cdf, dr.maximum(lane, 1) - 1, lane > 0)
+        return (self.emit_cdf - before) / dr.gather(mi.Float, self.emit_cdf, mi.UInt32(self.count - 1))
+
+    def guided_by(self, guide: StartGuide, scene: mi.Scene) -> Lights:
+        """The same lights of ``scene``, with light paths that start as ``guide`` says.
+
+        Raises ValueError for a guide of another number of lights.
+        """
+        emitters = list(scene.emitters())
+        ids = [_registry_id(emitter) for emitter in emitters]
+        return replace(self, guided=GuidedStarts.bind(guide, self.emit_probability, ids, rectangles(emitters)))
+
+    def gain(
+        self, emitter: mi.EmitterPtr, ds: mi.DirectionSample3f, n: mi.Vector3f, x: mi.Point3f, active: mi.Bool
+    ) -> mi.Float:
+        """The density of light paths from the point ``ds`` of a light to ``x``, over that of the default sampling.
+
+        ``ds`` is seen from ``x``, ``n`` is the light's normal there.
+        """
+        if self.guided is None:
+            return mi.Float(1)
+        light, d = self.guided.number_of(emitter), -ds.d
+        u = mi.Point2f(0)
+        if self.has(AREA):
+            u = squares.on_area(n, d)
+        if self.has(INFINITE) or self.has(DIRECTION):
+            at_infinity = self.is_kind(light, INFINITE) | self.is_kind(light, DIRECTION)
+            u = dr.select(at_infinity, squares.on_disk(d, (x - self.centre) / self.radius), u)
+        if self.has(POSITION):
+            axis, cutoff = dr.gather(mi.Vector3f, self.axis, light), dr.gather(mi.Float, self.cos_cutoff, light)
+            u = dr.select(self.is_kind(light, POSITION), squares.in_cone(axis, cutoff, d), u)
+        return self.guided.gain_at(light, u, ds.uv, active & (dr.reinterpret_array(mi.UInt32, emitter) != 0))
+
 
 # ------------------------------------------------ Reading a scene ------------------------------------------------
 
@@ -102,16 +143,16 @@ def read_lights(scene: mi.Scene) -> Lights:
     kinds = tuple(_kind(emitter, shapes.get(key)) for emitter, key in zip(emitters, ids, strict=True))
     parameters = [mi.traverse(emitter) for emitter in emitters]
     pointers = scene.emitters_dr()
-    centre, radius = _scene_sphere(scene)
+    centre, radius = bounding_sphere(scene)
     kind = mi.UInt32(list(kinds))  # lists: Dr.Jit compiles again for each alignment of numpy's memory
 
-    weights = [_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
+    weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
             weights[i] = dr.select(is_flat(shapes[key]), weights[i], 0)
     weight = _column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
-    selection = read_selection(pointers, ids, weight, _box(scene)) if n > 1 else None
+    selection = read_selection(pointers, ids, weight, bounding_box(scene)) if n > 1 else None
     emit_weight = dr.select(kind == EYE_ONLY, 0, weight if selection is None else selection.overall)
     emit_cdf, emit = _normalise(emit_weight, n)
     axis, cos_cutoff = _cones(parameters, emitters)
@@ -150,53 +191,6 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
     return AREA
 
 
-def is_flat(mesh: mi.Mesh) -> mi.Bool:
-    """Whether a mesh light's vertex normals are its faces' normals, as data [1].
-
-    Otherwise Mitsuba converts densities with the wrong cosine, which also biases `path`. Such lights get selection
-    probability 0, and only hits find them.
-    """
-    if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
-        return mi.Bool(True)
-    corner = dr.arange(mi.UInt32, mesh.face_count()) * 3
-    faces = mesh.faces_buffer()
-    vertices = [dr.gather(mi.UInt32, faces, corner + k) for k in range(3)]
-    p0, p1, p2 = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), v) for v in vertices)
-    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
-    normals = mesh.vertex_normals_buffer()
-    aligned = [dr.abs(dr.dot(normal, dr.gather(mi.Vector3f, normals, v))) for v in vertices]
-    return dr.max(dr.fmax(1 - dr.minimum(dr.minimum(aligned[0], aligned[1]), aligned[2]), 0)) < _FLAT
-
-
-def _weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
-    """The weight of a light's selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
-    shines = mi.Bool(True)
-    keys = list(parameters.keys())
-    brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
-    if brightness:
-        shines = mi.Bool(False)
-        for key in brightness:
-            shines |= _is_positive(parameters[key])
-    if "scale" in parameters:
-        shines &= _is_positive(parameters["scale"])
-    return dr.select(shines, dr.opaque(mi.Float, emitter.sampling_weight()), 0)
-
-
-def _is_positive(value: Any) -> mi.Bool:
-    """Whether a parameter, of whatever type, is or holds a number above 0, as data [1]."""
-    if isinstance(value, bool | str):
-        return mi.Bool(False)
-    if isinstance(value, int | float):
-        return dr.opaque(mi.Float, float(value)) > 0
-    if dr.is_tensor_v(value):
-        return dr.max(value.array) > 0
-    if not (dr.is_array_v(value) and dr.is_float_v(value)):
-        return mi.Bool(False)
-    dr.make_opaque(value)
-    highest = dr.max(value) if dr.depth_v(value) > 1 else value
-    return dr.max(highest) > 0 if dr.width(highest) > 1 else highest > 0
-
-
 def _column(n: int, entries: list[mi.Float | float]) -> mi.Float:
     """The n entries [1] as one array [n]."""
     column = dr.zeros(mi.Float, n)
@@ -224,19 +218,6 @@ def _cones(parameters: list[mi.SceneParameters], emitters: list[mi.Emitter]) -> 
         axes.append(dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1)) if spot else mi.Vector3f(0, 0, 1))
         cosines.append(dr.cos(dr.deg2rad(params["cutoff_angle"])) if spot else mi.Float(-1))
     return mi.Vector3f(*(_column(n, [axis[k] for axis in axes]) for k in range(3))), _column(n, cosines)
-
-
-def _box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """The scene's bounding box, or that of a unit sphere where there is no shape."""
-    box = scene.bbox()
-    return box if box.valid() and scene.shapes() else mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])
-
-
-def _scene_sphere(scene: mi.Scene) -> tuple[mi.Point3f, mi.Float]:
-    """(centre, radius) of a sphere around everything, as data: an object that moves past it recompiles nothing."""
-    sphere = _box(scene).bounding_sphere()
-    radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
-    return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)
 
 
 # ------------------------------------- Next event estimation (y₀ from x) -------------------------------------
@@ -282,7 +263,7 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
     shape_factor = mi.Float(1)  # e/(ê·cos₀): 1, p_ω or 1/r²
     shape_factor = dr.select(lights.is_kind(index, INFINITE), ds.pdf, shape_factor)
     shape_factor = dr.select(lights.is_kind(index, POSITION), dr.rcp(dr.square(ds.dist)), shape_factor)
-    ratio = lights.emission_factor(emitter) * shape_factor / density
+    ratio = lights.emission_factor(emitter) * shape_factor / density * lights.gain(emitter, ds, ds.n, si.p, valid)
     return DirectSample(
         d=ds.d,
         p=ds.p,
@@ -308,7 +289,8 @@ def hit_densities(
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
     factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
-    return lights.nee_probability(emitter, vertex) * p_direction, lights.emission_factor(emitter) * factor
+    emission = lights.emission_factor(emitter) * factor * lights.gain(emitter, ds, si.sh_frame.n, vertex, active)
+    return lights.nee_probability(emitter, vertex) * p_direction, emission
 
 
 # ------------------------------------------------ Emission (from y₀) ------------------------------------------------
@@ -321,22 +303,30 @@ class Emission:
     ray: mi.Ray3f
     throughput: mi.Spectrum  # Le·cos₀/e
     emitter: mi.EmitterPtr
-    factor: mi.Float  # ê
+    factor: mi.Float  # ê, times the guide's gain
     p_direction: mi.Float  # p_ω of a light at infinity
     sample: mi.DirectionSample3f  # p, n, uv of y₀ on an area light
     is_area: mi.Bool
     at_infinity: mi.Bool  # INFINITE or DIRECTION
     delta: mi.Bool  # POSITION or DIRECTION
     valid: mi.Bool
+    cell: mi.UInt32  # of the guide's table; 0 without a guide
 
 
 def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UInt32) -> Emission:
     """Start the light paths of number ``path`` among ``paths`` [1]: neighbours in number set out in like directions."""
     n = dr.width(rng.index)
-    index = _choose_start(lights, rng)
+    if lights.guided is None:
+        index, cell, gain = _choose_start(lights, rng), mi.UInt32(0), mi.Float(1)
+        u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng)
+    else:
+        drawn = lights.guided.draw(path, paths, rng)
+        index, cell, gain = drawn.light, drawn.cell, drawn.gain
+        far = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
+        u_position = dr.select(far, drawn.direction, drawn.position)  # at infinity it is the disk that is guided
+        u_direction = dr.select(far, drawn.position, drawn.direction)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
-    factor = lights.emission_factor(emitter)
-    u_position, u_direction = rng.next_2d(), along_curve(path, paths, rng)
+    factor = lights.emission_factor(emitter) * gain
     out = Emission(
         ray=dr.zeros(mi.Ray3f, n),
         throughput=mi.Spectrum(0),
@@ -348,9 +338,10 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
         at_infinity=lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION),
         delta=lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION),
         valid=factor > 0,
+        cell=cell,
     )
     if lights.has(AREA):
-        _start_on_area(out, u_position, u_direction, out.valid & out.is_area)
+        _start_on_area(out, lights, u_position, u_direction, out.valid & out.is_area)
     if lights.has(INFINITE) or lights.has(DIRECTION):
         _start_at_infinity(out, lights, u_position, u_direction, out.valid & out.at_infinity)
     if lights.has(POSITION):
@@ -360,9 +351,13 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
     return out
 
 
-def _start_on_area(out: Emission, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool) -> None:
+def _start_on_area(
+    out: Emission, lights: Lights, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool
+) -> None:
     ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
+    if lights.guided is not None:
+        si.sh_frame = squares.frame_about(ps.n)
     si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
     out.throughput[mask] = out.emitter.eval(si, mask)
     out.ray = dr.select(mask, si.spawn_ray(si.to_world(si.wi)), out.ray)
@@ -376,7 +371,8 @@ def _start_at_infinity(
     reference.p = lights.centre
     ds, weight = out.emitter.sample_direction(reference, u_direction, mask)
     disk = mi.warp.square_to_uniform_disk_concentric(u_position)
-    offset = mi.Frame3f(ds.d).to_world(mi.Vector3f(disk.x, disk.y, 1))
+    frame = mi.Frame3f(ds.d) if lights.guided is None else squares.frame_about(ds.d)
+    offset = frame.to_world(mi.Vector3f(disk.x, disk.y, 1))
     ray = mi.Ray3f(lights.centre + lights.radius * offset, -ds.d)
     out.throughput[mask] = weight
     out.ray = dr.select(mask, ray, out.ray)

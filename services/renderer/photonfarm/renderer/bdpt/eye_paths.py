@@ -15,6 +15,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.emission import DirectSample, Lights, hit_densities, sample_direct
+from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
@@ -51,6 +52,7 @@ class Connectable:
     image: mi.UInt32  # image of the launch that a lane belongs to
     first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
     shifts: mi.UInt32  # see randomness.shifts
+    tally: TalliedConnections | None = None  # where a guide is learned
 
 
 def trace_eye_paths(
@@ -253,14 +255,18 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
     """
     later = (options.connections + 1) // 2
     near = own.depth <= _NEAR_VERTICES
+    share = dr.select(near, mi.Float(1 / options.connections), 1 / later)
     total = mi.Spectrum(0)
     for k in range(options.connections):
         row = connectable.image * SHIFTS + own.depth % SHIFTS
         active = own.active if k < later else own.active & near
         shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
         path = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
-        total += _connect(scene, options, connectable, replace(own, active=active), path)
-    return total * dr.select(near, mi.Float(1 / options.connections), 1 / later)
+        value = _connect(scene, options, connectable, replace(own, active=active), path)
+        if connectable.tally is not None:
+            connectable.tally.add(path, value * share, active)
+        total += value
+    return total * share
 
 
 def _connect(

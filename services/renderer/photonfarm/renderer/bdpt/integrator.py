@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +14,10 @@ from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
+from photonfarm.renderer.bdpt.guiding.learning import Effort, learned
+from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
+from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
+from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
@@ -31,6 +37,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
     - ``light_samples`` (int ≥ 1, default 1): samples of the lights by next event estimation at the first eye vertex,
       where most noise of direct light comes from; later vertices take one.
+    - ``guided`` (bool, default false): let light paths start where they reach what the camera sees. `render` learns a
+      guide from a few paths of its own first, unless it is given one by `learn_guide`.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -48,8 +56,11 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.light_ratio = float(props.get("light_ratio", 1.0))
         self.light_samples = int(props.get("light_samples", 1))
         self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
+        self.guided = bool(props.get("guided", False))
         self._check_parameters()
-        self._recorder = Recorder(trace) if props.get("record", False) else None
+        record = props.get("record", False)
+        self._recorder = Recorder(trace) if record else None
+        self._learning_recorder = Recorder(explore) if record else None
 
     def _check_parameters(self) -> None:
         if self.rr_depth < 1:
@@ -90,15 +101,17 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
+        guide: StartGuide | None = None,
     ) -> mi.TensorXf:
         """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
         ``sensor`` is a sensor or the number of one; ``spp`` of 0 stands for the samples per pixel of its sampler.
+        A ``guided`` integrator without a ``guide`` learns one for this image.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         seed = int(seed if isinstance(seed, int) else seed[0])
-        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count())
+        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count(), guide=guide)
         with dr.suspend_grad():
             film.prepare([])
             images.put(film)
@@ -109,40 +122,102 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 dr.eval(image)
             return image
 
-    def render_seeds(self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int) -> mi.TensorXf:
+    def render_seeds(
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, guide: StartGuide | None = None
+    ) -> mi.TensorXf:
         """Independent images of one view, [K, H, W, 3], one for each seed; several small images share a launch.
 
         Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
         an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
-        their order. Raises as ``render`` does.
+        their order. A ``guided`` integrator without a ``guide`` learns one for each image. Raises as ``render`` does.
         """
         width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp).tensor(width, height)
+        return self._render(scene, sensor, seeds, spp, guide=guide).tensor(width, height)
 
     def render_views(
-        self, scene: mi.Scene, sensor: mi.Sensor, places: Places, seeds: Sequence[int], spp: int
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        places: Places,
+        seeds: Sequence[int],
+        spp: int,
+        guide: StartGuide | None = None,
     ) -> mi.TensorXf:
         """Images of K views, [K, H, W, 3], one for each place and seed; as many as may be share a launch.
 
         ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
         has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
-        does.
+        does. A ``guided`` integrator without a ``guide`` learns one for each view.
         """
         width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp, places).tensor(width, height)
+        return self._render(scene, sensor, seeds, spp, places, guide).tensor(width, height)
 
-    def _render(
-        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None = None
-    ) -> ImageStack:
+    def learn_guide(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        places: Places | None = None,
+        effort: Effort | None = None,
+    ) -> StartGuide | None:
+        """A guide for light paths that reach what a sensor sees, or what it sees from several ``places``.
+
+        It is learned from random numbers of its own, so images that are rendered with it stay independent of each
+        other, and unbiased. None where light paths cannot be guided, as there are none. Raises as ``render`` does.
+        """
+        if not (self.guided and self._has_light_paths(scene)):
+            return None
+        self._check(scene, sensor)
+        effort = effort or Effort()
+        with dr.suspend_grad():
+            width, height = (int(n) for n in sensor.film().crop_size())
+            lights = read_lights(scene)
+            layout = Layout.of(lights.count)
+            lights = lights.guided_by(StartGuide.neutral(layout), scene)
+            views = 1 if places is None else len(places)
+            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)
+            launch = effort.launch(views)
+            options = self._options(launch, width * height)
+            options = replace(options, light_ratio=dr.opaque(mi.Float, self.light_ratio))
+            shifts = randomness.shifts(seeds, launch, self.connections) if options.connects else None
+            poses = None if places is None else Poses.of(places)
+            keys = randomness.image_keys(seeds)
+            lanes = SparseLanes.of(launch, (width, height), 1, keys, shifts, poses)
+            lanes.thin(effort.eye_paths // views)
+            images, tally = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes)
+            return learned(layout, lights.emit_probability, images, Tally(*tally), lanes)
+
+    def _has_light_paths(self, scene: mi.Scene) -> bool:
+        return bool(self.light_ratio > 0 and self.max_depth > 2 and scene.emitters())
+
+    def _check(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         sensor.sampler().seed(0, 1)  # else the state left by another integrator would be evaluated with our input
         check_scene(scene, light_paths=self.light_ratio > 0)
         check_sensor(sensor, light_tracing=self.light_ratio > 0)
+
+    def _render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seeds: Sequence[int],
+        spp: int,
+        places: Places | None = None,
+        guide: StartGuide | None = None,
+    ) -> ImageStack:
+        self._check(scene, sensor)
+        if self.guided and guide is None and len(seeds) > 1:
+            return self._render_with_own_guides(scene, sensor, seeds, spp, places)
         with dr.suspend_grad():
             seeds = [seed & 0xFFFFFFFF for seed in seeds]
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
+            if self.guided and guide is None:
+                effort = Effort.of_image(pixels * spp, self.light_ratio)
+                guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
-            light_ratio = self.light_ratio if lights is not None and self.max_depth > 2 else 0
+            light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
+            if lights is not None and guide is not None and light_ratio:
+                lights = lights.guided_by(guide, scene)
             images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
                 options = self._options(launch, pixels)
@@ -155,14 +230,38 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 images.add(part, launch.first_image * pixels)
             return images
 
+    def _render_with_own_guides(
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None
+    ) -> ImageStack:
+        """The images that are rendered alone, each with a guide of its own."""
+        width, height = sensor.film().crop_size()
+        images = ImageStack.black(len(seeds) * width * height)
+        for k, seed in enumerate(seeds):
+            image = self._render(scene, sensor, [seed], spp, None if places is None else places[k : k + 1])
+            images.add(image, k * width * height)
+        return images
+
     def _trace(
         self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
     ) -> ImageStack:
-        if self._recorder is None:
-            return trace(scene, sensor, lights, options, lanes)
+        images: ImageStack = self._call(trace, self._recorder, scene, sensor, lights, options, lanes)
+        return images
+
+    def _call(
+        self,
+        function: Callable[..., Any],
+        recorder: Recorder | None,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        lights: Lights | None,
+        options: PathOptions,
+        lanes: Lanes,
+    ) -> Any:
+        if recorder is None:
+            return function(scene, sensor, lights, options, lanes)
         clipping = (sensor.near_clip(), sensor.far_clip())
-        kind = (lanes.kind, options.kind, lights.kinds if lights else None, clipping)
-        return self._recorder(kind, scene, sensor, lights, options, lanes)
+        kind = (lanes.kind, options.kind, lights.kind_of_kernels if lights else None, clipping)
+        return recorder(kind, scene, sensor, lights, options, lanes)
 
     def _options(self, launch: Launch, pixels: int) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0
@@ -178,8 +277,28 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         )
 
 
-def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes) -> ImageStack:
-    """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch."""
+def explore(
+    scene: mi.Scene, sensor: mi.Sensor, lights: Lights, options: PathOptions, lanes: SparseLanes
+) -> tuple[ImageStack, tuple[mi.Float, mi.Float, mi.Float]]:
+    """(images, sums of a `Tally`) of a launch from which a guide is learned."""
+    tally = Tally.empty(Layout.of(lights.count), lanes)
+    images = trace(scene, sensor, lights, options, lanes, tally)
+    dr.eval(tally.sums)
+    return images, tally.sums
+
+
+def trace(
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    lights: Lights | None,
+    options: PathOptions,
+    lanes: Lanes,
+    tally: Tally | None = None,
+) -> ImageStack:
+    """Trace the light paths and the eye paths of a launch; a recording runs it once for each kind of launch.
+
+    What the light paths add is noted in ``tally``.
+    """
     splats, sums = (Sums.zero(lanes.images * lanes.pixels) for _ in range(2))
     vertices = None
     if lights is not None and options.traces_light:
@@ -187,6 +306,8 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
         lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
+        if tally is not None:
+            splat = TalliedSplat.of(splat, tally, image, dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2])))
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         vertices = trace_light_paths(
             scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
@@ -201,7 +322,8 @@ def trace(scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: Pa
     connectable = None
     if vertices is not None:
         first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
-        connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts)
+        noted = None if tally is None else TalliedConnections.of(tally, image, pixel, lanes)
+        connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, noted)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     sums.add(image * lanes.pixels + pixel, radiance * lanes.eye_scale, dr.select(hit, lanes.eye_scale, 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -101,7 +102,7 @@ class Lanes:
         keys: mi.UInt32,
         shifts: mi.UInt32 | None,
         poses: Poses | None = None,
-    ) -> Lanes:
+    ) -> Self:
         """The lanes of a launch whose images have the size ``size`` (W, H) and get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0

@@ -24,6 +24,7 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
+from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, empty_record
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
@@ -84,6 +85,8 @@ def trace_light_paths(
     None without connections.
     """
     start = sample_emission(lights, rng, path, paths)
+    if isinstance(splat, TalliedSplat):
+        splat.begin(start.cell)
     (state,) = traced_once(
         state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
         cond=lambda s: s.active,
@@ -91,6 +94,8 @@ def trace_light_paths(
         labels=("light path",),
         label="bdpt light paths",
     )
+    if isinstance(splat, TalliedSplat):
+        splat.end(state.depth)
     if not options.connects:
         dr.eval(state.seen)
         return None

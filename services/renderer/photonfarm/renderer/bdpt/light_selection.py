@@ -10,7 +10,7 @@ Lighting Calculations*, 1996, who choose by an unshadowed estimate at each point
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +21,11 @@ CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell
 _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
+_FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
 _MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
+
+BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
+"""The first parts of the names of parameters that scale a light's brightness."""
 
 LightIndex: TypeAlias = "mi.Int32 | mi.UInt32"
 """Numbers of lights; ``dr.binary_search`` finds signed ones."""
@@ -105,3 +109,50 @@ def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box:
 def _over_cell(value: mi.Float, n: int) -> mi.Float:
     """The sum over a cell's n entries, at each of them [C·n]."""
     return dr.repeat(dr.block_sum(value, n), n)
+
+
+def sampling_weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
+    """The weight of a light's selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
+    shines = mi.Bool(True)
+    keys = list(parameters.keys())
+    brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
+    if brightness:
+        shines = mi.Bool(False)
+        for key in brightness:
+            shines |= _is_positive(parameters[key])
+    if "scale" in parameters:
+        shines &= _is_positive(parameters["scale"])
+    return dr.select(shines, dr.opaque(mi.Float, emitter.sampling_weight()), 0)
+
+
+def _is_positive(value: Any) -> mi.Bool:
+    """Whether a parameter, of whatever type, is or holds a number above 0, as data [1]."""
+    if isinstance(value, bool | str):
+        return mi.Bool(False)
+    if isinstance(value, int | float):
+        return dr.opaque(mi.Float, float(value)) > 0
+    if dr.is_tensor_v(value):
+        return dr.max(value.array) > 0
+    if not (dr.is_array_v(value) and dr.is_float_v(value)):
+        return mi.Bool(False)
+    dr.make_opaque(value)
+    highest = dr.max(value) if dr.depth_v(value) > 1 else value
+    return dr.max(highest) > 0 if dr.width(highest) > 1 else highest > 0
+
+
+def is_flat(mesh: mi.Mesh) -> mi.Bool:
+    """Whether a mesh light's vertex normals are its faces' normals, as data [1].
+
+    Otherwise Mitsuba converts densities with the wrong cosine, which also biases `path`. Such lights get selection
+    probability 0, and only hits find them.
+    """
+    if mesh.class_name() == "Rectangle" or not mesh.has_vertex_normals():
+        return mi.Bool(True)
+    corner = dr.arange(mi.UInt32, mesh.face_count()) * 3
+    faces = mesh.faces_buffer()
+    vertices = [dr.gather(mi.UInt32, faces, corner + k) for k in range(3)]
+    p0, p1, p2 = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), v) for v in vertices)
+    normal = dr.normalize(dr.cross(p1 - p0, p2 - p0))
+    normals = mesh.vertex_normals_buffer()
+    aligned = [dr.abs(dr.dot(normal, dr.gather(mi.Vector3f, normals, v))) for v in vertices]
+    return dr.max(dr.fmax(1 - dr.minimum(dr.minimum(aligned[0], aligned[1]), aligned[2]), 0)) < _FLAT

@@ -23,7 +23,7 @@ import numpy as np
 
 from photonfarm.renderer.bdpt.launches import Launch
 
-LIGHT, EYE, PAIRING, PHOTONS = range(4)
+LIGHT, EYE, PAIRING, PHOTONS, PIXELS, LEARNING = range(6)
 
 _ULP = 1 / (1 << 24)
 
@@ -104,6 +104,11 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
     return mi.UInt32(np.concatenate(table).tolist())  # a list: Dr.Jit compiles again for each alignment of numpy's
 
 
+def learning_seeds(seed: int, images: int) -> list[int]:
+    """The seeds of images from which a guide is learned; images that are rendered with it have others."""
+    return [int(s) for s in np.random.default_rng([seed, LEARNING]).integers(1 << 32, size=images)]
+
+
 def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
     """A stratified point in [0, 1)² for each of ``n`` [1] lanes; lanes of close numbers get points close to each other.
 
@@ -113,11 +118,11 @@ def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
     """
     length = mi.UInt32((mi.Float64(lane) + mi.Float64(rng.next_1d())) * (4294967296.0 / mi.Float64(n)))
     below = mi.Point2f(rng.next_independent(), rng.next_independent())
-    cell = mi.Point2f(mi.Float(_every_other_bit(length)), mi.Float(_every_other_bit(length >> 1)))
+    cell = mi.Point2f(mi.Float(every_other_bit(length)), mi.Float(every_other_bit(length >> 1)))
     return dr.minimum((cell + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
 
 
-def _every_other_bit(x: mi.UInt32) -> mi.UInt32:
+def every_other_bit(x: mi.UInt32) -> mi.UInt32:
     """The 16 bits at even places, moved together."""
     for shift, bits in ((0, 0x55555555), (1, 0x33333333), (2, 0x0F0F0F0F), (4, 0x00FF00FF), (8, 0x0000FFFF)):
         x = (x | (x >> shift)) & bits

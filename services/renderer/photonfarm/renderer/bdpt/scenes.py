@@ -1,7 +1,8 @@
-"""The scenes that this integrator accepts."""
+"""The scenes that this integrator accepts, and how large they are."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 UNBOUNDED = 0xFFFFFFFF
@@ -37,3 +38,16 @@ def depth_limit(max_depth: int) -> int:
     if max_depth < -1:
         raise ValueError(f"bdpt: max_depth is {max_depth}; allowed are -1 (unbounded) and any number of edges from 0")
     return UNBOUNDED if max_depth == -1 else max_depth
+
+
+def bounding_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
+    """The scene's bounding box, or that of a unit sphere where there is no shape."""
+    box = scene.bbox()
+    return box if box.valid() and scene.shapes() else mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])
+
+
+def bounding_sphere(scene: mi.Scene) -> tuple[mi.Point3f, mi.Float]:
+    """(centre, radius) of a sphere around everything, as data: an object that moves past it recompiles nothing."""
+    sphere = bounding_box(scene).bounding_sphere()
+    radius = max(float(sphere.radius) * (1 + 1e-3), 1e-6)
+    return mi.Point3f(*(dr.opaque(mi.Float, float(sphere.center[k])) for k in range(3))), dr.opaque(mi.Float, radius)

@@ -40,6 +40,7 @@ class LoadedScene:
         from photonfarm.renderer.scene.editing import MovableGroup
         from photonfarm.renderer.scene.materials import Materials
         from photonfarm.renderer.scene.sensor import AimedSensor
+        from photonfarm.renderer.scene.start_guides import SceneGuides
         from photonfarm.renderer.scene.surroundings import boxes_of
 
         self.spec = spec
@@ -58,6 +59,7 @@ class LoadedScene:
         self.boxes = boxes_of(shapes)
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
         self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
+        self._start_guides = SceneGuides(spec, self._sensor)
         self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self._state = rest(spec)
 
@@ -110,8 +112,9 @@ class LoadedScene:
 
         They have the spec's `half_spp` samples per pixel unless it is given.
         """
-        spp = half_spp or self.spec.transport.half_spp
-        return np.array(self._integrator.render_seeds(self.scene, self._sensor.aim(view), seeds, spp), np.float32)
+        spp, guide = half_spp or self.spec.transport.half_spp, self._guide(self._integrator)
+        sensor = self._sensor.aim(view)
+        return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide), np.float32)
 
     def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
         """A half-estimate of each view by its seed, (K, H, W, 3), in as few launches as the device's memory allows.
@@ -120,7 +123,8 @@ class LoadedScene:
         """
         places = np.stack([self._sensor.place(view) for view in views])
         sensor, spp = self._sensor.at_origin, self.spec.transport.half_spp
-        return np.array(self._integrator.render_views(self.scene, sensor, places, seeds, spp), np.float32)
+        guide = self._guide(self._integrator)
+        return np.array(self._integrator.render_views(self.scene, sensor, places, seeds, spp, guide), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
         """One half-estimate, (H, W, 3)."""
@@ -131,13 +135,24 @@ class LoadedScene:
         import drjit as dr
         import mitsuba as mi
 
-        image = (integrator or self._integrator).render(
+        integrator = integrator or self._integrator
+        guide = self._guide(integrator)
+        image = integrator.render(
             self.scene,
             sensor=self._sensor.aim(view),
             seed=dr.opaque(mi.UInt32, seed),
             spp=spp or self.spec.transport.half_spp,
+            **({} if guide is None else {"guide": guide}),
         )
         return np.array(image, np.float32)
+
+    def _guide(self, integrator: Any) -> Any:
+        """The guide of the present configuration's light paths; None for an integrator that is not guided."""
+        return self._start_guides.of(integrator, self.scene, self._state)
+
+    def forget_guides(self) -> None:
+        """Learn guides anew, as for another configuration."""
+        self._start_guides.forget()
 
     def buffers(self, view: View) -> ViewBuffers:
         """The depth, albedo and normal buffers of a view in the present configuration."""

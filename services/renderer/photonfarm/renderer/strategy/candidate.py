@@ -15,12 +15,14 @@ class Candidate:
 
     connections: int  # light vertices joined to each eye vertex
     light_ratio: float  # light paths per eye path; 0: plain path tracing
+    guided: bool = False  # whether light paths start where views see them
 
     def __str__(self) -> str:
         if not self.light_ratio:
             return "plain path tracing"
         few = {0: "without connections", 1: "with 1 connection"}
-        return f"light ratio {self.light_ratio:g} " + few.get(self.connections, f"with {self.connections} connections")
+        joined = few.get(self.connections, f"with {self.connections} connections")
+        return f"light ratio {self.light_ratio:g} {joined}" + ", guided" * self.guided
 
 
 PLAIN = Candidate(0, 0.0)

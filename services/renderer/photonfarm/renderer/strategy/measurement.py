@@ -22,9 +22,10 @@ from photonfarm.shared.core.models import Frozen
 from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
 
-GRID = tuple(
-    Candidate(c, r)
-    for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25), (1, 1.0), (2, 1.0), (4, 1.0), (8, 1.0))
+GRID = (
+    *(Candidate(c, r) for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25))),
+    *(Candidate(c, 1.0) for c in (1, 2, 4, 8)),
+    *(Candidate(c, r, guided=True) for c, r in ((0, 1.0), (0, 16.0), (1, 1.0), (4, 1.0), (8, 1.0))),
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 
@@ -56,6 +57,7 @@ class CandidateRow(Frozen):
 
     connections: int
     light_ratio: float
+    guided: bool = False
     errors: RelativeErrors  # of images of `Measurement.spp`
     missed: float  # as in `MeasuredCandidate`
     fixed_s: float  # as in `ImageCost`, of a half-estimate on the spec's film
@@ -64,7 +66,7 @@ class CandidateRow(Frozen):
     @property
     def candidate(self) -> Candidate:
         """The settings."""
-        return Candidate(self.connections, self.light_ratio)
+        return Candidate(self.connections, self.light_ratio, self.guided)
 
     @property
     def cost(self) -> ImageCost:
@@ -241,7 +243,7 @@ def _halved(film: Film) -> Film:
 
 def present(spec: SceneSpec) -> Candidate:
     """The present settings of a spec."""
-    return Candidate(spec.transport.connections, spec.transport.light_ratio)
+    return Candidate(spec.transport.connections, spec.transport.light_ratio, spec.transport.guided)
 
 
 def _images(half: ImageCost, half_s: float, beside: ViewCost, spp: int) -> float:
@@ -284,6 +286,7 @@ def _row(
     return CandidateRow(
         connections=measured.candidate.connections,
         light_ratio=measured.candidate.light_ratio,
+        guided=measured.candidate.guided,
         errors=measured.errors,
         missed=measured.missed,
         fixed_s=correction * half.fixed_s,

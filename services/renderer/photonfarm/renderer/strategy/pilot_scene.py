@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,8 +66,10 @@ class PilotScene:
 
     def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
         self.apply(modification)
+        if self.spec.groups:
+            self.loaded.forget_guides()  # a sample has them to learn, as with one view of each configuration
         if candidate not in self._integrators:
-            settings = {"connections": candidate.connections, "light_ratio": candidate.light_ratio}
+            settings = asdict(candidate)
             self._integrators[candidate] = integrator_of(self.spec.transport.model_copy(update=settings))
         return self.loaded.render(view, seed, self._integrators[candidate], spp)
 

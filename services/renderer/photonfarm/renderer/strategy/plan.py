@@ -43,11 +43,13 @@ class TransportPlan:
     @property
     def settings(self) -> SpecTables:
         """The planned tables of the spec."""
+        guided = {"guided": self.candidate.guided} if self.candidate.guided or self.spec.transport.guided else {}
         return {
             "transport": {
                 "connections": self.candidate.connections,
                 "light_ratio": self.candidate.light_ratio,
                 "half_spp": self.half_spp,
+                **guided,
             },
             "photons": {"paths": self.photons.paths, "depth": self.photons.depth},
         }
@@ -76,8 +78,8 @@ class TransportPlan:
             "settings": self.settings,
             "changes": self.changes,
             "savings": [
-                {"connections": s.over.connections, "light_ratio": s.over.light_ratio, "factor": s.factor,
-                 "spread": s.spread}
+                {"connections": s.over.connections, "light_ratio": s.over.light_ratio, "guided": s.over.guided,
+                 "factor": s.factor, "spread": s.spread}
                 for s in self.savings
             ],
             "halves_overhead": self.halves_overhead,

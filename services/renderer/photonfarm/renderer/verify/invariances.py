@@ -307,8 +307,7 @@ def oracles_weights(build: Callable[[int], SceneDict], lanes: int) -> tuple[list
 
 
 def _integrator(settings: BdptSettings) -> dict[str, Any]:
-    counts = {"connections": settings.connections, "light_ratio": settings.light_ratio}
-    return {"type": "bdpt", "max_depth": DEPTH, **counts}
+    return {"type": "bdpt", "max_depth": DEPTH, **settings.parameters}
 
 
 def _images(scene: Any, settings: BdptSettings, effort: Effort, seed: int, spp: int | None = None) -> Images:

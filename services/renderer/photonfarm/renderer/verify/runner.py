@@ -112,7 +112,7 @@ def run(
         item.edit(scene)
     for counts in tried:
         integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
-        integrator |= {"connections": counts.connections, "light_ratio": counts.light_ratio}
+        integrator |= counts.parameters
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
         command = f"python -m bench.renderer.stability --only {item.label} --settings {counts} --seed {seed}"
         outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
@@ -218,9 +218,8 @@ def message_of(refusal: Refusal, size: int = 8) -> str:
 
 
 def _refusal(scene: object, settings: BdptSettings) -> str:
-    integrator = {"type": "bdpt", "connections": settings.connections, "light_ratio": settings.light_ratio}
     try:
-        mi.load_dict(integrator).render(scene, seed=0, spp=1)
+        mi.load_dict({"type": "bdpt", **settings.parameters}).render(scene, seed=0, spp=1)
     except ValueError as error:
         return str(error)
     return ""

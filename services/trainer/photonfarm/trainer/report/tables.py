@@ -54,7 +54,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
                     f"in two independent halves{_further_passes(contents)}"),
         ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
         ("transport", f"bdpt: paths of up to {t.max_depth} edges, {counted(t.connections, 'connection')}, light ratio "
-                      f"{t.light_ratio:g}"),
+                      f"{t.light_ratio:g}" + ", guided" * t.guided),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
         ("cost", _cost(contents)),

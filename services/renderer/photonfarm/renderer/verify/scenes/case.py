@@ -6,7 +6,7 @@ Shape letters: K renders, H W image.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,14 +24,22 @@ class BdptSettings:
 
     connections: int
     light_ratio: float
+    guided: bool = False
 
     def __str__(self) -> str:
-        return f"{self.connections},{self.light_ratio:g}"
+        return f"{self.connections},{self.light_ratio:g}" + ",guided" * self.guided
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The settings as the plugin takes them."""
+        return asdict(self)
 
 
 FIRST = BdptSettings(1, 1.0)
 """The settings of the quick version."""
-ALL = (FIRST, BdptSettings(0, 0.0), BdptSettings(0, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.5))
+GUIDED = BdptSettings(1, 1.0, guided=True)
+"""The same with guided light paths."""
+ALL = (FIRST, GUIDED, BdptSettings(0, 0.0), BdptSettings(0, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.5))
 """The settings of the long version; each is complete if paths from the eye find everything."""
 EYE_ALONE = (BdptSettings(0, 0.0),)
 """A path tracer, for scenes in which nothing can be done from the light side."""

@@ -249,13 +249,14 @@ def _light_sums(
         ray=mi.Ray3f(joined.light.p, -joined.light.d),
         throughput=mi.Spectrum(1),
         emitter=joined.emitter,
-        factor=lights.emission_factor(joined.emitter),
+        factor=lights.emission_factor(joined.emitter) * _gain(lights, joined),
         p_direction=_direction_density(lights, joined),
         sample=mi.DirectionSample3f(mi.PositionSample3f(joined.on_light)),
         is_area=joined.is_area,
         at_infinity=joined.light.at_infinity,
         delta=joined.light.delta,
         valid=joined.complete,
+        cell=mi.UInt32(0),
     )
     r2 = dr.square(first.t)
     left = start_weights(start, lights, first.p, r2, joined.complete)
@@ -266,6 +267,13 @@ def _light_sums(
         left = _scattered(joined.bounces[j - 1], arrived[j], count, st.cos_left[j], st.to_eye[j], st.to_light[j])
         arrived[j + 1] = weights.arrive(*left, st.r2[j], st.cos_right[j])
     return arrived
+
+
+def _gain(lights: Lights, joined: JoinedPaths) -> Any:
+    """The gain of the guide, if there is one, for light paths that start as these do."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.d, ds.uv = joined.light.d, joined.on_light.uv
+    return lights.gain(joined.emitter, ds, joined.on_light.n, joined.bounces[0].si.p, joined.complete)
 
 
 def _direction_density(lights: Lights, joined: JoinedPaths) -> Any:
@@ -349,7 +357,7 @@ def _light_densities(
     emission = np.where(
         area, 1 / (surface * np.pi), np.where(infinite, per_angle / disk, 1 / (2 * np.pi * (1 - cutoff)))
     )
-    return next_event, started * emission
+    return next_event, started * emission * _column(kept, _gain(lights, joined))
 
 
 def _selection(lights: Lights, index: Any, seen_from: F64) -> tuple[F64, F64]:

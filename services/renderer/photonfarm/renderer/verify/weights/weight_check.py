@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from photonfarm.renderer.bdpt.emission import read_lights
+from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.case import BdptSettings, SceneDict
@@ -101,9 +102,14 @@ class WeightComparison:
 def compare_weights(
     build: Callable[[int], SceneDict], settings: BdptSettings, *, lanes: int, seed: int = 0
 ) -> WeightComparison:
-    """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays."""
+    """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays.
+
+    Light paths start by a guide of random gains, for settings that are guided.
+    """
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
+    if settings.guided:
+        lights = lights.guided_by(random_guide(lights.count, seed), scene)
     count = connection_count(settings.connections, EDGES)
     result = WeightComparison()
     for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
@@ -125,6 +131,16 @@ def compare_weights(
         grazing = (paths.turn[walked] > _GRAZING).any(axis=1)
         result.refracted_error = _largest(result.refracted_error, off[refracted & ~grazing])
     return result
+
+
+def random_guide(lights: int, seed: int) -> StartGuide:
+    """A guide that follows nothing: its gains are random, from 0.1 to 10.
+
+    Its cells are large: where the ray of next event estimation arrives is a little beside the light's point that was
+    sampled, and may lie in another cell.
+    """
+    layout = Layout(lights, directions=4, positions=1)
+    return StartGuide.of(layout, 10 ** np.random.default_rng(seed).uniform(-1, 1, layout.cells))
 
 
 def _can_be_walked(paths: OraclePaths) -> Mask:

@@ -1,0 +1,80 @@
+"""The start squares of lights, [0, 1)² each, and how the point of one is found again from a light path.
+
+A light path starts at a point of two squares. The *square of directions* is the one that is always guided:
+
+    area lights       the direction about the surface's normal, by Shirley and Chiu's map and Malley's method
+    lights at infinity  where the ray enters the disk across the scene's sphere
+    point lights      the direction, uniform in the cone about the light's axis
+
+The *square of positions* is guided for rectangles alone, whose texture coordinates it is.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from photonfarm.renderer.bdpt.randomness import every_other_bit
+
+_AXIS = 0.267261242, 0.534522484, 0.801783726  # along no edge of a usual scene
+
+
+def frame_about(n: mi.Vector3f) -> mi.Frame3f:
+    """A frame about unit vectors that depends on them continuously, except at ±`_AXIS`.
+
+    Mitsuba's own frame turns by half a circle where n.z changes sign, as rounding does at the walls of most scenes.
+    """
+    s = dr.normalize(dr.cross(mi.Vector3f(*_AXIS), n))
+    return mi.Frame3f(s, dr.cross(n, s), n)
+
+
+def on_area(n: mi.Vector3f, d: mi.Vector3f) -> mi.Point2f:
+    """The point of a square for light that leaves a surface of normal ``n`` along ``d``."""
+    local = frame_about(n).to_local(d)
+    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
+
+
+def on_disk(d: mi.Vector3f, offset: mi.Vector3f) -> mi.Point2f:
+    """The point of a square for light from infinity along ``d``, which passes ``offset``.
+
+    The offset is from the centre of the scene's sphere, and its unit is the radius.
+    """
+    local = frame_about(-d).to_local(offset)
+    return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
+
+
+def in_cone(axis: mi.Vector3f, cos_cutoff: mi.Float, d: mi.Vector3f) -> mi.Point2f:
+    """The point of a square for light along ``d`` in a cone about ``axis``."""
+    local = mi.Frame3f(axis).to_local(d)
+    turn = dr.atan2(local.y, local.x) * dr.inv_two_pi
+    return mi.Point2f((1 - local.z) / (1 - cos_cutoff), turn - dr.floor(turn))
+
+
+# ------------------------------------------------ Cells of a square ------------------------------------------------
+
+
+def cell_of(u: mi.Point2f, side: int) -> mi.UInt32:
+    """The number along Morton's curve of the cell that points lie in, of ``side``² ones; some cell for NaN."""
+    x, y = (mi.UInt32(dr.clip(u[k] * side, 0, side - 0.5)) for k in range(2))
+    return dr.minimum(_spread(x) | (_spread(y) << 1), side * side - 1)
+
+
+def corner_of(cell: mi.UInt32) -> mi.Point2f:
+    """The lower corner of cells with these numbers, in cells."""
+    return mi.Point2f(mi.Float(every_other_bit(cell)), mi.Float(every_other_bit(cell >> 1)))
+
+
+def within_cell(place: mi.Float64, below: mi.Point2f) -> mi.Point2f:
+    """The points in [0, 1)² at places in [0, 1) along Morton's curve, with 16 bits for each coordinate.
+
+    ``below`` in [0, 1)² are the bits below them.
+    """
+    bits = mi.UInt32(place * 4294967296.0)
+    return dr.minimum((corner_of(bits) + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
+
+
+def _spread(x: mi.UInt32) -> mi.UInt32:
+    """The lowest 16 bits, moved to even places."""
+    for shift, bits in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        x = (x | (x << shift)) & bits
+    return x

@@ -1,0 +1,207 @@
+"""Light paths that start by a guide: its densities, its images and what it learns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from photonfarm.renderer.bdpt import randomness
+from photonfarm.renderer.bdpt.emission import INFINITE, Lights, read_lights, sample_emission
+from photonfarm.renderer.bdpt.guiding import learning
+from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
+from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
+from photonfarm.renderer.verify.scenes import hard_scenes
+from photonfarm.renderer.verify.weights.weight_check import ball_light, bulb_room
+
+BDPT = {"type": "bdpt", "max_depth": 5}
+
+
+def loaded(build: Any, size: int = 16) -> Any:
+    return mi.load_dict(build(size), optimize=False)
+
+
+def at_random(layout: Layout, seed: int = 0) -> StartGuide:
+    return StartGuide.of(layout, 10 ** np.random.default_rng(seed).uniform(-1, 1, layout.cells))
+
+
+def started(lights: Lights, paths: int) -> Any:
+    path = dr.arange(mi.UInt32, paths)
+    sequence = randomness.stream(randomness.image_keys([1]), randomness.LIGHT) + dr.zeros(mi.UInt32, paths)
+    return sample_emission(lights, randomness.sampler(sequence, path), path, dr.opaque(mi.UInt32, paths))
+
+
+# ------------------------------------------------ Densities ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "build", [hard_scenes.many_lights, hard_scenes.rotated_envmap, bulb_room, ball_light], ids=lambda b: b.__name__
+)
+def test_the_density_of_a_start_is_found_again_from_its_ray(build: Any) -> None:
+    scene = loaded(build)
+    plain = read_lights(scene)
+    lights = plain.guided_by(at_random(Layout.of(plain.count)), scene)
+    start = started(lights, 1 << 14)
+    ds = mi.DirectionSample3f(start.sample)
+    ds.d = -start.ray.d
+    found = lights.gain(start.emitter, ds, start.sample.n, start.ray(0.3), start.valid)
+    drawn = start.factor / lights.emission_factor(start.emitter)
+    valid = np.array(start.valid)
+    off = np.abs(np.array(found / drawn) - 1)[valid]
+    assert valid.mean() > 0.2
+    # Rounding takes a few rays over the edge of their cell
+    assert np.mean(off > 1e-3) < 2e-3, f"{np.mean(off > 1e-3):.2g} of {valid.sum()} starts have another density"
+
+
+@pytest.mark.parametrize("layout", [Layout(9, 8, 2), Layout(9, 4, 1), Layout(9, 1, 1)], ids=str)
+def test_starts_fall_into_cells_as_the_guide_says(layout: Layout) -> None:
+    scene = loaded(hard_scenes.many_lights)
+    plain = read_lights(scene)
+    layout = Layout(plain.count, layout.directions, layout.positions)
+    lights, paths = plain.guided_by(at_random(layout), scene), 1 << 16
+    count = np.bincount(np.array(started(lights, paths).cell), minlength=layout.cells)
+    assert lights.guided is not None
+    probability = np.diff(np.array(lights.guided.cdf), prepend=0) / np.array(lights.guided.cdf)[-1]
+    # One stratified number draws the cell, so a count is off by less than 2, and the rounding of the sums
+    assert np.abs(count - paths * probability).max() < 2.1
+
+
+def test_a_neutral_guide_has_the_density_of_no_guide() -> None:
+    scene = loaded(hard_scenes.many_lights)
+    plain = read_lights(scene)
+    start = started(plain.guided_by(StartGuide.neutral(Layout.of(plain.count)), scene), 256)
+    np.testing.assert_allclose(np.array(start.factor), np.array(plain.emission_factor(start.emitter)), rtol=1e-5)
+
+
+def test_positions_are_guided_on_rectangles_alone() -> None:
+    scene = loaded(ball_light)
+    plain = read_lights(scene)
+    lights = plain.guided_by(at_random(Layout(1, 2, 4)), scene)
+    assert lights.guided is not None
+    by_direction = np.array(lights.guided.gain).reshape(4, 16)
+    assert np.ptp(by_direction, axis=1).max() < 1e-5 * by_direction.max()
+    assert np.ptp(by_direction[:, 0]) > 0.1
+
+
+def test_a_dead_light_starts_no_guided_path() -> None:
+    description = hard_scenes.many_lights(16)
+    description["ball_light"]["emitter"] = hard_scenes.shining(0.0)
+    scene = mi.load_dict(description, optimize=False)
+    plain = read_lights(scene)
+    start = started(plain.guided_by(at_random(Layout.of(plain.count)), scene), 4096)
+    dead = next(shape.emitter() for shape in scene.shapes() if shape.id() == "ball_light")
+    assert not np.array(start.valid & (start.emitter == mi.EmitterPtr(dead))).any()
+    assert INFINITE in plain.kinds
+
+
+# ------------------------------------------------ Images ------------------------------------------------
+
+
+@pytest.mark.parametrize(("connections", "light_ratio"), [(1, 1.0), (0, 4.0)])
+@pytest.mark.parametrize("build", [hard_scenes.many_lights, bulb_room], ids=lambda b: b.__name__)
+def test_any_guide_leaves_the_mean(
+    build: Any, connections: int, light_ratio: float, renders: Any, assert_equal_means: Any
+) -> None:
+    scene, spp, seeds = loaded(build), 64, range(12)
+    counts = {"connections": connections, "light_ratio": light_ratio}
+    plugin = mi.load_dict({**BDPT, **counts, "guided": True})
+    guide = at_random(Layout.of(len(scene.emitters())))
+    images = [np.array(plugin.render(scene, seed=seed, spp=spp, guide=guide))[..., :3] for seed in seeds]
+    assert_equal_means(np.stack(images), renders(scene, {**BDPT, **counts}, spp, range(100, 112)))
+
+
+def test_a_learned_guide_leaves_the_mean_of_a_caustic(renders: Any, assert_equal_means: Any) -> None:
+    scene = loaded(hard_scenes.glass_caustic)
+    plain, guided = (
+        renders(scene, {**BDPT, "light_ratio": 4.0, "guided": guided}, 512, seeds)
+        for guided, seeds in ((False, range(16)), (True, range(100, 116)))
+    )
+    assert_equal_means(guided, plain)
+
+
+def test_guided_light_paths_halve_the_error_of_a_caustic(renders: Any) -> None:
+    scene = loaded(hard_scenes.floor_caustic, 32)
+    settings = {**BDPT, "connections": 0, "light_ratio": 4.0, "record": True}
+    plain, guided = (renders(scene, {**settings, "guided": guided}, 32, range(6)) for guided in (False, True))
+    assert guided.var(axis=0).mean() < 0.5 * plain.var(axis=0).mean()
+
+
+def test_equal_seeds_give_equal_images_and_guides() -> None:
+    scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
+    plugins = [mi.load_dict({**BDPT, "guided": True, "record": record}) for record in (False, True, True)]
+    images = [np.array(plugin.render(scene, sensor, seed=7, spp=4)) for plugin in plugins]
+    np.testing.assert_array_equal(images[1], images[2])
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
+    guides = [np.array(plugins[1].learn_guide(scene, sensor, seed).gain) for seed in (7, 7, 8)]
+    np.testing.assert_array_equal(guides[0], guides[1])
+    assert not np.array_equal(guides[0], guides[2])
+
+
+def test_a_guide_that_is_given_serves_all_images_alike() -> None:
+    scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
+    plugin = mi.load_dict({**BDPT, "guided": True, "record": True})
+    guide = plugin.learn_guide(scene, sensor, 3)
+    together = np.array(plugin.render_seeds(scene, sensor, [5, 6], 4, guide))
+    for image, seed in zip(together, (5, 6), strict=True):
+        alone = np.array(plugin.render(scene, sensor, seed=seed, spp=4, guide=guide))[..., :3]
+        np.testing.assert_array_equal(alone, image)
+
+
+def test_nothing_is_learned_where_there_are_no_light_paths() -> None:
+    scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
+    for settings in ({"guided": False}, {"guided": True, "max_depth": 2}):
+        assert mi.load_dict({**BDPT, **settings}).learn_guide(scene, sensor, 0) is None
+
+
+def test_a_guide_of_other_lights_is_refused() -> None:
+    scene = loaded(hard_scenes.cornell)
+    with pytest.raises(ValueError, match="learned with 3 lights, the scene has 1"):
+        mi.load_dict({**BDPT, "guided": True}).render(scene, spp=1, guide=StartGuide.neutral(Layout.of(3)))
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
+def test_a_guide_that_would_lose_light_is_refused(wrong: float) -> None:
+    layout = Layout(1, 2, 1)
+    with pytest.raises(ValueError, match="light would be lost"):
+        StartGuide.of(layout, np.array([1, 1, wrong, 1]))
+
+
+# ------------------------------------------------ Learning ------------------------------------------------
+
+
+def test_gains_follow_the_root_of_what_cells_add() -> None:
+    layout = Layout(1, 2, 1)
+    starts = np.full(4, 1e6)
+    found = gains(layout, starts * [1, 4, 9, 0], starts, 2 * starts, np.ones(1))
+    assert found.mean() == pytest.approx(1)
+    np.testing.assert_allclose(found, (1 - DEFAULT_SHARE) * np.array([1, 2, 3, 0]) / 1.5 + DEFAULT_SHARE, atol=0.01)
+
+
+def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None:
+    layout = Layout(1, 4, 1)
+    starts = np.full(16, 1e6)
+    sums = np.repeat([1.0, 4.0, 4.0, 4.0], 4) * starts
+    starts[1] = sums[1] = 0
+    found = gains(layout, sums, starts, starts, np.ones(1))
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+    assert found[4] > 1.5 * found[0]
+
+
+def test_nothing_seen_teaches_nothing() -> None:
+    layout = Layout.of(2)
+    nothing = np.zeros(layout.cells)
+    np.testing.assert_array_equal(gains(layout, nothing, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells))
+
+
+@pytest.mark.parametrize(("lights", "cells"), [(1, 1 << 14), (9, 9 << 10), (100, 100 << 6), (1 << 15, 1 << 15)])
+def test_more_lights_have_fewer_cells_each(lights: int, cells: int) -> None:
+    assert Layout.of(lights).cells == cells
+
+
+def test_the_paths_that_teach_are_a_small_share_of_an_image() -> None:
+    for eye_paths, light_ratio in ((1 << 17, 1.0), (1 << 20, 16.0), (1 << 30, 0.25)):
+        effort = learning.Effort.of_image(eye_paths, light_ratio)
+        assert effort.eye_paths + effort.light_paths < 0.1 * eye_paths * (1 + light_ratio)

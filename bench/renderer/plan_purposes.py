@@ -92,7 +92,8 @@ def rows(measured: Any, renders: list[Any], purpose: Any, exposure: float, pairs
         CandidateRow(
             connections=row.connections,
             light_ratio=row.light_ratio,
-            guided=row.guided,
+            guided_light=row.guided_light,
+            light_samples=row.light_samples,
             errors=rounds.errors(row.candidate),
             missed=rounds.missed(row.candidate),
             fixed_s=launches * row.fixed_s,
@@ -113,7 +114,8 @@ def compared(spec: Any, measurement: Any) -> Compared:
 
 def short(candidate: Any) -> str:
     """A candidate as (connections, light ratio)."""
-    return f"({candidate.connections}, {candidate.light_ratio:g}{', guided' * candidate.guided})"
+    samples = f", {candidate.light_samples} light samples" if candidate.light_samples > 1 else ""
+    return f"({candidate.connections}, {candidate.light_ratio:g}{', guided' * candidate.guided_light}{samples})"
 
 
 def line(spec: Any, training: Compared, images: Compared, alone: Compared) -> list[Any]:

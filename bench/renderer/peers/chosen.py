@@ -22,18 +22,21 @@ class Chosen:
     light_ratio: float
     pilot_wall_s: float  # with the compilation of all candidates; 0 for settings that were given
     why: str
-    guided: bool = False
+    guided_light: bool = False
+    light_samples: int = 1
 
     def parameters(self) -> dict[str, Any]:
         """The settings as the plugin takes them."""
-        guided = {"guided": True} if self.guided else {}
-        return {"connections": self.connections, "light_ratio": self.light_ratio, **guided}
+        guided = {"guided_light": True} if self.guided_light else {}
+        samples = {"light_samples": self.light_samples} if self.light_samples > 1 else {}
+        return {"connections": self.connections, "light_ratio": self.light_ratio, **guided, **samples}
 
 
 def words(parameters: dict[str, Any]) -> str:
-    """The settings in brackets, "(1, 0.25)" or "(1, 0.25, guided)"."""
-    guided = ", guided" if parameters.get("guided") else ""
-    return f"({parameters['connections']}, {parameters['light_ratio']:g}{guided})"
+    """The settings in brackets, "(1, 0.25)", "(1, 0.25, guided)" or "(1, 0.25, 2 light samples)"."""
+    guided = ", guided" if parameters.get("guided_light") else ""
+    samples = f", {n} light samples" if (n := parameters.get("light_samples", 1)) > 1 else ""
+    return f"({parameters['connections']}, {parameters['light_ratio']:g}{guided}{samples})"
 
 
 def given(text: str) -> Chosen:
@@ -84,4 +87,6 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
     choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
     best = choice.candidate
     spent_s = time.perf_counter() - start
-    return Chosen(best.connections, best.light_ratio, spent_s, "; ".join(choice.reasons), best.guided)
+    return Chosen(
+        best.connections, best.light_ratio, spent_s, "; ".join(choice.reasons), best.guided_light, best.light_samples
+    )

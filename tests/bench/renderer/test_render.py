@@ -181,6 +181,6 @@ def test_the_default_run_is_planned_for_less_than_forty_minutes() -> None:
 
 def test_given_settings_are_checked() -> None:
     assert given("2,0.5").parameters() == {"connections": 2, "light_ratio": 0.5}
-    assert given("2,0.5,guided").parameters() == {"connections": 2, "light_ratio": 0.5, "guided": True}
+    assert given("2,0.5,guided").parameters() == {"connections": 2, "light_ratio": 0.5, "guided_light": True}
     with pytest.raises(ValueError, match=r"CONNECTIONS,LIGHT_RATIO"):
         given("many")

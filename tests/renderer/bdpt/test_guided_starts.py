@@ -107,7 +107,7 @@ def test_any_guide_leaves_the_mean(
 ) -> None:
     scene, spp, seeds = loaded(build), 64, range(12)
     counts = {"connections": connections, "light_ratio": light_ratio}
-    plugin = mi.load_dict({**BDPT, **counts, "guided": True})
+    plugin = mi.load_dict({**BDPT, **counts, "guided_light": True})
     guide = at_random(Layout.of(len(scene.emitters())))
     images = [np.array(plugin.render(scene, seed=seed, spp=spp, guide=guide))[..., :3] for seed in seeds]
     assert_equal_means(np.stack(images), renders(scene, {**BDPT, **counts}, spp, range(100, 112)))
@@ -116,7 +116,7 @@ def test_any_guide_leaves_the_mean(
 def test_a_learned_guide_leaves_the_mean_of_a_caustic(renders: Any, assert_equal_means: Any) -> None:
     scene = loaded(hard_scenes.glass_caustic)
     plain, guided = (
-        renders(scene, {**BDPT, "light_ratio": 4.0, "guided": guided}, 512, seeds)
+        renders(scene, {**BDPT, "light_ratio": 4.0, "guided_light": guided}, 512, seeds)
         for guided, seeds in ((False, range(16)), (True, range(100, 116)))
     )
     assert_equal_means(guided, plain)
@@ -125,13 +125,13 @@ def test_a_learned_guide_leaves_the_mean_of_a_caustic(renders: Any, assert_equal
 def test_guided_light_paths_halve_the_error_of_a_caustic(renders: Any) -> None:
     scene = loaded(hard_scenes.floor_caustic, 32)
     settings = {**BDPT, "connections": 0, "light_ratio": 4.0, "record": True}
-    plain, guided = (renders(scene, {**settings, "guided": guided}, 32, range(6)) for guided in (False, True))
+    plain, guided = (renders(scene, {**settings, "guided_light": guided}, 32, range(6)) for guided in (False, True))
     assert guided.var(axis=0).mean() < 0.5 * plain.var(axis=0).mean()
 
 
 def test_equal_seeds_give_equal_images_and_guides() -> None:
     scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
-    plugins = [mi.load_dict({**BDPT, "guided": True, "record": record}) for record in (False, True, True)]
+    plugins = [mi.load_dict({**BDPT, "guided_light": True, "record": record}) for record in (False, True, True)]
     images = [np.array(plugin.render(scene, sensor, seed=7, spp=4)) for plugin in plugins]
     np.testing.assert_array_equal(images[1], images[2])
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
@@ -142,7 +142,7 @@ def test_equal_seeds_give_equal_images_and_guides() -> None:
 
 def test_a_guide_that_is_given_serves_all_images_alike() -> None:
     scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
-    plugin = mi.load_dict({**BDPT, "guided": True, "record": True})
+    plugin = mi.load_dict({**BDPT, "guided_light": True, "record": True})
     guide = plugin.learn_guide(scene, sensor, 3)
     together = np.array(plugin.render_seeds(scene, sensor, [5, 6], 4, guide))
     for image, seed in zip(together, (5, 6), strict=True):
@@ -152,14 +152,14 @@ def test_a_guide_that_is_given_serves_all_images_alike() -> None:
 
 def test_nothing_is_learned_where_there_are_no_light_paths() -> None:
     scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
-    for settings in ({"guided": False}, {"guided": True, "max_depth": 2}):
+    for settings in ({"guided_light": False}, {"guided_light": True, "max_depth": 2}):
         assert mi.load_dict({**BDPT, **settings}).learn_guide(scene, sensor, 0) is None
 
 
 def test_a_guide_of_other_lights_is_refused() -> None:
     scene = loaded(hard_scenes.cornell)
     with pytest.raises(ValueError, match="learned with 3 lights, the scene has 1"):
-        mi.load_dict({**BDPT, "guided": True}).render(scene, spp=1, guide=StartGuide.neutral(Layout.of(3)))
+        mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=StartGuide.neutral(Layout.of(3)))
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])

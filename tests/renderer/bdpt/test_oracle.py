@@ -13,7 +13,7 @@ LANES = 256
 
 
 @pytest.mark.parametrize(
-    "settings", [BdptSettings(1, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.0, guided=True)], ids=str
+    "settings", [BdptSettings(1, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.0, guided_light=True)], ids=str
 )
 @pytest.mark.parametrize("name", SCENES)
 def test_weights_of_real_paths_sum_to_one_and_are_the_oracles(name: str, settings: BdptSettings) -> None:

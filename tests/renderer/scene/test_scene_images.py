@@ -58,7 +58,7 @@ def test_a_static_scene_has_one_configuration(small: Callable[..., SceneSpec]) -
 
 def test_guided_light_paths_follow_from_the_configuration_alone(small: Callable[..., SceneSpec]) -> None:
     plain = small(load_spec("room"))
-    spec = plain.model_copy(update={"transport": plain.transport.model_copy(update={"guided": True})})
+    spec = plain.model_copy(update={"transport": plain.transport.model_copy(update={"guided_light": True})})
     room = LoadedScene.load(spec)
     moved = sample_modification(spec, 0, 0)
     views = [sample_view(spec, moved.key(spec.scene_id), 0, i, moved) for i in range(2)]

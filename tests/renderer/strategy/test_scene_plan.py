@@ -56,7 +56,8 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
     """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
     return CandidateRow(
-        connections=candidate.connections, light_ratio=candidate.light_ratio, guided=candidate.guided, missed=0.0,
+        connections=candidate.connections, light_ratio=candidate.light_ratio, guided_light=candidate.guided_light,
+        light_samples=candidate.light_samples, missed=0.0,
         errors=RelativeErrors(images=12, own=own, plain=(0.2,) * 3), fixed_s=fixed_s, sample_s=sample_s,
     )  # fmt: skip
 
@@ -151,23 +152,30 @@ def test_the_guides_whose_time_belongs_to_a_sample_enter_the_digest_for_training
     assert cache.digest(more, Purpose.TRAINING) != cache.digest(spec, Purpose.TRAINING)
 
 
-def test_a_plan_writes_guided_only_where_it_is_or_was_set() -> None:
-    guided = Candidate(0, 1.0, guided=True)
+UNUSUAL = [
+    (Candidate(0, 1.0, guided_light=True), "guided_light"),
+    (Candidate(0, 1.0, light_samples=2), "light_samples"),
+]
+
+
+@pytest.mark.parametrize(("unusual", "key"), UNUSUAL, ids=str)
+def test_a_plan_writes_later_settings_only_where_they_are_or_were_set(unusual: Candidate, key: str) -> None:
+    value = getattr(unusual, key)
     rows = (
         row(PLAIN, 0.2, 0.01, 0.01),
         row(LIGHT, 0.05, 0.02, 0.02),
-        row(guided, 0.02, 0.02, 0.02),
+        row(unusual, 0.02, 0.02, 0.02),
         row(JOINED, 0.05, 0.02, 0.04),
     )
     found = plan_of(spec_with(), measurement(*rows), cached=False)
-    assert found.candidate == guided
-    assert found.changes["transport"]["guided"] is True
-    assert "guided" in text_of(found).splitlines()[0]
-    worse = (*rows[:2], row(guided, 0.9, 0.02, 0.02), rows[3])
-    back = plan_of(spec_with(connections=0, guided=True), measurement(*worse), cached=False)
+    assert found.candidate == unusual
+    assert found.changes["transport"][key] == value
+    assert key in text_of(found).splitlines()[0]
+    worse = (*rows[:2], row(unusual, 0.9, 0.02, 0.02), rows[3])
+    back = plan_of(spec_with(connections=0, **{key: value}), measurement(*worse), cached=False)
     assert back.candidate == LIGHT
-    assert back.settings["transport"]["guided"] is False
-    assert "guided" not in plan_of(spec_with(), measurement(), cached=False).settings["transport"]
+    assert back.settings["transport"][key] == getattr(LIGHT, key)
+    assert key not in plan_of(spec_with(), measurement(), cached=False).settings["transport"]
 
 
 @pytest.mark.parametrize("seed", range(200))
@@ -279,13 +287,21 @@ def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:
     text = lines(plan_of(spec_with(), measurement(), cached=False))
     first = next(i for i, line in enumerate(text) if line.startswith("connections  light ratio"))
     assert text[first : first + 4] == [
-        "connections  light ratio  guided  images  half_spp  relMSE     ms  error × time",
-        "          0            0      no      12         9  0.0444  100.0   1",
-        "          0            1      no      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
-        "          1            1      no      12         2  0.0500  100.0   1.13 ± 0.06",
+        "connections  light ratio  light samples  guided  images  half_spp  relMSE     ms  error × time",
+        "          0            0              1      no      12         9  0.0444  100.0   1",
+        "          0            1              1      no      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
+        "          1            1              1      no      12         2  0.0500  100.0   1.13 ± 0.06",
     ]
     legend = "\n".join(text[first + 4 :])
-    for column in ("connections:", "light ratio:", "guided:", "half_spp:", "relMSE and ms:", "error × time:"):
+    for column in (
+        "connections:",
+        "light ratio:",
+        "light samples:",
+        "guided:",
+        "half_spp:",
+        "relMSE and ms:",
+        "error × time:",
+    ):
         assert column in legend
     assert all(line == line.rstrip() for line in text)
 

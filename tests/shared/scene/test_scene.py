@@ -69,8 +69,8 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
         (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0;"),
         (
-            changed(transport={"light_ratio": 0, "connections": 0, "guided": True}),
-            "transport: has guided = true and light_ratio = 0",
+            changed(transport={"light_ratio": 0, "connections": 0, "guided_light": True}),
+            "transport: has guided_light = true and light_ratio = 0",
         ),
         (changed(flm={}), "flm: .*nearest: film"),
         (changed(objects=tomllib.loads(SPEC)["objects"] * 2), "'ball'"),
@@ -112,9 +112,12 @@ def test_plain_path_tracing_and_light_paths_without_connections_are_allowed(scen
         assert SceneSpec.model_validate_json(spec.model_dump_json()) == spec
 
 
-def test_a_spec_without_guided_light_paths_has_the_id_it_always_had(scenes: Path) -> None:
-    plain, off, on = (parse_spec(changed(transport=t), where="spec") for t in ({}, {"guided": False}, {"guided": True}))
-    assert "guided" not in plain.identity()["transport"]
+@pytest.mark.parametrize(("key", "default", "other"), [("guided_light", False, True), ("light_samples", 1, 2)])
+def test_a_spec_with_later_settings_at_their_defaults_has_the_id_it_always_had(
+    scenes: Path, key: str, default: object, other: object
+) -> None:
+    plain, off, on = (parse_spec(changed(transport=t), where="spec") for t in ({}, {key: default}, {key: other}))
+    assert key not in plain.identity()["transport"]
     assert plain.scene_id == off.scene_id != on.scene_id
     assert SceneSpec.model_validate_json(on.model_dump_json()) == on
 

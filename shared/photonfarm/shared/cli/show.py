@@ -72,7 +72,8 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
             ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
             ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
             ("light transport", f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"
-             + ", guided" * t.guided),
+             + ", guided light" * t.guided_light
+             + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
             ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
             ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
             ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),

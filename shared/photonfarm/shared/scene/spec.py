@@ -140,7 +140,11 @@ class Transport(Frozen):
     connections: Annotated[int, Field(ge=0, le=64)] = 1  # light vertices joined to each eye vertex
     light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
-    guided: bool = Field(default=False, exclude_if=lambda said: not said)  # let light paths start where views see them
+    # The next two are left out of ids at their defaults
+    guided_light: bool = Field(
+        default=False, exclude_if=lambda said: not said
+    )  # light paths start where views see them
+    light_samples: int = Field(default=1, ge=1, le=64, exclude_if=lambda said: said == 1)  # at the first eye vertex
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
@@ -149,10 +153,10 @@ class Transport(Frozen):
                 f"has connections = {self.connections} and light_ratio = 0; light_ratio = 0 has no light paths to "
                 "connect to, so connections = 0 or a light_ratio above 0 is required"
             )
-        if self.guided and not self.light_ratio:
+        if self.guided_light and not self.light_ratio:
             raise ValueError(
-                "has guided = true and light_ratio = 0, which has no light paths to guide; guided = false or a "
-                "light_ratio above 0 is required"
+                "has guided_light = true and light_ratio = 0, which has no light paths to guide; guided_light = false "
+                "or a light_ratio above 0 is required"
             )
         return self
 

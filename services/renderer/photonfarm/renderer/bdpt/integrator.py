@@ -37,8 +37,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
     - ``light_samples`` (int ≥ 1, default 1): samples of the lights by next event estimation at the first eye vertex,
       where most noise of direct light comes from; later vertices take one.
-    - ``guided`` (bool, default false): let light paths start where they reach what the camera sees. `render` learns a
-      guide from a few paths of its own first, unless it is given one by `learn_guide`.
+    - ``guided_light`` (bool, default false): let light paths start where they reach what the camera sees. `render`
+      learns a guide from a few paths of its own first, unless it is given one by `learn_guide`.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -56,7 +56,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.light_ratio = float(props.get("light_ratio", 1.0))
         self.light_samples = int(props.get("light_samples", 1))
         self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
-        self.guided = bool(props.get("guided", False))
+        self.guided_light = bool(props.get("guided_light", False))
         self._check_parameters()
         record = props.get("record", False)
         self._recorder = Recorder(trace) if record else None
@@ -106,7 +106,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
         ``sensor`` is a sensor or the number of one; ``spp`` of 0 stands for the samples per pixel of its sampler.
-        A ``guided`` integrator without a ``guide`` learns one for this image.
+        A ``guided_light`` integrator without a ``guide`` learns one for this image.
         """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
@@ -129,7 +129,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
         Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
         an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
-        their order. A ``guided`` integrator without a ``guide`` learns one for each image. Raises as ``render`` does.
+        their order. A ``guided_light`` integrator without a ``guide`` learns one for each image. Raises as ``render``
+        does.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp, guide=guide).tensor(width, height)
@@ -147,7 +148,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
         ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
         has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
-        does. A ``guided`` integrator without a ``guide`` learns one for each view.
+        does. A ``guided_light`` integrator without a ``guide`` learns one for each view.
         """
         width, height = sensor.film().crop_size()
         return self._render(scene, sensor, seeds, spp, places, guide).tensor(width, height)
@@ -165,7 +166,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         It is learned from random numbers of its own, so images that are rendered with it stay independent of each
         other, and unbiased. None where light paths cannot be guided, as there are none. Raises as ``render`` does.
         """
-        if not (self.guided and self._has_light_paths(scene)):
+        if not (self.guided_light and self._has_light_paths(scene)):
             return None
         self._check(scene, sensor)
         effort = effort or Effort()
@@ -205,13 +206,13 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         guide: StartGuide | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)
-        if self.guided and guide is None and len(seeds) > 1:
+        if self.guided_light and guide is None and len(seeds) > 1:
             return self._render_with_own_guides(scene, sensor, seeds, spp, places)
         with dr.suspend_grad():
             seeds = [seed & 0xFFFFFFFF for seed in seeds]
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
-            if self.guided and guide is None:
+            if self.guided_light and guide is None:
                 effort = Effort.of_image(pixels * spp, self.light_ratio)
                 guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None

@@ -37,7 +37,7 @@ class SceneGuides:
 
     def of(self, integrator: Any, scene: Any, state: Modification) -> Any:
         """The guide of an integrator in a configuration; None for one that is not guided."""
-        if not getattr(integrator, "guided", False):
+        if not getattr(integrator, "guided_light", False):
             return None
         if self._state is None or not np.array_equal(self._state.vector, state.vector):
             self.forget()

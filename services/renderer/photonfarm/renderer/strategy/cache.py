@@ -17,7 +17,7 @@ from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
 
-_DECIDED = ("connections", "light_ratio", "half_spp", "guided")
+_DECIDED = ("connections", "light_ratio", "half_spp", "guided_light", "light_samples")
 
 
 def digest(spec: SceneSpec, purpose: Purpose) -> str:

@@ -15,14 +15,15 @@ class Candidate:
 
     connections: int  # light vertices joined to each eye vertex
     light_ratio: float  # light paths per eye path; 0: plain path tracing
-    guided: bool = False  # whether light paths start where views see them
+    guided_light: bool = False  # whether light paths start where views see them
+    light_samples: int = 1  # of next event estimation at the first eye vertex
 
     def __str__(self) -> str:
-        if not self.light_ratio:
-            return "plain path tracing"
         few = {0: "without connections", 1: "with 1 connection"}
         joined = few.get(self.connections, f"with {self.connections} connections")
-        return f"light ratio {self.light_ratio:g} {joined}" + ", guided" * self.guided
+        walks = f"light ratio {self.light_ratio:g} {joined}" if self.light_ratio else "plain path tracing"
+        samples = f", {self.light_samples} light samples" if self.light_samples > 1 else ""
+        return walks + ", guided light" * self.guided_light + samples
 
 
 PLAIN = Candidate(0, 0.0)

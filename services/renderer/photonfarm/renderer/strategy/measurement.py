@@ -25,12 +25,14 @@ from photonfarm.shared.scene.spec import Film, SceneSpec
 GRID = (
     *(Candidate(c, r) for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25))),
     *(Candidate(c, 1.0) for c in (1, 2, 4, 8)),
-    *(Candidate(c, r, guided=True) for c, r in ((0, 1.0), (0, 16.0), (1, 1.0), (4, 1.0), (8, 1.0))),
+    *(Candidate(c, r, light_samples=n) for c, r, n in ((1, 1.0, 2), (1, 1.0, 4), (0, 0.25, 2), (2, 1.0, 2))),
+    *(Candidate(c, r, guided_light=True) for c, r in ((0, 1.0), (0, 16.0), (1, 1.0), (4, 1.0), (8, 1.0))),
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 
 A light ratio above 1 helps only with light that splats alone find. Connections gain nothing from it: they use one light
-path for each eye vertex, however many there are.
+path for each eye vertex, however many there are. Several light samples pay where direct light at the first eye vertex
+has much of the noise, as in evenly lit rooms.
 """
 
 FIRST_ROUND = 0.4
@@ -57,7 +59,8 @@ class CandidateRow(Frozen):
 
     connections: int
     light_ratio: float
-    guided: bool = False
+    guided_light: bool = False
+    light_samples: int = 1
     errors: RelativeErrors  # of images of `Measurement.spp`
     missed: float  # as in `MeasuredCandidate`
     fixed_s: float  # as in `ImageCost`, of a half-estimate on the spec's film
@@ -66,7 +69,7 @@ class CandidateRow(Frozen):
     @property
     def candidate(self) -> Candidate:
         """The settings."""
-        return Candidate(self.connections, self.light_ratio, self.guided)
+        return Candidate(self.connections, self.light_ratio, self.guided_light, self.light_samples)
 
     @property
     def cost(self) -> ImageCost:
@@ -243,7 +246,8 @@ def _halved(film: Film) -> Film:
 
 def present(spec: SceneSpec) -> Candidate:
     """The present settings of a spec."""
-    return Candidate(spec.transport.connections, spec.transport.light_ratio, spec.transport.guided)
+    t = spec.transport
+    return Candidate(t.connections, t.light_ratio, t.guided_light, t.light_samples)
 
 
 def _images(half: ImageCost, half_s: float, beside: ViewCost, spp: int) -> float:
@@ -286,7 +290,8 @@ def _row(
     return CandidateRow(
         connections=measured.candidate.connections,
         light_ratio=measured.candidate.light_ratio,
-        guided=measured.candidate.guided,
+        guided_light=measured.candidate.guided_light,
+        light_samples=measured.candidate.light_samples,
         errors=measured.errors,
         missed=measured.missed,
         fixed_s=correction * half.fixed_s,

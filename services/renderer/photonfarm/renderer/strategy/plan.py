@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +43,18 @@ class TransportPlan:
     @property
     def settings(self) -> SpecTables:
         """The planned tables of the spec."""
-        guided = {"guided": self.candidate.guided} if self.candidate.guided or self.spec.transport.guided else {}
+        planned, now = self.candidate, self.spec.transport
+        unusual: dict[str, Any] = {}  # settings that a spec need not state are written only where they matter
+        if planned.guided_light or now.guided_light:
+            unusual["guided_light"] = planned.guided_light
+        if planned.light_samples > 1 or now.light_samples > 1:
+            unusual["light_samples"] = planned.light_samples
         return {
             "transport": {
                 "connections": self.candidate.connections,
                 "light_ratio": self.candidate.light_ratio,
                 "half_spp": self.half_spp,
-                **guided,
+                **unusual,
             },
             "photons": {"paths": self.photons.paths, "depth": self.photons.depth},
         }
@@ -78,8 +83,7 @@ class TransportPlan:
             "settings": self.settings,
             "changes": self.changes,
             "savings": [
-                {"connections": s.over.connections, "light_ratio": s.over.light_ratio, "guided": s.over.guided,
-                 "factor": s.factor, "spread": s.spread}
+                {**asdict(s.over), "factor": s.factor, "spread": s.spread}
                 for s in self.savings
             ],
             "halves_overhead": self.halves_overhead,

@@ -54,7 +54,8 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
                     f"in two independent halves{_further_passes(contents)}"),
         ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
         ("transport", f"bdpt: paths of up to {t.max_depth} edges, {counted(t.connections, 'connection')}, light ratio "
-                      f"{t.light_ratio:g}" + ", guided" * t.guided),
+                      f"{t.light_ratio:g}" + ", guided light" * t.guided_light
+                      + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
         ("cost", _cost(contents)),

@@ -20,7 +20,8 @@ def lines(plan: TransportPlan) -> list[str]:
     origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
     return [
         f"{plan.spec.name}: connections {plan.candidate.connections}, light_ratio {plan.candidate.light_ratio:g}, "
-        f"{'guided, ' * plan.candidate.guided}"
+        f"{'guided_light true, ' * plan.candidate.guided_light}"
+        f"{f'light_samples {plan.candidate.light_samples}, ' if plan.candidate.light_samples > 1 else ''}"
         f"half_spp {plan.half_spp}; photons: paths {plan.photons.paths}, depth {plan.photons.depth}",
         f"for {m.purpose}: {_verdict(plan)}",
         "",

@@ -23,7 +23,8 @@ def table(candidates: Sequence[CandidateAtCost], chosen: Candidate, purpose: Pur
     columns = {
         "connections": [str(measured.candidate.connections) for measured in candidates],
         "light ratio": _aligned(f"{measured.candidate.light_ratio:g}" for measured in candidates),
-        "guided": ["yes" if measured.candidate.guided else "no" for measured in candidates],
+        "light samples": [str(measured.candidate.light_samples) for measured in candidates],
+        "guided": ["yes" if measured.candidate.guided_light else "no" for measured in candidates],
         "images": [str(measured.errors.images) for measured in candidates],
         "half_spp": [str(measured.half_spp) for measured in candidates],
         ERROR[purpose]: _aligned(_three_digits(measured.half_error) for measured in candidates),
@@ -50,8 +51,8 @@ def legend(spec: SceneSpec, purpose: Purpose) -> list[str]:
     film, now = spec.film, spec.transport.half_spp
     return [
         "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "
-        "tracing: 0 and 0; guided: light paths start where they reach what is seen; images: rendered to measure it, "
-        "over all views",
+        "tracing: 0 and 0; light samples: of next event estimation at the first eye vertex; guided: light paths start "
+        "where they reach what is seen; images: rendered to measure it, over all views",
         f"half_spp: samples per pixel, 1 at least, for the time that {now} of the spec's settings take now, "
         f"{present(spec)}; {error} and ms: {_MEANING[purpose]} and CPU milliseconds of such a half-estimate, "
         f"{film.width} × {film.height} pixels",

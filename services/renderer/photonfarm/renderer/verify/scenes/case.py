@@ -24,10 +24,10 @@ class BdptSettings:
 
     connections: int
     light_ratio: float
-    guided: bool = False
+    guided_light: bool = False
 
     def __str__(self) -> str:
-        return f"{self.connections},{self.light_ratio:g}" + ",guided" * self.guided
+        return f"{self.connections},{self.light_ratio:g}" + ",guided" * self.guided_light
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -37,7 +37,7 @@ class BdptSettings:
 
 FIRST = BdptSettings(1, 1.0)
 """The settings of the quick version."""
-GUIDED = BdptSettings(1, 1.0, guided=True)
+GUIDED = BdptSettings(1, 1.0, guided_light=True)
 """The same with guided light paths."""
 ALL = (FIRST, GUIDED, BdptSettings(0, 0.0), BdptSettings(0, 1.0), BdptSettings(4, 0.25), BdptSettings(1, 1.5))
 """The settings of the long version; each is complete if paths from the eye find everything."""

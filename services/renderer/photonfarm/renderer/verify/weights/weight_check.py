@@ -108,7 +108,7 @@ def compare_weights(
     """
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
-    if settings.guided:
+    if settings.guided_light:
         lights = lights.guided_by(random_guide(lights.count, seed), scene)
     count = connection_count(settings.connections, EDGES)
     result = WeightComparison()

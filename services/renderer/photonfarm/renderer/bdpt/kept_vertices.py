@@ -7,11 +7,13 @@ The surface is kept as it was found. To find it again would take longer than to 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.records import Record, as_float, as_uint, read, write
+Record: TypeAlias = "tuple[mi.Vector4f, ...]"
+"""What is read and written at once."""
 
 _QUADS = 8  # vectors of 4 numbers in a record; Dr.Jit reads and writes one at once
 _POWER = 5  # the one that begins with the throughput
@@ -31,9 +33,9 @@ class KeptVertex:
         """Everything in it, as it lies in memory."""
         si = self.si
         quads = (
-            (*si.p, as_float(self.depth)),
-            (*si.n, as_float(dr.reinterpret_array(mi.UInt32, si.shape))),
-            (*si.sh_frame.n, as_float(si.prim_index)),
+            (*si.p, _as_float(self.depth)),
+            (*si.n, _as_float(dr.reinterpret_array(mi.UInt32, si.shape))),
+            (*si.sh_frame.n, _as_float(si.prim_index)),
             (*si.sh_frame.s, self.dvcm),
             (*si.wi, self.dvc),
             (*self.throughput_over_cos, si.uv.x),
@@ -56,12 +58,12 @@ class KeptVertices:
         numbers = dr.empty(mi.Float, n * 4 * _QUADS)
         power = record[_POWER]
         scaled = mi.Vector4f(*(power[k] * mi.Float(drawn_from) for k in range(3)), power.w)
-        write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
+        _write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
         return cls(numbers)
 
     def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
         """The kept vertex of light path ``path``; its depth is 0 if there is none."""
-        record = read(self.numbers, path, _QUADS, active)
+        record = _read(self.numbers, path, _QUADS, active)
         p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = record
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.t = mi.Float(0)  # finite: a surface was hit
@@ -70,11 +72,32 @@ class KeptVertices:
         si.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
         si.dp_du, si.dp_dv = dp_du.xyz, dp_dv.xyz
         si.uv = mi.Point2f(throughput.w, dp_du.w)
-        si.prim_index = as_uint(frame_n.w)
-        si.shape = dr.reinterpret_array(mi.ShapePtr, as_uint(n.w))
-        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, as_uint(p.w))
+        si.prim_index = _as_uint(frame_n.w)
+        si.shape = dr.reinterpret_array(mi.ShapePtr, _as_uint(n.w))
+        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, _as_uint(p.w))
 
 
 def empty_record() -> Record:
     """A record of zeros."""
     return tuple(mi.Vector4f(0) for _ in range(_QUADS))
+
+
+def _write(memory: mi.Float, place: mi.UInt32, record: Record) -> None:
+    """Write a record at ``place``, where no other lane writes."""
+    for k, quad in enumerate(record):
+        dr.scatter(memory, quad, place * len(record) + k, mode=dr.ReduceMode.NoConflicts)
+
+
+def _read(memory: mi.Float, place: mi.UInt32, quads: int, active: mi.Bool) -> Record:
+    """The record of so many vectors at ``place``."""
+    return tuple(dr.gather(mi.Vector4f, memory, place * quads + k, active) for k in range(quads))
+
+
+def _as_float(bits: mi.UInt32) -> mi.Float:
+    """The Float of these bits."""
+    return dr.reinterpret_array(mi.Float, bits)
+
+
+def _as_uint(number: mi.Float) -> mi.UInt32:
+    """The bits of a Float."""
+    return dr.reinterpret_array(mi.UInt32, number)

@@ -25,10 +25,9 @@ from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
 from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
-from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, empty_record
+from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
-from photonfarm.renderer.bdpt.records import Record
 
 _MAX_THROUGHPUT_KEPT = 0.95
 

@@ -11,7 +11,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.emission import INFINITE, Lights, read_lights, sample_emission
-from photonfarm.renderer.bdpt.guiding import learning
+from photonfarm.renderer.bdpt.guiding import learning, squares
 from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.verify.scenes import hard_scenes
@@ -84,6 +84,22 @@ def test_positions_are_guided_on_rectangles_alone() -> None:
     by_direction = np.array(lights.guided.gain).reshape(4, 16)
     assert np.ptp(by_direction, axis=1).max() < 1e-5 * by_direction.max()
     assert np.ptp(by_direction[:, 0]) > 0.1
+
+
+@pytest.mark.parametrize("towards", [(1, 2, 3), squares._AXIS, (0, 0, 1)], ids=str)
+def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float]) -> None:
+    """The frame once had no directions for (1, 2, 3), so that all light paths of such a sun were lost."""
+    description = hard_scenes.cove(16) | {"sun": {"type": "directional", "direction": [-x for x in towards]}}
+    del description["light"]
+    scene = mi.load_dict(description, optimize=False)
+    plain = read_lights(scene)
+    lights = plain.guided_by(at_random(Layout.of(plain.count)), scene)
+    start = started(lights, 1024)
+    assert np.array(start.valid).all()
+    frame = squares.frame_about(dr.normalize(mi.Vector3f(*towards)))
+    lengths = [float(np.linalg.norm(np.array(v))) for v in (frame.s, frame.t)]
+    np.testing.assert_allclose(lengths, 1, rtol=1e-4)
+    assert np.isfinite(np.array(start.ray.o)).all()
 
 
 def test_a_dead_light_starts_no_guided_path() -> None:

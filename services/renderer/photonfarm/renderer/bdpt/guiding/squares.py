@@ -16,15 +16,17 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt.randomness import every_other_bit
 
-_AXIS = 0.267261242, 0.534522484, 0.801783726  # along no edge of a usual scene
+_AXIS = 0.4343, 0.5772, 0.69154  # of length 1, along no direction that a scene's author would write down
+_NEAR_AXIS = 1e-4  # the squared sine of the angle to the axis below which another one is taken
 
 
 def frame_about(n: mi.Vector3f) -> mi.Frame3f:
-    """A frame about unit vectors that depends on them continuously, except at ±`_AXIS`.
+    """A frame about unit vectors that depends on them continuously, except about ±`_AXIS`.
 
     Mitsuba's own frame turns by half a circle where n.z changes sign, as rounding does at the walls of most scenes.
     """
-    s = dr.normalize(dr.cross(mi.Vector3f(*_AXIS), n))
+    s = dr.cross(mi.Vector3f(*_AXIS), n)
+    s = dr.normalize(dr.select(dr.squared_norm(s) > _NEAR_AXIS, s, dr.cross(mi.Vector3f(1, 0, 0), n)))
     return mi.Frame3f(s, dr.cross(n, s), n)
 
 

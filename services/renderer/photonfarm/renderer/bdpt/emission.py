@@ -26,7 +26,14 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt.guiding import squares
 from photonfarm.renderer.bdpt.guiding.starts import GuidedStarts, StartGuide, rectangles
-from photonfarm.renderer.bdpt.light_selection import LightIndex, Selection, is_flat, read_selection, sampling_weight
+from photonfarm.renderer.bdpt.light_selection import (
+    LightIndex,
+    Selection,
+    is_flat,
+    read_selection,
+    sampling_weight,
+)
+from photonfarm.renderer.bdpt.light_shapes import Spheres, column, cones
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 
@@ -60,6 +67,7 @@ class Lights:
     cos_cutoff: mi.Float  # [N]: −1 for lights that shine everywhere
     centre: mi.Point3f  # [1]: centre of the scene's sphere
     radius: mi.Float  # [1]: its radius
+    spheres: Spheres | None = None  # normals of lights that are spheres
     guided: GuidedStarts | None = None  # how light paths start where they are guided
 
     def only(self, kind: int) -> bool:
@@ -150,17 +158,17 @@ def read_lights(scene: mi.Scene) -> Lights:
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
             weights[i] = dr.select(is_flat(shapes[key]), weights[i], 0)
-    weight = _column(n, weights)
+    weight = column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
     selection = read_selection(pointers, ids, weight, bounding_box(scene)) if n > 1 else None
     emit_weight = dr.select(kind == EYE_ONLY, 0, weight if selection is None else selection.overall)
     emit_cdf, emit = _normalise(emit_weight, n)
-    axis, cos_cutoff = _cones(parameters, emitters)
+    axis, cos_cutoff = cones(parameters, emitters)
 
     emission = emit / (dr.two_pi * (1 - cos_cutoff))  # positions; π·R² for lights at infinity, A·π for areas
     emission = dr.select((kind == INFINITE) | (kind == DIRECTION), emit / (dr.pi * dr.square(radius)), emission)
     if AREA in kinds:
-        area = _column(n, [shapes[key].surface_area() if kinds[i] == AREA else 0 for i, key in enumerate(ids)])
+        area = column(n, [shapes[key].surface_area() if kinds[i] == AREA else 0 for i, key in enumerate(ids)])
         emission = dr.select(kind == AREA, dr.select(area > 0, emit / (area * dr.pi), 0), emission)
 
     index = mi.UInt32(ids)
@@ -169,8 +177,9 @@ def read_lights(scene: mi.Scene) -> Lights:
     dr.scatter(emission_by_id, emission, index)
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
-        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius
-    )
+        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius,
+        Spheres.of([shapes.get(key) for key in ids]),
+    )  # fmt: skip
 
 
 def _registry_id(emitter: mi.Emitter) -> int:
@@ -185,19 +194,9 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
         return kind
     if shape is None:
         return HIT_ONLY  # on an instanced shape: it can be hit, but has no place of its own to be sampled from
-    textured = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-    if textured and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
+    if _is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
         return HIT_ONLY  # Mitsuba's sampling of such a light does not know the surface's texture coordinates
     return AREA
-
-
-def _column(n: int, entries: list[mi.Float | float]) -> mi.Float:
-    """The n entries [1] as one array [n]."""
-    column = dr.zeros(mi.Float, n)
-    places = mi.UInt32(list(range(n)))
-    for i, entry in enumerate(entries):
-        dr.scatter(column, entry, dr.gather(mi.UInt32, places, mi.UInt32(i)))
-    return column
 
 
 def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
@@ -207,17 +206,8 @@ def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
     return cdf, dr.select(total > 0, weight / total, 0)
 
 
-def _cones(parameters: list[mi.SceneParameters], emitters: list[mi.Emitter]) -> tuple[mi.Vector3f, mi.Float]:
-    """(axes [N], cosines of the cut-off angles [N]) of the lights' cones: whole spheres for all but spot lights."""
-    n = len(emitters)
-    if not any(emitter.class_name() == "SpotLight" for emitter in emitters):
-        return mi.Vector3f(*(dr.opaque(mi.Float, x, n) for x in (0, 0, 1))), dr.opaque(mi.Float, -1, n)
-    axes, cosines = [], []
-    for emitter, params in zip(emitters, parameters, strict=True):
-        spot = emitter.class_name() == "SpotLight"
-        axes.append(dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1)) if spot else mi.Vector3f(0, 0, 1))
-        cosines.append(dr.cos(dr.deg2rad(params["cutoff_angle"])) if spot else mi.Float(-1))
-    return mi.Vector3f(*(_column(n, [axis[k] for axis in axes]) for k in range(3))), _column(n, cosines)
+def _is_textured(emitter: mi.Emitter) -> bool:
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 # ------------------------------------- Next event estimation (y₀ from x) -------------------------------------
@@ -341,7 +331,7 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
         cell=cell,
     )
     if lights.has(AREA):
-        _start_on_area(out, lights, u_position, u_direction, out.valid & out.is_area)
+        _start_on_area(out, lights, index, u_position, u_direction, out.valid & out.is_area)
     if lights.has(INFINITE) or lights.has(DIRECTION):
         _start_at_infinity(out, lights, u_position, u_direction, out.valid & out.at_infinity)
     if lights.has(POSITION):
@@ -352,9 +342,11 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
 
 
 def _start_on_area(
-    out: Emission, lights: Lights, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool
+    out: Emission, lights: Lights, index: LightIndex, u_position: mi.Point2f, u_direction: mi.Point2f, mask: mi.Bool
 ) -> None:
     ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
+    if lights.spheres is not None:
+        ps.n = lights.spheres.normal(index, ps)
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
     if lights.guided is not None:
         si.sh_frame = squares.frame_about(ps.n)

@@ -115,13 +115,14 @@ def grid_light(size: int) -> SceneDict:
 
 
 def round_lights(size: int) -> SceneDict:
-    """A room lit by a cylinder, a disk and a sphere."""
+    """A room lit by a cylinder, a disk and a sphere that is turned."""
     scene = lit_room(size)
     disk = mi.ScalarTransform4f().look_at(origin=[0.95, 0, 1], target=[0, 0, 0.8], up=[0, 0, 1])
     tube = {"type": "cylinder", "p0": [-0.7, 0.4, 1.2], "p1": [-0.2, 0.4, 1.5], "radius": 0.08}
     scene["light"] = {**tube, "emitter": shining([9.0, 2.0, 2.0])}
     scene["disk"] = {"type": "disk", "to_world": disk @ mi.ScalarTransform4f().scale(0.2), "emitter": shining(4.0)}
-    scene["ball"] = {"type": "sphere", "center": [0.4, 0.5, 0.4], "radius": 0.12, "emitter": shining([1.0, 6.0, 2.0])}
+    ball = mi.ScalarTransform4f().translate([0.4, 0.5, 0.4]).rotate([0.6, 0, 0.8], 160).scale(0.12)
+    scene["ball"] = {"type": "sphere", "to_world": ball, "emitter": shining([1.0, 6.0, 2.0])}
     return scene
 
 

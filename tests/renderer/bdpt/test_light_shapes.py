@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -11,6 +12,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.emission import read_lights, sample_emission
+from photonfarm.renderer.bdpt.light_selection import is_unfolded
 from photonfarm.renderer.verify.scenes import hard_scenes
 
 BDPT = {"type": "bdpt", "max_depth": 4}
@@ -19,6 +21,11 @@ BDPT = {"type": "bdpt", "max_depth": 4}
 def turned_ball(*scale: float) -> Any:
     to_world = mi.ScalarTransform4f().translate([0.1, 0.2, 1.2]).rotate([0.6, 0, 0.8], 160).scale([*scale])
     return {"type": "sphere", "to_world": to_world, "emitter": hard_scenes.shining(8.0)}
+
+
+def texels(seed: int = 0) -> dict[str, Any]:
+    bitmap = mi.Bitmap((np.random.default_rng(seed).random((4, 4, 3)) * 9).astype(np.float32))
+    return {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
 
 
 # ------------------------------------------------ Spheres ------------------------------------------------
@@ -46,3 +53,37 @@ def test_a_turned_sphere_lights_as_much_by_light_paths(guided: bool, renders: An
     scene = mi.load_dict({**hard_scenes.lit_room(16), "light": turned_ball(0.2, 0.2, 0.2)}, optimize=False)
     images = renders(scene, {**BDPT, "guided_light": guided, "record": True}, 128, range(8))
     assert_equal_means(images, renders(scene, {"type": "path", "max_depth": 4}, 512, range(100, 108)))
+
+
+# ------------------------------------------------ Textured meshes ------------------------------------------------
+
+
+def sheet(file: Path, texture_scale: float) -> dict[str, Any]:
+    """A square mesh light below the ceiling, whose texture is repeated where the scale is above 1."""
+    mesh = mi.Mesh("sheet", 4, 2, has_vertex_texcoords=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = [-0.3, -0.3, 1.5, -0.3, 0.3, 1.5, 0.3, 0.3, 1.5, 0.3, -0.3, 1.5]
+    parameters["faces"] = [0, 1, 2, 0, 2, 3]
+    parameters["vertex_texcoords"] = [texture_scale * x for x in (0, 0, 0, 1, 1, 1, 1, 0)]
+    parameters.update()
+    mesh.write_ply(str(file))
+    return {"type": "ply", "filename": str(file), "face_normals": True, "emitter": texels()}
+
+
+@pytest.mark.parametrize(("texture_scale", "found"), [(1.0, True), (3.0, False)])
+def test_texels_that_repeat_do_not_say_where_a_point_lies(texture_scale: float, found: bool, tmp_path: Path) -> None:
+    mesh = mi.load_dict(sheet(tmp_path / "sheet.ply", texture_scale))
+    assert bool(is_unfolded(mesh)[0]) is found
+
+
+def test_faces_that_share_their_texels_are_lights_for_hits_alone(renders: Any, assert_equal_means: Any) -> None:
+    """All faces of Mitsuba's cube have the same texture: by its texels, and so by `path`, only one is sampled."""
+
+    def cube(**more: Any) -> Any:
+        to_world = mi.ScalarTransform4f().translate([0.1, 0.2, 1.2]).scale(0.2)
+        light = {"type": "cube", "to_world": to_world, "face_normals": True, "emitter": {**texels(), **more}}
+        dark = {"type": "point", "position": [0, 0, 1], "intensity": 0.0}  # Mitsuba wants some light to sample
+        return mi.load_dict({**hard_scenes.lit_room(16), "light": light, "dark": dark}, optimize=False)
+
+    hits = renders(cube(sampling_weight=0.0), {"type": "path", "max_depth": 4}, 2048, range(100, 108))
+    assert_equal_means(renders(cube(), BDPT, 512, range(8)), hits)

@@ -30,6 +30,7 @@ from photonfarm.renderer.bdpt.light_selection import (
     LightIndex,
     Selection,
     is_flat,
+    is_unfolded,
     read_selection,
     sampling_weight,
 )
@@ -157,7 +158,8 @@ def read_lights(scene: mi.Scene) -> Lights:
     weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
-            weights[i] = dr.select(is_flat(shapes[key]), weights[i], 0)
+            found = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
+            weights[i] = dr.select(found, weights[i], 0)
     weight = column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
     selection = read_selection(pointers, ids, weight, bounding_box(scene)) if n > 1 else None

@@ -22,6 +22,13 @@ _SAMPLES = 4  # of each light in each cell
 _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
+_PROBES = (
+    (1 / 3, 1 / 3, 1 / 3),
+    (0.8, 0.1, 0.1),
+    (0.1, 0.8, 0.1),
+    (0.1, 0.1, 0.8),
+)  # points of each face that are looked up
+_UNFOLDED = 1e-2  # largest distance, over the extent of a mesh light, at which a point counts as found by its texel
 _MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
 
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
@@ -156,3 +163,28 @@ def is_flat(mesh: mi.Mesh) -> mi.Bool:
     normals = mesh.vertex_normals_buffer()
     aligned = [dr.abs(dr.dot(normal, dr.gather(mi.Vector3f, normals, v))) for v in vertices]
     return dr.max(dr.fmax(1 - dr.minimum(dr.minimum(aligned[0], aligned[1]), aligned[2]), 0)) < _FLAT
+
+
+def is_unfolded(mesh: mi.Mesh) -> mi.Bool:
+    """Whether texture coordinates in [0, 1]² say where on a mesh light a point lies, as data [1].
+
+    Mitsuba chooses points of a textured light by its texels. Where several faces share a texel, or texels repeat, it
+    finds only one of the faces, which also biases `path`. Such lights get selection probability 0, and only hits find
+    them.
+    """
+    if mesh.class_name() == "Rectangle":
+        return mi.Bool(True)
+    if not mesh.has_vertex_texcoords():
+        return mi.Bool(False)
+    lane = dr.arange(mi.UInt32, mesh.face_count() * len(_PROBES))
+    probe = lane % len(_PROBES)
+    share = [dr.gather(mi.Float, mi.Float([weights[k] for weights in _PROBES]), probe) for k in range(3)]
+    vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), lane // len(_PROBES) * 3 + k) for k in range(3)]
+    p, uv = mi.Point3f(0), mi.Point2f(0)
+    for weight, vertex in zip(share, vertices, strict=True):
+        p += weight * dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), vertex)
+        uv += weight * dr.gather(mi.Point2f, mesh.vertex_texcoords_buffer(), vertex)
+    found = mesh.eval_parameterization(uv)
+    extent = dr.norm(mi.Vector3f(mesh.bbox().extents()))
+    there = found.is_valid() & (dr.norm(found.p - p) < _UNFOLDED * extent) & dr.all((uv >= 0) & (uv <= 1))
+    return dr.max(dr.select(there, 0, 1)) < 1

@@ -1,4 +1,4 @@
-"""Lights whose shapes Mitsuba samples wrongly."""
+"""Lights whose shapes Mitsuba samples wrongly, or not at all."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.emission import read_lights, sample_emission
 from photonfarm.renderer.bdpt.light_selection import is_unfolded
 from photonfarm.renderer.verify.scenes import hard_scenes
+from photonfarm.renderer.verify.scenes.lights import round_lights
 
 BDPT = {"type": "bdpt", "max_depth": 4}
 
@@ -87,3 +88,17 @@ def test_faces_that_share_their_texels_are_lights_for_hits_alone(renders: Any, a
 
     hits = renders(cube(sampling_weight=0.0), {"type": "path", "max_depth": 4}, 2048, range(100, 108))
     assert_equal_means(renders(cube(), BDPT, 512, range(8)), hits)
+
+
+# ------------------------------------------------ Curves ------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
+def test_curves_beside_area_lights_are_refused_where_light_paths_start(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "curve.txt").write_text("\n".join(f"{x} {x * x} 0.5 0.05" for x in (-0.4, -0.1, 0.1, 0.4)))
+    curve = {"type": kind, "filename": str(tmp_path / "curve.txt")}
+    scene = mi.load_dict({**round_lights(8), "hair": curve}, optimize=False)
+    with pytest.raises(ValueError, match="shape 'hair', a curve; light paths cannot start"):
+        mi.load_dict(BDPT).render(scene, spp=1)
+    plain = mi.load_dict({**BDPT, "connections": 0, "light_ratio": 0})
+    assert np.isfinite(np.array(plain.render(scene, spp=1))).all()

@@ -7,11 +7,14 @@ import mitsuba as mi
 
 UNBOUNDED = 0xFFFFFFFF
 
+UNSAMPLED = {"Instance": "an instance", "BSplineCurve": "a curve", "LinearCurve": "a curve"}
+"""The classes of shapes whose surfaces Mitsuba cannot sample, in words; it fails if a scene has any of them."""
+
 
 def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
     """Raise ValueError for media and for lights that shine along their normal only.
 
-    Where there are ``light_paths``, also for scenes that have both instances and area lights.
+    Where there are ``light_paths``, also for scenes that have both area lights and shapes without area sampling.
     """
     shapes = scene.shapes()
     for shape in shapes:
@@ -25,11 +28,12 @@ def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
                 f"bdpt: shape {shape.id()!r} is a 'directionalarea' light; no camera path can find it, and light "
                 "paths would need a density of their own; use 'directional', or render with 'ptracer'"
             )
-    instanced = any(shape.class_name() == "Instance" for shape in shapes)
-    if light_paths and instanced and any(shape.is_emitter() for shape in shapes):
+    unsampled = next((shape for shape in shapes if shape.class_name() in UNSAMPLED), None)
+    if light_paths and unsampled is not None and any(shape.is_emitter() for shape in shapes):
         raise ValueError(
-            "bdpt: the scene has instances and area lights; light paths cannot start in it, because Mitsuba cannot "
-            "sample a shape's surface where some shapes are instances; use light_ratio=0 and connections=0"
+            f"bdpt: the scene has area lights and shape {unsampled.id()!r}, {UNSAMPLED[unsampled.class_name()]}; light "
+            "paths cannot start in it, because Mitsuba cannot sample a shape's surface where some shapes are of this "
+            "kind; use light_ratio=0 and connections=0"
         )
 
 

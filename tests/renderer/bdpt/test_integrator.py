@@ -296,3 +296,10 @@ def test_a_recording_does_not_outlive_the_clipping_planes_that_it_was_made_with(
         edited.update()
         images = [np.array(it.render(scene, sensor=0, seed=3, spp=2)) for it in (recorded, traced)]
         np.testing.assert_array_equal(*images)
+
+
+def test_the_integrator_says_all_its_settings() -> None:
+    settings = {"max_depth": 7, "rr_depth": 3, "connections": 2, "light_ratio": 0.5, "light_samples": 4}
+    said = str(mi.load_dict({"type": "bdpt", **settings, "guided_light": True}))
+    for name, value in {**settings, "guided_light": True}.items():
+        assert f"{name}={value}" in said

@@ -90,7 +90,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
         return (
             f"BidirectionalPathTracer[max_depth={depth}, rr_depth={self.rr_depth}, connections={self.connections}, "
-            f"light_ratio={self.light_ratio}]"
+            f"light_ratio={self.light_ratio}, light_samples={self.light_samples}, guided_light={self.guided_light}]"
         )
 
     def render(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.emission import INFINITE, Lights, read_lights, sample_emission
 from photonfarm.renderer.bdpt.guiding import learning, squares
 from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
+from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.weights.weight_check import ball_light, bulb_room
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer import bdpt
-from photonfarm.renderer.bdpt import emission, variant
+from photonfarm.renderer.bdpt import variant
+from photonfarm.renderer.bdpt.lights import emission
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 SIZE = 16

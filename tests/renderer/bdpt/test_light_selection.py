@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.renderer.bdpt import light_selection
-from photonfarm.renderer.bdpt.emission import read_lights
+from photonfarm.renderer.bdpt.lights import selection
+from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
 
 SIGNIFICANCE = 1e-5  # of each test over all its comparisons; the seeds are fixed
-CELLS = light_selection.CELLS**3
+CELLS = selection.CELLS**3
 
 
 def load(scene: Any) -> Any:
@@ -166,8 +166,8 @@ def test_a_light_of_a_thousand_times_the_power_is_preferred_accordingly() -> Non
     def first_share(radiance: float) -> Any:
         """[cells]: share of the first light in what both cast; all but the defensive share follows it."""
         scene = two_lights(radiance, 1.0)
-        own = light_selection._DEFENSIVE / 2
-        return (table(scene)[:, number_of(scene, "first")] - own) / (1 - light_selection._DEFENSIVE)
+        own = selection._DEFENSIVE / 2
+        return (table(scene)[:, number_of(scene, "first")] - own) / (1 - selection._DEFENSIVE)
 
     equal, brighter = first_share(1.0), first_share(1000.0)
     mixed = (equal > 1e-3) & (equal < 1 - 1e-3)  # the others see one of them only
@@ -184,7 +184,7 @@ def test_sampling_weights_count_in_the_defensive_share() -> None:
     scene["light"]["emitter"]["sampling_weight"] = 3.0
     loaded = load(scene)
     bulb = next(k for k, emitter in enumerate(loaded.emitters()) if emitter.get_shape() is None)
-    assert table(loaded)[:, bulb].min() == pytest.approx(light_selection._DEFENSIVE / 4, rel=1e-2)
+    assert table(loaded)[:, bulb].min() == pytest.approx(selection._DEFENSIVE / 4, rel=1e-2)
 
 
 def test_probabilities_do_not_depend_on_the_image_seed() -> None:
@@ -206,7 +206,7 @@ def test_probabilities_do_not_depend_on_the_image_seed() -> None:
 def test_a_wall_between_two_layers_of_cells_is_as_bright_as_it_should_be(
     facing: int, counts: tuple[int, float], renders: Any, assert_equal_means: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(light_selection, "_MARGIN", (0.0, 0.0))  # so that the wall does lie there
+    monkeypatch.setattr(selection, "_MARGIN", (0.0, 0.0))  # so that the wall does lie there
     black = grey(0.0)
     scene = load(
         {

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.emission import read_lights, sample_emission
-from photonfarm.renderer.bdpt.light_selection import is_unfolded
+from photonfarm.renderer.bdpt.lights.emission import read_lights, sample_emission
+from photonfarm.renderer.bdpt.lights.selection import is_unfolded
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.scenes.lights import round_lights
 

@@ -16,8 +16,8 @@ import pytest
 
 from photonfarm.renderer.bdpt import eye_paths, light_paths, weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
-from photonfarm.renderer.bdpt.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
 from photonfarm.renderer.bdpt.integrator import connection_count
+from photonfarm.renderer.bdpt.lights.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.weights import oracle
 from photonfarm.renderer.verify.weights.joined_paths import Bounce, JoinedPaths, Pinhole, stored

@@ -136,7 +136,7 @@ class Transport(Frozen):
     """Light transport: the settings of the `bdpt` integrator."""
 
     max_depth: Annotated[int, Field(ge=-1, le=64)] = 8  # edges of a path; 1: only emitters seen directly; -1: no limit
-    rr_depth: Annotated[int, Field(ge=1)] = 5  # path length from which Russian roulette may end it
+    rr_depth: Annotated[int, Field(ge=1)] = 5  # edges after which Russian roulette may end any path
     connections: Annotated[int, Field(ge=0, le=64)] = 1  # light vertices joined to each eye vertex
     light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates

@@ -14,10 +14,10 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
-from photonfarm.renderer.bdpt.emission import DirectSample, Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
+from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
@@ -38,6 +38,7 @@ class EyeState:
     throughput: mi.Spectrum
     radiance: mi.Spectrum  # the estimate so far
     eta: mi.Float  # product of relative refractive indices, for Russian roulette
+    whole: mi.Float  # throughput with which it left the first vertex, not scaled by refraction, for the same
     dvcm: mi.Float  # see weights.py, as they left the vertex before
     dvc: mi.Float
     depth: mi.UInt32  # edges up to this vertex
@@ -81,6 +82,7 @@ def trace_eye_paths(
         throughput=mi.Spectrum(start.weight),
         radiance=mi.Spectrum(0),
         eta=mi.Float(1),
+        whole=mi.Float(1),
         dvcm=weights.eye_start(options.light_ratio, start.density) if options.traces_light else mi.Float(0),
         dvc=mi.Float(0),
         depth=mi.UInt32(1),
@@ -164,7 +166,7 @@ def _bounce(
         s, active=active, before=si.p, radiance=radiance, dvcm=dvcm, dvc=dvc, depth=depth + 1, before_ray=mi.Float(0)
     )
     _scatter(state, ctx, si, bsdf, bs, bs_weight, count)
-    _roulette(state, options)
+    _roulette(state, first, options)
     state.arrival = scene.ray_intersect_preliminary(state.ray, active=state.active)
     state.active &= _matters(scene, state.arrival)
     return (state,)
@@ -222,12 +224,19 @@ def _scatter(
     s.ray = si.spawn_ray(d)
 
 
-def _roulette(s: EyeState, options: PathOptions) -> None:
-    """Russian roulette as in Mitsuba's ``path``: after ``rr_depth`` edges, by throughput not scaled by refraction."""
-    kept = dr.minimum(dr.max(s.throughput) * dr.square(s.eta), _MAX_THROUGHPUT_KEPT)
-    roulette = s.depth > options.rr_depth
-    s.active &= ~roulette | (s.rng.next_independent() < kept)
-    s.throughput[roulette] *= dr.rcp(kept)
+def _roulette(s: EyeState, first: mi.Bool, options: PathOptions) -> None:
+    """Play Russian roulette with throughput, not scaled by refraction, as the probability of survival.
+
+    After ``rr_depth`` edges it works as in Mitsuba's ``path``. Before, only paths that have lost more than half of the
+    throughput with which they left the ``first`` vertex may end, since they cost as much as others and carry less.
+    """
+    left = dr.max(s.throughput) * dr.square(s.eta)
+    s.whole = dr.select(first, left, s.whole)
+    kept = dr.select(
+        s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(2 * left / s.whole, 1)
+    )
+    s.active &= s.rng.next_independent() < kept
+    s.throughput *= dr.rcp(kept)
 
 
 # ------------------------------------------------ Connections ------------------------------------------------

@@ -11,7 +11,6 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
-from photonfarm.renderer.bdpt.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
 from photonfarm.renderer.bdpt.guiding.learning import Effort, learned
@@ -20,6 +19,7 @@ from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
+from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
 from photonfarm.renderer.bdpt.recording import Recorder
 from photonfarm.renderer.bdpt.scenes import UNBOUNDED, check_scene, depth_limit
@@ -30,8 +30,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     - ``max_depth`` (int, default -1): longest path in edges, -1 unbounded; 1 shows lights only, 2 direct light, as
       in ``path``.
-    - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; light paths that have
-      lost more than two thirds of their throughput meet it before.
+    - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; paths that have lost
+      most of their throughput meet it before.
     - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
       to half as many. Needs ``light_ratio`` > 0.
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
@@ -348,7 +348,7 @@ def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
 def connection_count(connections: int, max_depth: int) -> float:
     """The technique count of connections: n_C over a nominal number of vertices per light path, 3 at most.
 
-    A connection picks one of a path's vertices at random, so each technique (s, t) gets n_C/length of them on average.
+    A connection gets one of a path's vertices at random, so each technique (s, t) gets about n_C/length of them.
     Every constant keeps the estimate unbiased, as counts only change the weights. About 3 was the mean length in the
     closed rooms that were measured.
     """

@@ -52,12 +52,12 @@ class KeptVertices:
     numbers: mi.Float  # [N · 32]
 
     @classmethod
-    def of(cls, record: Record, drawn_from: mi.UInt32) -> KeptVertices:
-        """The kept vertices of all lanes' paths, each drawn from as many vertices of its path; 0: it has none."""
-        n = dr.width(drawn_from)
+    def of(cls, record: Record, scale: mi.Float) -> KeptVertices:
+        """The kept vertices of all lanes' paths, their throughputs times ``scale`` [N]."""
+        n = dr.width(scale)
         numbers = dr.empty(mi.Float, n * 4 * _QUADS)
         power = record[_POWER]
-        scaled = mi.Vector4f(*(power[k] * mi.Float(drawn_from) for k in range(3)), power.w)
+        scaled = mi.Vector4f(*(power[k] * scale for k in range(3)), power.w)
         _write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
         return cls(numbers)
 

@@ -3,10 +3,10 @@
 The first surface vertex is not joined to the lens (t=1), but all later ones are. Direct light is left to next event
 estimation, which has less noise than splats. It misses none, as lights that it cannot sample start no light paths.
 
-The vertex kept for connections is drawn uniformly among those that a connection can reach, by reservoir sampling
-(Vitter, *Random Sampling with a Reservoir*, 1985), and their number is kept too. So each path needs storage for one
-vertex whatever ``max_depth`` is. The kept vertex is weighted by that number, which keeps the sum over all vertices
-unbiased.
+The vertex kept for connections is drawn among those that a connection can reach, in proportion to their throughput, by
+reservoir sampling (Chao, *A General Purpose Unequal Probability Sampling Plan*, 1982). So each path needs storage for
+one vertex whatever ``max_depth`` is. Its throughput is divided by the probability with which it was drawn, which keeps
+the sum over all vertices unbiased.
 
 The light side never evaluates an adjoint BSDF. It evaluates the radiance-mode BSDF with exchanged directions, times
 |cos_g(out)|/|cos_g(in)|, so both sides integrate the same function under any shading normal (Veach 1997, §5.3).
@@ -22,10 +22,10 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
-from photonfarm.renderer.bdpt.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.film import Splat
 from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
+from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import traced_once
 
@@ -63,8 +63,8 @@ class LightState:
     dvcm: mi.Float  # see weights.py, as they left the vertex before
     dvc: mi.Float
     depth: mi.UInt32  # edges up to this vertex
-    seen: mi.UInt32  # vertices a connection could reach so far
-    kept: Record  # of one of them, chosen uniformly; empty without connections
+    seen: mi.Float  # sum over the vertices that a connection could reach so far, of the throughput left there
+    kept: Record  # of one of them, drawn in proportion to that; empty without connections
 
 
 def trace_light_paths(
@@ -111,7 +111,7 @@ def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, 
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(
-        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.UInt32(0), kept
+        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.Float(0), kept
     )
 
 
@@ -155,19 +155,20 @@ def vertex_bounce(
 
     # ----------------------------- Keep for connections -----------------------------
 
-    count_seen = mi.UInt32(s.seen)
+    sum_seen = mi.Float(s.seen)
     kept = s.kept
     if options.connects:
         reachable = active & smooth & (depth + 1 < options.max_depth)
-        count_seen[reachable] += 1
-        keep = reachable & (s.rng.next_independent() * mi.Float(count_seen) < 1)
-        vertex = KeptVertex(si, s.throughput / cos_in, dvcm, dvc, depth).record()
+        left = _throughput_left(s, start)
+        sum_seen[reachable] += left
+        keep = reachable & (s.rng.next_independent() * sum_seen < left)
+        vertex = KeptVertex(si, s.throughput / (left * cos_in), dvcm, dvc, depth).record()
         kept = tuple(dr.select(keep, new, old) for new, old in zip(vertex, s.kept, strict=True))
 
     # ----------------------------------- Scatter -----------------------------------
 
     goes_on = active & (depth + 1 < options.max_depth)
-    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=count_seen, kept=kept)
+    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=sum_seen, kept=kept)
     scatter(state, si, bsdf, cos_in, count)
     roulette(state, start, options)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
@@ -215,10 +216,15 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     After ``rr_depth`` edges it works as in Mitsuba's ``path``. Before, only paths that have lost more than two thirds
     of their throughput may end, since they cost as much as others and carry less.
     """
-    left = dr.max(s.throughput) / dr.max(start.throughput)
+    left = _throughput_left(s, start)
     kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
     s.active &= (s.rng.next_independent() < kept) & (kept > 0)
     s.throughput *= dr.rcp(kept)
+
+
+def _throughput_left(s: LightState, start: Emission) -> mi.Float:
+    """The throughput, relative to that at the start."""
+    return dr.max(s.throughput) / dr.max(start.throughput)
 
 
 def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.emission import Lights, read_lights, sample_emission
 from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
+from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
 from photonfarm.renderer.bdpt.recording import Recorder, traced_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
@@ -40,7 +40,7 @@ def trace_photons(
 
     ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
     emit none), so that sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
-    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see ``emission``) emit none.
+    Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see ``lights.emission``) emit none.
 
     Nothing is compiled again for another seed, or for a scene that was edited in place. With a ``recorder`` of
     ``trace`` Python runs but once, which saves most of the time in scenes of many materials. Raises ValueError for

@@ -37,7 +37,7 @@ def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
 
 def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
     """Give meshes that emit the normals of their faces: with others they cannot be sampled without bias."""
-    from photonfarm.renderer.bdpt.light_selection import is_flat
+    from photonfarm.renderer.bdpt.lights.selection import is_flat
 
     smooth = {
         shape.id()

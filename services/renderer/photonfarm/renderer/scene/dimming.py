@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.light_selection import BRIGHTNESS
+from photonfarm.renderer.bdpt.lights.selection import BRIGHTNESS
 from photonfarm.renderer.scene.arrays import zeros_like
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.files import ENVIRONMENT

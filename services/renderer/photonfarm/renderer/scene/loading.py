@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.bdpt.light_selection import is_flat
+from photonfarm.renderer.bdpt.lights.selection import is_flat
 from photonfarm.renderer.bdpt.scenes import check_scene
 from photonfarm.renderer.scene import rooms
 from photonfarm.renderer.scene.dimming import dim, factor_of

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.bdpt.emission import Lights, hit_densities, read_lights, sample_direct
+from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read_lights, sample_direct
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.bdpt.emission import read_lights
+from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import GRID, RAYS
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, pattern_of

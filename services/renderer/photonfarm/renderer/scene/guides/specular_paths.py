@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.emission import Lights
+from photonfarm.renderer.bdpt.lights.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.gbuffer import seen_reflectance
 from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned

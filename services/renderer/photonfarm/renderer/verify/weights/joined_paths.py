@@ -3,7 +3,7 @@
 Eye paths walk as the integrator's do, each vertex is joined to a light by next event estimation, and each such path is
 then treated as made by any of the techniques: the sums of `bdpt.weights` are run from the lens towards the light
 and from the light towards the lens, in the order of the integrator's loops, with densities from the integrator
-(`emission`, `light_selection`, `camera`) and from Mitsuba.
+(`lights`, `camera`) and from Mitsuba.
 
 Shape letters: N lanes, one path each; k edges.
 """
@@ -21,7 +21,8 @@ import numpy as np
 
 from photonfarm.renderer.bdpt import randomness, weights
 from photonfarm.renderer.bdpt.camera import EyeStart, primary_rays, sample_sensor
-from photonfarm.renderer.bdpt.emission import (
+from photonfarm.renderer.bdpt.light_paths import start_weights
+from photonfarm.renderer.bdpt.lights.emission import (
     AREA,
     INFINITE,
     DirectSample,
@@ -30,7 +31,6 @@ from photonfarm.renderer.bdpt.emission import (
     hit_densities,
     sample_direct,
 )
-from photonfarm.renderer.bdpt.light_paths import start_weights
 from photonfarm.renderer.verify.weights.oracle import F64, OraclePaths
 
 _FOUND = 1e-3  # a ray to a sampled point of a light must end this near to it, relative to the scene's size

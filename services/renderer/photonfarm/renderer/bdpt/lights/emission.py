@@ -26,7 +26,7 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt.guiding import squares
 from photonfarm.renderer.bdpt.guiding.starts import GuidedStarts, StartGuide, rectangles
-from photonfarm.renderer.bdpt.light_selection import (
+from photonfarm.renderer.bdpt.lights.selection import (
     LightIndex,
     Selection,
     is_flat,
@@ -34,7 +34,7 @@ from photonfarm.renderer.bdpt.light_selection import (
     read_selection,
     sampling_weight,
 )
-from photonfarm.renderer.bdpt.light_shapes import Spheres, column, cones
+from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 

@@ -322,7 +322,7 @@ def trace(
     start = primary_rays(lens, rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
-        first = spread(sample * lanes.counts[0] + pixel, options.light_ratio)
+        first = lanes.partner(sample, pixel)
         noted = None if tally is None else TalliedConnections.of(tally, image, pixel, lanes)
         connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, noted)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
@@ -333,16 +333,6 @@ def trace(
     images.radiance += splats.images().radiance
     dr.eval(images)
     return images
-
-
-def spread(lane: mi.UInt32, light_ratio: mi.Float) -> mi.UInt32:
-    """The number of the light path that the eye path ``lane`` of an image is joined to, before the shift.
-
-    It is the eye path's own number unless there are more light paths than eye paths. Then eye paths take light paths
-    evenly from all of them, since neighbouring light paths start alike. Every choice is unbiased, as the shift is
-    uniform over all light paths.
-    """
-    return mi.UInt32(mi.Float64(lane) * dr.maximum(mi.Float64(light_ratio), 1))
 
 
 def connection_count(connections: int, max_depth: int) -> float:

@@ -21,6 +21,8 @@ the same mean. The number of images in a launch changes no image.
 SQUARE = 4
 """The edge of the squares of pixels whose eye paths a packet of 16 lanes traces."""
 
+_GOLDEN = (5**0.5 - 1) / 2
+
 
 @dataclass(frozen=True, slots=True)
 class Launch:
@@ -142,6 +144,22 @@ class Lanes:
         along = place - strip * (SQUARE * self.width)
         square, inside = along // SQUARE**2, along % SQUARE**2
         return (strip * SQUARE + inside // SQUARE) * self.width + square * SQUARE + inside % SQUARE
+
+    def partner(self, sample: mi.UInt32, pixel: mi.UInt32) -> mi.UInt32:
+        """The number of the light path that an eye path is joined to, before the shift (see randomness.shifts).
+
+        Light paths of close numbers start alike. So each sample of the pixels has an equal share of the numbers for
+        itself, and a pixel is joined to light paths from everywhere. In a share pixels take light paths one by one, in
+        turn where there are fewer of them than pixels, and evenly spread where there are more. From sample to sample
+        the share is turned by the golden ratio, or a pixel would have the same place in all of them.
+
+        Every choice is unbiased, as the shift is uniform over all light paths.
+        """
+        pixels, samples, paths = self.counts
+        share = dr.maximum(paths // samples, 1)
+        step = dr.maximum(mi.Float64(share) / mi.Float64(pixels), 1)
+        turn = mi.UInt32(_GOLDEN * mi.Float64(share))
+        return sample * share + (mi.UInt32(mi.Float64(pixel) * step) + sample * turn) % share
 
     def light(self) -> tuple[mi.UInt32, mi.UInt32]:
         """(image, number within the image) of each light path's lane."""

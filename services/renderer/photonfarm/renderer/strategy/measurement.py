@@ -23,16 +23,16 @@ from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
 
 GRID = (
-    *(Candidate(c, r) for c, r in ((0, 0.0), (0, 0.25), (0, 1.0), (0, 4.0), (0, 16.0), (1, 0.25))),
-    *(Candidate(c, 1.0) for c in (1, 2, 4, 8)),
-    *(Candidate(c, r, light_samples=n) for c, r, n in ((1, 1.0, 2), (1, 1.0, 4), (0, 0.25, 2))),
-    *(Candidate(c, r, guided_light=True) for c, r in ((0, 1.0), (0, 16.0), (8, 1.0))),
+    *(Candidate(0, r) for r in (0.0, 0.25, 1.0, 4.0, 16.0)),
+    *(Candidate(c, r) for c, r in ((1, 1.0), (2, 0.25), (4, 0.125), (8, 0.125))),
+    *(Candidate(c, r, light_samples=n) for c, r, n in ((1, 0.25, 2), (2, 0.25, 2), (2, 0.25, 4), (4, 0.125, 2))),
+    *(Candidate(c, r, guided_light=True) for c, r in ((0, 1.0), (0, 16.0), (4, 0.25))),
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 
-A light ratio above 1 helps only with light that splats alone find. Connections gain nothing from it: they use one light
-path for each eye vertex, however many there are. Several light samples pay where direct light at the first eye vertex
-has much of the noise, as in evenly lit rooms.
+A light ratio above 1 helps only with light that splats alone find. Connections need few light paths, as several eye
+paths may be joined to the same one. Several light samples pay where direct light at the first eye vertex has much of
+the noise, as in evenly lit rooms.
 """
 
 FIRST_ROUND = 0.4

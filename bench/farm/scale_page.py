@@ -59,7 +59,7 @@ jobs and more. Commands include those within scripts.
 
 
 def _kept(kept: Mapping[str, str]) -> str:
-    """At which commits the steps were measured that were kept."""
+    """The commits at which the kept steps were measured."""
     steps: dict[str, list[str]] = {}
     for step, commit in kept.items():
         steps.setdefault(commit, []).append(step)

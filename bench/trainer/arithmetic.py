@@ -125,7 +125,7 @@ class GradientDifference:
     def of(
         cls, learners: Mapping[Precision, Learner], feed: Feed, rows: Sequence[int]
     ) -> dict[Precision, GradientDifference]:
-        """Of each precision but float32."""
+        """The difference of each precision but float32."""
         size, exact = 2, learners["float32"]
         sums = {name: torch.zeros(0) for name in learners}
         squares = dict.fromkeys(learners, 0.0)

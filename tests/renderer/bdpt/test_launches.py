@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ def partners(samples: int, light_paths: int) -> Any:
     _, sample, pixel = lanes.eye()
     joined = np.zeros((samples, PIXELS), np.int64)
     joined[np.array(sample), np.array(pixel)] = np.array(lanes.partner(sample, pixel))
-    dr.eval()
     return joined
 
 

@@ -56,7 +56,7 @@ def registration(settings: WorkerSettings) -> Iterator[Registration]:
 
 
 class RedisRegistration(Registration):
-    """In Redis, by heartbeats."""
+    """A worker and its lost jobs, known in Redis by heartbeats."""
 
     def __init__(self, settings: WorkerSettings, connection: redis.Redis) -> None:
         """Take the connection for what must not fail; the rest has one of its own each time."""

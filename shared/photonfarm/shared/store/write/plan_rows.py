@@ -113,7 +113,7 @@ class StoredRows:
 
     @property
     def modification(self) -> F32:
-        """Of all rows, as the others; see `PlannedRows`."""
+        """The modifications of all rows; see `PlannedRows`."""
         return self._whole("modification")
 
     @property

@@ -42,7 +42,7 @@ class ViewCost:
 
 
 FREE = ViewCost(0.0, 0.0)
-"""For images alone: nothing but they is rendered."""
+"""The cost beside images where nothing but images is rendered."""
 
 
 def measure(pilot_scene: PilotScene, views: Iterable[tuple[Modification, View]]) -> ViewCost:

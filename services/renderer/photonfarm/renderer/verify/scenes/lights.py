@@ -184,7 +184,7 @@ def hundred_lights_one_by_one(scene: HardScene, effort: Effort, seed: int) -> Im
 # ------------------------------------------------ Rows ------------------------------------------------
 
 _UNGUIDED = tuple(settings for settings in ALL if not settings.guided_light)
-"""For a truth with more noise than guided light paths leave: a test compares these with others instead."""
+"""Settings for a truth that is noisier than guided light paths: a test compares those with other settings instead."""
 _INDIRECT = replace(LONG, truth_spp=512)
 
 SCENES = (

@@ -1,0 +1,127 @@
+"""The command `photonfarm scene plan`."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from plan_measurements import JOINED, SPEC, measurement, row
+
+from photonfarm.renderer.scene import backend
+
+backend.load(threads=1)
+
+from photonfarm.renderer.strategy import plan  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy.candidate import PLAIN  # noqa: E402
+from photonfarm.renderer.strategy.measurement import GRID, Measurement  # noqa: E402
+from photonfarm.renderer.strategy.objective.purpose import Purpose  # noqa: E402
+from photonfarm.shared.cli.main import main  # noqa: E402
+from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
+from photonfarm.shared.scene.spec_loading import load_spec  # noqa: E402
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box.toml").write_text(SPEC)
+
+    def command(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(["scene", "plan", *arguments])
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), said.out, said.err
+
+    return command
+
+
+def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("box.toml", "--seconds", "20", "--json")
+    assert code == 0
+    assert f"measuring {len(GRID)} settings" in err
+    first = json.loads(out)
+    assert {(r["connections"], r["light_ratio"]) for r in first["measurement"]["rows"]} == {
+        (c.connections, c.light_ratio) for c in GRID
+    }
+    assert (tmp_path / "box.toml").read_text() == SPEC
+
+    code, out, err = run("box.toml", "--seconds", "20", "--json", "--write")
+    assert (code, json.loads(out)["cached"]) == (0, True)
+    assert json.loads(out)["settings"] == first["settings"]
+    for table in ("transport", "photons"):
+        assert f"[{table}] {'written' if table in first['changes'] else 'stays as it is'}" in err
+    written = load_spec(tmp_path / "box.toml")
+    assert written.transport.model_dump() == {"max_depth": 3, "rr_depth": 5, **first["settings"]["transport"]}
+    assert written.photons.model_dump() == first["settings"]["photons"]
+    assert "max_depth = 3  # edges\n" in (tmp_path / "box.toml").read_text()
+
+    code, out, _ = run("box.toml", "--seconds", "1")
+    assert code == 0
+    assert "kept from an earlier pilot" in out
+
+    code, out, _ = run("box.toml", "--seconds", "4", "--json", "--again")
+    assert (code, json.loads(out)["cached"]) == (0, False)
+    assert json.loads(out)["for"] == "training"
+    assert min(json.loads(out)["measurement"][part] for part in ("configuration_s", "view_s")) > 0
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The seconds of each pilot, in place of the pilots."""
+    seconds: list[float] = []
+
+    def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, asked_s: float, log: Any) -> Measurement:
+        seconds.append(asked_s)
+        return measurement().model_copy(update={"asked_s": asked_s, "purpose": purpose})
+
+    monkeypatch.setattr(plan, "measure", measure)
+    return seconds
+
+
+def test_each_purpose_has_a_pilot_of_its_own(run: Run, asked: list[float]) -> None:
+    said = [json.loads(run("box.toml", "--json", *more)[1])["for"] for more in ([], ["--for", "images"], [])]
+    assert (said, len(asked)) == (["training", "images", "training"], 2)
+
+
+def test_a_short_pilot_does_not_serve_for_the_default(run: Run, asked: list[float]) -> None:
+    for arguments, pilots in ((["--seconds", "5"], [5]), ([], [5, 60]), (["--seconds", "5"], [5, 60]), ([], [5, 60])):
+        run("box.toml", *arguments)
+        assert asked == pilots
+
+
+def test_settings_that_do_not_gain_are_not_written(
+    run: Run, asked: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeps = measurement(row(PLAIN, 0.2, 0.01, 0.01), row(JOINED, 0.02, 0.02, 0.04))
+    monkeypatch.setattr(plan, "measure", lambda *_: keeps)
+    code, _, err = run("box.toml", "--write")
+    assert code == 0
+    assert "box.toml: [transport] stays as it is\n" in err
+    assert "box.toml: [photons] written\n" in err
+    assert (tmp_path / "box.toml").read_text() == SPEC + "depth = 2\n"
+    run("box.toml", "--write")
+    assert (tmp_path / "box.toml").read_text() == SPEC + "depth = 2\n"
+
+
+@pytest.mark.slow
+def test_settings_that_the_content_makes_pointless_are_measured_where_the_spec_has_them(
+    run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "box.toml").write_text(SPEC.replace("max_depth = 3", "max_depth = 2"))
+    code, out, _ = run("box.toml", "--seconds", "4", "--json")
+    assert code == 0
+    found = json.loads(out)["measurement"]
+    assert "max_depth is 2" in found["left_out"][0]
+    plain, default = found["rows"]
+    assert [(r["connections"], r["light_ratio"]) for r in (plain, default)] == [(0, 0), (1, 1)]
+    assert plain["errors"] == default["errors"]  # the same images: no light paths are traced for two edges
+
+
+def test_a_built_in_spec_is_refused_before_it_is_measured(run: Run) -> None:
+    code, out, err = run("cornell", "--write")
+    assert (code, out) == (3, "")
+    assert "built in" in err
+    assert "measuring" not in err

@@ -11,7 +11,7 @@ from photonfarm.renderer.scene import backend
 mi = backend.load(threads=1)
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render  # noqa: E402
-from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors, view_weights  # noqa: E402
+from photonfarm.renderer.strategy.noise import BlockSums, missed, pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.shared.core.statistics import block_z_test  # noqa: E402
@@ -171,17 +171,20 @@ def test_one_lucky_sample_does_not_convict_the_others() -> None:
 
 
 def test_bright_samples_that_all_candidates_share_are_not_counted() -> None:
-    rng = np.random.default_rng(6)
-    weights = np.ones(SHAPE, np.float32)
-    shared = []
-    for i in range(8):
-        images = (1 + 0.1 * rng.standard_normal((4, *SHAPE))).astype(np.float32)
-        images[[0, 2], 5, 5] += 3000.0 * (i == 3)  # in the first image of either candidate
-        errors, common = pair_errors([(images[0], images[1]), (images[2], images[3])], weights)
-        shared.append(common)
-        assert min(errors) >= common
-    assert np.flatnonzero(not_counted(shared)).tolist() == [3]
-    assert not_counted(shared)[3] == pytest.approx(3000**2 / 2 / 1024, rel=0.01)
+    images = (1 + 0.1 * np.random.default_rng(6).standard_normal((4, *SHAPE))).astype(np.float32)
+    images[[0, 2], 5, 5] += 3000.0  # in the first image of either candidate
+    errors, shared = pair_errors([(images[0], images[1]), (images[2], images[3])], np.ones(SHAPE, np.float32))
+    assert shared == pytest.approx(3000**2 / 2 / 1024, rel=0.01)
+    assert max(errors) < 2e-4 * shared
+
+
+def test_a_bright_sample_that_a_candidate_alone_has_is_counted() -> None:
+    images = (1 + 0.1 * np.random.default_rng(7).standard_normal((4, *SHAPE))).astype(np.float32)
+    images[0, 5, 5] += 3000.0
+    (lucky, other), shared = pair_errors([(images[0], images[1]), (images[2], images[3])], np.ones(SHAPE, np.float32))
+    assert shared == 0
+    assert lucky == pytest.approx(3000**2 / 2 / 1024, rel=0.01)
+    assert other == pytest.approx(0.01, rel=0.3)
 
 
 def test_a_pixel_at_the_edge_of_a_light_does_not_rule_the_error() -> None:
@@ -256,12 +259,11 @@ def test_the_choice_holds_on_images_that_the_pilot_has_not_seen(name: str) -> No
     choice = choose(render, CANDIDATES, seconds=1.0, spp=4, clock=clock)
     weights = view_weights([render(JOINED, 50_000 + i, 32) for i in range(4)])
     assert weights is not None
-    pairs = [
-        pair_errors([(render(c, 60_000 + 2 * i, 4), render(c, 60_001 + 2 * i, 4)) for c in CANDIDATES], weights)
+    errors = [
+        pair_errors([(render(c, 60_000 + 2 * i, 4), render(c, 60_001 + 2 * i, 4)) for c in CANDIDATES], weights)[0]
         for i in range(16)
     ]
-    counted = np.array([errors for errors, _ in pairs]) - not_counted([shared for _, shared in pairs])[:, None]
-    costs = counted.mean(axis=0) * [1 + c.light_ratio + c.connections for c in CANDIDATES]
+    costs = np.mean(errors, axis=0) * [1 + c.light_ratio + c.connections for c in CANDIDATES]
     assert costs[CANDIDATES.index(choice.candidate)] < 1.2 * costs.min()
 
 

@@ -190,9 +190,10 @@ def _more_direct_light(
 ) -> mi.Spectrum:  # fmt: skip
     """Radiance at the first vertex from all samples of the lights but one; a light can only be hit instead (s=0)."""
     n = options.light_samples
+    rng = s.rng.apart()  # so that eye paths are the same for every n
     total = mi.Spectrum(0)
     for _ in range(n - 1):
-        light = sample_direct(lights, si, s.rng, active)
+        light = sample_direct(lights, si, rng, active)
         value, p_forward = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
         joined = _lit(scene, si, light, light.valid & (dr.max(value) > 0))
         w = weights.next_event(dr.select(light.delta, 0, p_forward / (n * light.density)), 0, 0, 0, 0, 0)

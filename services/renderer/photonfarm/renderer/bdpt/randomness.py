@@ -79,6 +79,10 @@ class Sampler:
         first = _mix(seed)
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
 
+    def apart(self) -> Sampler:
+        """The same point from a pair of dimensions on that a path does not read before 5000 vertices."""
+        return Sampler(self.sequence, self.index, self.dimension + (1 << 15))
+
     def _next_seed(self) -> mi.UInt32:
         """The seed of the next pair of dimensions' scramble."""
         self.dimension += 1

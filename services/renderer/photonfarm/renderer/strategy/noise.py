@@ -6,7 +6,7 @@ image. For training, y = x·e/√((e·b)² + 0.05), e being the scene's exposure
 mean variance of y is the relative loss of a network that predicts the noise-free image.
 
 **Noise that is seen** is mean (y_a − y_b)²/2 over two independent images a, b of a view. Rare bright samples that all
-candidates share are left out (`not_counted`).
+candidates share are left out (`pair_errors`).
 
 **Light that is missed.** A technique that finds some light with a small probability may find none of it in a short
 pilot. Its images then lack that light, and show no noise from it either. But all candidates have the same mean image,
@@ -38,8 +38,8 @@ BLOCKS = (1, 4, 16)
 SIGNIFICANT = 4.0
 """The limit z, in standard errors: if these were exact, chance would exceed it in one of 30 000 blocks."""
 
-SHARED = 8.0
-"""The multiple of its median up to which the noise that all candidates share is counted."""
+RARE = 0.01
+"""The share of the pixels in which shared noise is taken for rare bright samples if it exceeds that of all others."""
 
 Blocks = NDArray[np.float64]
 
@@ -79,25 +79,21 @@ def _reference(images: Sequence[F32]) -> NDArray[np.float64]:
 
 
 def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[float], float]:
-    """The error of one image from each candidate's pair of images, and the part that all candidates share.
+    """The error of one image from each candidate's pair of images, and the shared error that it leaves out.
 
-    It is the mean variance of y, relMSE or relative loss.
-
-    The shared part is the mean over pixels of the least (y_a − y_b)²/2 of all candidates.
-    """
-    squares = [((a.astype(np.float64) - b) * weights) ** 2 / 2 for a, b in pairs]
-    return [float(square.mean()) for square in squares], float(np.minimum.reduce(squares).mean())
-
-
-def not_counted(shared: Sequence[float]) -> NDArray[np.float64]:
-    """The part of the shared noise that is not counted, for each pair of images of a view: what exceeds 8 medians.
+    The error is the mean variance of y, relMSE or relative loss, less the error that is left out.
 
     Some light no technique finds well, such as a caustic seen in a mirror. With equal seeds all candidates have the
-    same rare bright samples of it, and chance decides whether a short pilot has one. In later rounds the candidates are
-    those still measured, and the same part is subtracted from each. So a choice among them is wrong by no more than the
-    ratio of their times.
+    same rare bright samples of it, and chance decides whether a short pilot has one. A pixel's shared noise is the least
+    (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more shared noise than all others together,
+    the difference is subtracted from each candidate's. So a choice among them is wrong by no more than the ratio of
+    their times. In later rounds of a pilot the candidates are those still measured.
     """
-    return np.maximum(np.array(shared) - SHARED * np.median(shared), 0)
+    squares = [(((a.astype(np.float64) - b) * weights) ** 2 / 2).mean(axis=-1).ravel() for a, b in pairs]
+    shared = np.sort(np.minimum.reduce(squares))
+    rest, worst = np.split(shared, [-max(1, round(RARE * shared.size))])
+    rare = max(float(worst.sum() - rest.sum()) / shared.size, 0.0)
+    return [float(square.mean()) - rare for square in squares], rare
 
 
 @dataclass(slots=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidate import PLAIN, Candidate, Render
 from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
-from photonfarm.renderer.strategy.noise import BlockSums, missed, not_counted, pair_errors
+from photonfarm.renderer.strategy.noise import BlockSums, missed, pair_errors
 from photonfarm.renderer.strategy.objective.purpose import Weigh
 from photonfarm.renderer.strategy.reasons import SUSPICIOUS
 from photonfarm.shared.core.records import F32
@@ -56,7 +56,7 @@ class Rounds:
         self.weights: dict[int, F32] = {}  # by view; black views are left out
         self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
         self._block_sums = {c: BlockSums() for c in candidates}
-        self._shared: dict[int, list[float]] = {}  # by view, of each pair
+        self._shared: dict[int, list[float]] = {}  # by view, of each pair: the error that is left out
 
     # ------------------------------------------------------------------------------------------------------ rendering
 
@@ -127,14 +127,11 @@ class Rounds:
 
     def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
         """The error that counts, by pairs and views, (pairs, views)."""
-        columns = []
-        for view, record in self._records[candidate].items():
-            columns.append(np.array(record.errors) - not_counted(self._shared[view])[: len(record.errors)])
-        return np.stack(columns, axis=1)
+        return np.stack([record.errors for record in self._records[candidate].values()], axis=1)
 
     def shared(self) -> float:
-        """The uncounted error of rare bright samples that all candidates share in an image."""
-        return float(np.mean([not_counted(shared).mean() for shared in self._shared.values()]))
+        """The error of rare bright samples that all candidates share in an image, which is left out."""
+        return float(np.mean([np.mean(shared) for shared in self._shared.values()]))
 
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""

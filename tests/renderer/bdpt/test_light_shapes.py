@@ -56,6 +56,28 @@ def test_a_turned_sphere_lights_as_much_by_light_paths(guided: bool, renders: An
     assert_equal_means(images, renders(scene, {"type": "path", "max_depth": 4}, 512, range(100, 108)))
 
 
+# ------------------------------------------------ Cylinders ------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scale", "flipped"), [((0.2, 0.2, 0.3), False), ((-0.2, 0.2, 0.3), False), ((0.2, 0.2, -0.3), True)]
+)
+def test_a_mirrored_cylinder_lights_as_much_as_its_hits(
+    scale: Any, flipped: bool, renders: Any, assert_equal_means: Any
+) -> None:
+    """Mitsuba's sampled points of a mirrored cylinder have normals opposite to those of its hits: `path` is biased."""
+
+    def room(**more: Any) -> Any:
+        to_world = mi.ScalarTransform4f().translate([0.1, 0.2, 1.2]).scale([*scale])
+        emitter = {**hard_scenes.shining(8.0), **more}
+        tube = {"type": "cylinder", "to_world": to_world, "flip_normals": flipped, "emitter": emitter}
+        dark = {"type": "point", "position": [0, 0, 1], "intensity": 0.0}  # Mitsuba wants some light to sample
+        return mi.load_dict({**hard_scenes.lit_room(16), "light": tube, "dark": dark}, optimize=False)
+
+    hits = renders(room(sampling_weight=0.0), {"type": "path", "max_depth": 4}, 1024, range(100, 108))
+    assert_equal_means(renders(room(), BDPT, 256, range(8)), hits)
+
+
 # ------------------------------------------------ Textured meshes ------------------------------------------------
 
 
@@ -75,6 +97,21 @@ def sheet(file: Path, texture_scale: float) -> dict[str, Any]:
 def test_texels_that_repeat_do_not_say_where_a_point_lies(texture_scale: float, found: bool, tmp_path: Path) -> None:
     mesh = mi.load_dict(sheet(tmp_path / "sheet.ply", texture_scale))
     assert bool(is_unfolded(mesh)[0]) is found
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_two_sides_of_a_thin_panel_share_their_texels(order: tuple[int, int]) -> None:
+    """Mitsuba samples one side alone, however close the other is."""
+    corners = np.array([(-0.3, -0.3), (-0.3, 0.3), (0.3, 0.3), (0.3, -0.3)])
+    below, above = (np.column_stack([corners, np.full(4, z)]) for z in (1.5, 1.504))
+    sides = [[0, 1, 2, 0, 2, 3], [4, 6, 5, 4, 7, 6]]
+    mesh = mi.Mesh("panel", 8, 4, has_vertex_texcoords=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.vstack([below, above]).ravel().tolist()
+    parameters["faces"] = sides[order[0]] + sides[order[1]]
+    parameters["vertex_texcoords"] = [0, 0, 0, 1, 1, 1, 1, 0] * 2
+    parameters.update()
+    assert not bool(is_unfolded(mesh)[0])
 
 
 def test_faces_that_share_their_texels_are_lights_for_hits_alone(renders: Any, assert_equal_means: Any) -> None:

@@ -34,7 +34,7 @@ from photonfarm.renderer.bdpt.lights.selection import (
     read_selection,
     sampling_weight,
 )
-from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones
+from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones, is_unmirrored
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 
@@ -160,6 +160,8 @@ def read_lights(scene: mi.Scene) -> Lights:
         if kinds[i] == AREA and shapes[key].is_mesh():
             found = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
             weights[i] = dr.select(found, weights[i], 0)
+        elif kinds[i] == AREA and shapes[key].class_name() == "Cylinder":
+            weights[i] = dr.select(is_unmirrored(shapes[key]), weights[i], 0)
     weight = column(n, weights)
     weight = dr.select(kind == HIT_ONLY, 0, weight)
     selection = read_selection(pointers, ids, weight, bounding_box(scene)) if n > 1 else None

@@ -28,7 +28,6 @@ _PROBES = (
     (0.1, 0.8, 0.1),
     (0.1, 0.1, 0.8),
 )  # points of each face that are looked up
-_UNFOLDED = 1e-2  # largest distance, over the extent of a mesh light, at which a point counts as found by its texel
 _MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
 
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
@@ -170,7 +169,7 @@ def is_unfolded(mesh: mi.Mesh) -> mi.Bool:
 
     Mitsuba chooses points of a textured light by its texels. Where several faces share a texel, or texels repeat, it
     finds only one of the faces, which also biases `path`. Such lights get selection probability 0, and only hits find
-    them.
+    them. Four points of each face are looked up; faces that overlap elsewhere alone are not noticed.
     """
     if mesh.class_name() == "Rectangle":
         return mi.Bool(True)
@@ -180,11 +179,9 @@ def is_unfolded(mesh: mi.Mesh) -> mi.Bool:
     probe = lane % len(_PROBES)
     share = [dr.gather(mi.Float, mi.Float([weights[k] for weights in _PROBES]), probe) for k in range(3)]
     vertices = [dr.gather(mi.UInt32, mesh.faces_buffer(), lane // len(_PROBES) * 3 + k) for k in range(3)]
-    p, uv = mi.Point3f(0), mi.Point2f(0)
+    uv = mi.Point2f(0)
     for weight, vertex in zip(share, vertices, strict=True):
-        p += weight * dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), vertex)
         uv += weight * dr.gather(mi.Point2f, mesh.vertex_texcoords_buffer(), vertex)
     found = mesh.eval_parameterization(uv)
-    extent = dr.norm(mi.Vector3f(mesh.bbox().extents()))
-    there = found.is_valid() & (dr.norm(found.p - p) < _UNFOLDED * extent) & dr.all((uv >= 0) & (uv <= 1))
-    return dr.max(dr.select(there, 0, 1)) < 1
+    itself = found.is_valid() & (found.prim_index == lane // len(_PROBES)) & dr.all((uv >= 0) & (uv <= 1))
+    return dr.max(dr.select(itself, 0, 1)) < 1

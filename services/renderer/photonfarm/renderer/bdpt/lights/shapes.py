@@ -1,4 +1,6 @@
-"""What the starts of light paths need to know of the lights' shapes: the cones of spot lights, the normals of spheres.
+"""What the starts of light paths need to know of the lights' shapes.
+
+These are the cones of spot lights, the normals of spheres, and which cylinders are mirrored.
 
 All of it is data in device memory, so that edits in place change no kernel. Index letter: N lights.
 """
@@ -33,6 +35,17 @@ def cones(parameters: Sequence[mi.SceneParameters], emitters: Sequence[mi.Emitte
         axes.append(dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1)) if spot else mi.Vector3f(0, 0, 1))
         cosines.append(dr.cos(dr.deg2rad(params["cutoff_angle"])) if spot else mi.Float(-1))
     return mi.Vector3f(*(column(n, [axis[k] for axis in axes]) for k in range(3))), column(n, cosines)
+
+
+def is_unmirrored(cylinder: mi.Shape) -> mi.Bool:
+    """Whether a cylinder light's ``to_world`` keeps its orientation, as data [1].
+
+    Otherwise Mitsuba's normals of sampled points are opposite to those of hits, which also biases `path`. Such lights
+    get selection probability 0, and only hits find them.
+    """
+    to_world = mi.traverse(cylinder)["to_world"]
+    x, y, z = (to_world @ mi.Vector3f(*axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    return mi.Bool(dr.dot(dr.cross(x, y), z) > 0)
 
 
 @dataclass(slots=True)

@@ -193,6 +193,10 @@ def test_what_stands_just_behind_the_near_plane_hides_the_scene_from_light_paths
     "wrong",
     [
         {"connections": -1},
+        {"connections": 1.5},
+        {"light_samples": 2.7},
+        {"max_depth": "8"},
+        {"guided_light": "false"},
         {"light_ratio": -0.5},
         {"connections": 1, "light_ratio": 0.0},
         {"connections": 4, "light_ratio": 0.0},

@@ -47,7 +47,7 @@ def test_survivors_are_brighter_by_their_rarity(
     np.testing.assert_allclose(np.array(state.throughput).ravel()[:2], brighter, rtol=1e-5)
 
 
-def test_no_path_ends_at_the_first_vertex_however_dark_it_is() -> None:
+def test_no_path_ends_at_the_first_vertex_before_rr_depth_however_dark_it_is() -> None:
     state = after_roulette(0.01, whole=1.0, depth=2, first=True)
     assert np.array(state.active).all()
     assert np.array(state.whole)[0] == pytest.approx(0.01)

@@ -178,7 +178,7 @@ def test_settings_are_kept_unless_others_are_significantly_better(error: float, 
 def test_the_best_settings_are_kept_as_the_best() -> None:
     spec = spec_with(connections=0, light_ratio=1.0)
     assert lines(plan_of(spec, measurement(), cached=False))[1] == (
-        "for images: the spec's settings are the best measured: keep them"
+        "for images: the spec's settings are the best of those measured longest: keep them"
     )
 
 

@@ -50,15 +50,15 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.max_depth = depth_limit(int(props.get("max_depth", -1)))
-        self.rr_depth = int(props.get("rr_depth", 5))
-        self.connections = int(props.get("connections", 1))
+        self.max_depth = depth_limit(_whole(props, "max_depth", -1))
+        self.rr_depth = _whole(props, "rr_depth", 5)
+        self.connections = _whole(props, "connections", 1)
         self.light_ratio = float(props.get("light_ratio", 1.0))
-        self.light_samples = int(props.get("light_samples", 1))
-        self.paths_at_once = int(props.get("paths_at_once", LAUNCH_PATHS))
-        self.guided_light = bool(props.get("guided_light", False))
+        self.light_samples = _whole(props, "light_samples", 1)
+        self.paths_at_once = _whole(props, "paths_at_once", LAUNCH_PATHS)
+        self.guided_light = _yes_or_no(props, "guided_light")
         self._check_parameters()
-        record = props.get("record", False)
+        record = _yes_or_no(props, "record")
         self._recorder = Recorder(trace) if record else None
         self._learning_recorder = Recorder(explore) if record else None
 
@@ -343,6 +343,22 @@ def connection_count(connections: int, max_depth: int) -> float:
     closed rooms that were measured.
     """
     return connections / min(3, max(1, max_depth - 2))
+
+
+def _whole(props: mi.Properties, name: str, default: int) -> int:
+    """A whole number of the plugin's parameters; raises ValueError for anything else."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1:
+        raise ValueError(f"bdpt: {name} is {value!r}; allowed are whole numbers")
+    return int(value)
+
+
+def _yes_or_no(props: mi.Properties, name: str) -> bool:
+    """A Boolean of the plugin's parameters, false by default; raises ValueError for anything else."""
+    value = props.get(name, False)
+    if not isinstance(value, bool):
+        raise ValueError(f"bdpt: {name} is {value!r}; allowed are true and false")
+    return value
 
 
 mi.register_integrator("bdpt", lambda props: BidirectionalPathTracer(props))

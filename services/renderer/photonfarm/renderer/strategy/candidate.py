@@ -13,7 +13,7 @@ from photonfarm.shared.core.records import F32
 class Candidate:
     """Settings of `bdpt`; all candidates have the same mean."""
 
-    connections: int  # light vertices joined to each eye vertex
+    connections: int  # light vertices joined to each of the first two eye vertices
     light_ratio: float  # light paths per eye path; 0: plain path tracing
     guided_light: bool = False  # whether light paths start where views see them
     light_samples: int = 1  # of next event estimation at the first eye vertex

@@ -39,7 +39,7 @@ SIGNIFICANT = 4.0
 """The limit z, in standard errors: if these were exact, chance would exceed it in one of 30 000 blocks."""
 
 RARE = 0.01
-"""The share of the pixels in which shared noise is taken for rare bright samples if it exceeds that of all others."""
+"""The share of the pixels that count as the worst: if their shared noise exceeds that of all others, it is rare."""
 
 Blocks = NDArray[np.float64]
 
@@ -84,10 +84,10 @@ def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[fl
     The error is the mean variance of y, relMSE or relative loss, less the error that is left out.
 
     Some light no technique finds well, such as a caustic seen in a mirror. With equal seeds all candidates have the
-    same rare bright samples of it, and chance decides whether a short pilot has one. A pixel's shared noise is the least
-    (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more shared noise than all others together,
-    the difference is subtracted from each candidate's. So a choice among them is wrong by no more than the ratio of
-    their times. In later rounds of a pilot the candidates are those still measured.
+    same rare bright samples of it, and chance decides whether a short pilot has one. The shared noise of a pixel is the
+    least (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more of it than all others together,
+    the difference is subtracted from each candidate's error. So a choice among them is wrong by no more than the ratio
+    of their times. In later rounds of a pilot the candidates are those still measured.
     """
     squares = [(((a.astype(np.float64) - b) * weights) ** 2 / 2).mean(axis=-1).ravel() for a, b in pairs]
     shared = np.sort(np.minimum.reduce(squares))

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "
     "them, because Mitsuba converts their densities with the wrong cosine (row 24, smooth-mesh-light).",
+    "Textured mesh lights whose faces share texels, and mirrored cylinder lights: hits alone, because Mitsuba samples "
+    "one of the faces, or the wrong side.",
     "Textured lights on shapes other than meshes and rectangles: hits alone (row 23, textured-ball-light).",
     "Emitters of types without emission sampling of ours, such as `sunsky`: next event estimation and hits (row 6, "
     "sun-and-sky).",

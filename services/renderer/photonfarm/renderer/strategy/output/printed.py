@@ -46,7 +46,7 @@ def _verdict(plan: TransportPlan) -> str:
         return "nothing was measured: every view is black"
     if plan.candidate == now:
         found = best(_fitting(plan))
-        better = "the spec's settings are the best measured" if found.candidate == now else _NO_GAIN
+        better = "the spec's settings are the best of those measured longest" if found.candidate == now else _NO_GAIN
         return f"{better}: keep them"
     gain = plan.saving(now)
     factor = plus_minus(gain.factor, gain.spread)

@@ -50,14 +50,15 @@ def legend(spec: SceneSpec, purpose: Purpose) -> list[str]:
     error = ERROR[purpose]
     film, now = spec.film, spec.transport.half_spp
     return [
-        "connections: light vertices joined to each eye vertex; light ratio: light paths per eye path; plain path "
-        "tracing: 0 and 0; light samples: of next event estimation at the first eye vertex; guided: light paths start "
-        "where they reach what is seen; images: rendered to measure it, over all views",
+        "connections: light vertices joined to each of the first two eye vertices; light ratio: light paths per eye "
+        "path; plain path tracing: 0 and 0; light samples: of next event estimation at the first eye vertex; guided: "
+        "light paths start where they reach what is seen; images: rendered to measure it, over all views; settings "
+        "with fewer of them than others were dropped early and cannot be chosen",
         f"half_spp: samples per pixel, 1 at least, for the time that {now} of the spec's settings take now, "
         f"{present(spec)}; {error} and ms: {_MEANING[purpose]} and CPU milliseconds of such a half-estimate, "
         f"{film.width} × {film.height} pixels",
         f"error × time: {error} × {_TIME[purpose]}, relative to plain path tracing, ± one standard error: the time to "
-        "the same error",
+        "the same error; too costly: the time does not pay for one sample per pixel",
     ]
 
 
@@ -69,7 +70,7 @@ _TIME = {Purpose.IMAGES: "ms", Purpose.TRAINING: "(ms + half of what a sample ta
 
 
 def _three_digits(value: float) -> str:
-    return f"{value:.{min(max(2 - math.floor(math.log10(value)), 0), 6)}f}"
+    return f"{value:.{min(max(2 - math.floor(math.log10(value)), 0), 6)}f}" if value > 0 else "0"
 
 
 def _aligned(numbers: Iterable[str]) -> list[str]:

@@ -30,7 +30,7 @@ METHODS: dict[str, dict[str, Any]] = {
             "light_ratio": ratio,
             "record": True,
         }
-        for connections, ratio in ((0, 0.0), (0, 0.25), (0, 1.0), (1, 0.25), (1, 1.0), (4, 1.0))
+        for connections, ratio in ((0, 0.0), (0, 0.25), (0, 1.0), (1, 1.0), (2, 0.25), (4, 0.125), (8, 0.125))
     },
 }
 

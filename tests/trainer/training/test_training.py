@@ -46,10 +46,11 @@ def test_the_held_out_error_falls_fivefold_and_below_the_mean_colours(make_sourc
     assert found.configurations >= 16
 
 
+@pytest.mark.parametrize(("most", "buffer"), [(60, 0), (30, 12)], ids=["grows-to-the-end", "grows-no-more"])
 def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_and_another_growth_is_another_run(
-    make_source, tiny, run, tmp_path
+    most, buffer, make_source, tiny, run, tmp_path
 ) -> None:
-    """12 rows are there at first, and 6 more after each step; what was drawn by then allows no more without them."""
+    """12 rows are there at first, and 6 more after each step, up to ``most``."""
     source, allowed = make_source(60), [12]
     release = source.refresh
 
@@ -58,11 +59,11 @@ def test_a_run_that_grew_repeats_to_the_bit_from_its_growth_and_another_growth_i
         return release()
 
     def count(draws: int, _samples: int) -> None:
-        allowed[0] = 12 + 2 * draws
+        allowed[0] = min(12 + 2 * draws, most)
 
     source.refresh = refresh
     rare = {"validate_every": 100, "checkpoint_every": 100}
-    settings = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, **rare)
+    settings = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=buffer, **rare)
     train(source, settings, run, Hooks(on_draws=count))
     script = Growth.of(checkpoint.load(run / CHECKPOINT)["following"])
     assert len(script.log) >= 3

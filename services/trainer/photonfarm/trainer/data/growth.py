@@ -26,15 +26,17 @@ class Growth:
 
     rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
     log: list[tuple[int, int]] = field(default_factory=list)  # (batches drawn by then, rows that had arrived)
+    drawn: int = 0  # batches drawn when this was saved
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Self:
         """The growth of a run, from the `following` of its checkpoint."""
-        return cls(state["arrived"].tolist(), [(drawn, arrived) for drawn, arrived in state["growth"].tolist()])
+        log = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
+        return cls(state["arrived"].tolist(), log, state["drawn"])
 
     def visible(self, drawn: int) -> int | None:
-        """The number of rows that had arrived when batch `drawn` was drawn; None for a batch after the log's last."""
-        if not self.log or drawn > self.log[-1][0]:
+        """The number of rows that had arrived when batch `drawn` was drawn; None for a batch not drawn by then."""
+        if drawn >= self.drawn:
             return None
         place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
         return self.log[place - 1][1] if place else 0

@@ -107,7 +107,7 @@ def compare_weights(
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays.
 
     Light paths start by a guide of random gains, for settings that are guided. Of these paths 0.5 % of each length may
-    be off: where the ray of next event estimation arrives is a little beside the light's point that was sampled, and may
+    be off: where the ray of next event estimation arrives is a little beside the sampled point of the light, and may
     lie in another cell of the guide.
     """
     scene = load(build(_SIZE))

@@ -13,7 +13,8 @@ import pytest
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker import heartbeat
 from photonfarm.renderer.worker.heartbeat import HeartbeatThread
-from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
+from photonfarm.renderer.worker.supervisor import ChildOutput, ending
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.shared import queue
 from photonfarm.shared.cli.farm_verbs import status
@@ -298,3 +299,15 @@ def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(redis_server: Em
         check(redis_server.url)
     queue.beat(connection, "near", process_space(), None, ttl_s=60)
     check(redis_server.url)
+
+
+@pytest.mark.parametrize("code", [1, -11])
+def test_a_job_is_overdue_whether_or_not_the_dump_of_its_stacks_crashed(code: int) -> None:
+    """faulthandler may crash while it dumps the stack of another thread, which runs on."""
+    stacks = ["Thread 0x1 (most recent call first):\n  File a, line 1 in beat", "Thread 0x2\n  File b, line 2 in job"]
+    written = f"{JOB_IN_HAND}some-3\nTimeout (0:00:04)!\n" + "\n".join(stacks if code == 1 else stacks[:1])
+    output = ChildOutput.of(written)
+    assert (output.overdue, output.in_hand) == ("some-3", True)
+    told = ending(code, output, 4.0)
+    assert told.startswith("job some-3 took longer than --deadline 4 s and was ended")
+    assert ("line 2 in job" in told, "line 1" in told) == (code == 1, False)

@@ -38,7 +38,8 @@ class ChildOutput:
     last: str  # its last line, which may state why it ended; "" if there is none
     job: str | None  # the job that it began last
     in_hand: bool  # whether that job had not ended
-    hung: str  # the stack of that job if the deadline ended it; otherwise ""
+    timed_out: bool  # whether the deadline ended it
+    hung: str  # the last stack of the dump then; otherwise ""
     counts: JobCounts  # of the jobs that ended
 
     @classmethod
@@ -53,12 +54,12 @@ class ChildOutput:
         counts = JobCounts.of(counted[-1]) if counted else JobCounts()
         in_hand = written.rfind(f"\n{JOB_IN_HAND}") > written.rfind(f"\n{JOBS_SO_FAR}")
         hung = "\n".join(stack[:HUNG_LINES])
-        return cls(others[-1] if others else "", jobs[-1] if jobs else None, in_hand, hung, counts)
+        return cls(others[-1] if others else "", jobs[-1] if jobs else None, in_hand, bool(timeout), hung, counts)
 
     @property
     def overdue(self) -> str | None:
         """The job that the deadline ended; None if it ended none."""
-        return self.job if self.hung else None
+        return self.job if self.timed_out else None
 
 
 class Supervisor:
@@ -133,11 +134,10 @@ class Supervisor:
             failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
             pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
-            ending = _ending(code, output, self._settings.deadline_s)
+            how = ending(code, output, self._settings.deadline_s)
             if output.job is not None and output.in_hand:
-                overdue = code > 0 and bool(output.overdue)
-                known.lost(store, self._settings.name, output.job, ending, overdue=overdue)
-            self._report(f"worker {self._settings.name}: {ending}; starting again in {pause:g} s")
+                known.lost(store, self._settings.name, output.job, how, overdue=output.timed_out)
+            self._report(f"worker {self._settings.name}: {how}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
     def _run_child(self) -> tuple[int, ChildOutput]:
@@ -205,13 +205,17 @@ def _read_all(pipe: int) -> bytes:
             content += part
 
 
-def _ending(code: int, output: ChildOutput, deadline_s: float) -> str:
-    """The sentence that states how a child ended."""
+def ending(code: int, output: ChildOutput, deadline_s: float) -> str:
+    """The sentence that states how a child ended.
+
+    faulthandler reads stacks while other threads run on, and sometimes crashes over it (Python 3.11: SIGSEGV). Then the
+    deadline ended the child all the same, but the main thread's stack, which comes last, is lacking.
+    """
+    if output.overdue:
+        where = f", while in\n{output.hung}\n" if code > 0 else ""
+        return f"job {output.overdue} took longer than --deadline {deadline_s:g} s and was ended{where}"
     if code < 0:
         return f"its child was ended by {signal.Signals(-code).name}"
-    if output.overdue:
-        deadline = f"--deadline {deadline_s:g} s"
-        return f"job {output.overdue} took longer than {deadline} and was ended, while in\n{output.hung}\n"
     return output.last or f"its child ended with exit code {code}, for the reason above"
 
 

@@ -12,10 +12,11 @@ import pytest
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import learning, squares
 from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
+from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
 from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.weights.weight_check import ball_light, bulb_room
+from photonfarm.renderer.verify.weights.weight_check import ball_light, bulb_room, random_usefulness
 
 BDPT = {"type": "bdpt", "max_depth": 5}
 
@@ -124,7 +125,7 @@ def test_any_guide_leaves_the_mean(
     scene, spp, seeds = loaded(build), 64, range(12)
     counts = {"connections": connections, "light_ratio": light_ratio}
     plugin = mi.load_dict({**BDPT, **counts, "guided_light": True})
-    guide = at_random(Layout.of(len(scene.emitters())))
+    guide = LightGuide(at_random(Layout.of(len(scene.emitters()))), random_usefulness(seed=2))
     images = [np.array(plugin.render(scene, seed=seed, spp=spp, guide=guide))[..., :3] for seed in seeds]
     assert_equal_means(np.stack(images), renders(scene, {**BDPT, **counts}, spp, range(100, 112)))
 
@@ -151,9 +152,10 @@ def test_equal_seeds_give_equal_images_and_guides() -> None:
     images = [np.array(plugin.render(scene, sensor, seed=7, spp=4)) for plugin in plugins]
     np.testing.assert_array_equal(images[1], images[2])
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
-    guides = [np.array(plugins[1].learn_guide(scene, sensor, seed).gain) for seed in (7, 7, 8)]
-    np.testing.assert_array_equal(guides[0], guides[1])
-    assert not np.array_equal(guides[0], guides[2])
+    guides = [plugins[1].learn_guide(scene, sensor, seed) for seed in (7, 7, 8)]
+    for a, b, other in ([guide.starts.gain for guide in guides], [guide.useful for guide in guides]):
+        np.testing.assert_array_equal(np.array(a), np.array(b))
+        assert not np.array_equal(np.array(a), np.array(other))
 
 
 def test_a_guide_that_is_given_serves_all_images_alike() -> None:
@@ -174,8 +176,9 @@ def test_nothing_is_learned_where_there_are_no_light_paths() -> None:
 
 def test_a_guide_of_other_lights_is_refused() -> None:
     scene = loaded(hard_scenes.cornell)
+    guide = LightGuide(StartGuide.neutral(Layout.of(3)), None)
     with pytest.raises(ValueError, match="learned with 3 lights, the scene has 1"):
-        mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=StartGuide.neutral(Layout.of(3)))
+        mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=guide)
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
@@ -191,9 +194,17 @@ def test_a_guide_that_would_lose_light_is_refused(wrong: float) -> None:
 def test_gains_follow_the_root_of_what_cells_add() -> None:
     layout = Layout(1, 2, 1)
     starts = np.full(4, 1e6)
-    found = gains(layout, starts * [1, 4, 9, 0], starts, 2 * starts, np.ones(1))
+    found = gains(layout, starts * [1, 4, 9, 0], 0.0, starts, 2 * starts, np.ones(1))
     assert found.mean() == pytest.approx(1)
     np.testing.assert_allclose(found, (1 - DEFAULT_SHARE) * np.array([1, 2, 3, 0]) / 1.5 + DEFAULT_SHARE, atol=0.01)
+
+
+def test_light_paths_start_as_without_a_guide_where_connections_make_the_error() -> None:
+    layout = Layout(1, 2, 1)
+    starts = np.full(4, 1e6)
+    splats = starts * [1, 4, 9, 0]
+    found = gains(layout, splats, 1000 * splats.sum(), starts, starts, np.ones(1))
+    np.testing.assert_allclose(found, 1, atol=1e-3)
 
 
 def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None:
@@ -201,7 +212,7 @@ def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None
     starts = np.full(16, 1e6)
     sums = np.repeat([1.0, 4.0, 4.0, 4.0], 4) * starts
     starts[1] = sums[1] = 0
-    found = gains(layout, sums, starts, starts, np.ones(1))
+    found = gains(layout, sums, 0.0, starts, starts, np.ones(1))
     assert found[1] == pytest.approx(found[0], rel=0.01)
     assert found[4] > 1.5 * found[0]
 
@@ -209,7 +220,7 @@ def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None
 def test_nothing_seen_teaches_nothing() -> None:
     layout = Layout.of(2)
     nothing = np.zeros(layout.cells)
-    np.testing.assert_array_equal(gains(layout, nothing, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells))
+    np.testing.assert_array_equal(gains(layout, nothing, 0.0, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells))
 
 
 @pytest.mark.parametrize(("lights", "cells"), [(1, 1 << 14), (9, 9 << 10), (100, 100 << 6), (1 << 15, 1 << 15)])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from photonfarm.renderer.bdpt import grid
 from photonfarm.renderer.bdpt.lights import selection
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
@@ -63,7 +64,7 @@ def test_points_that_are_not_finite_are_in_some_cell() -> None:
     number, probability = lights.selection.choose(points, dr.opaque(mi.Float, 0.5, 4))
     assert (np.array(number) < 2).all()
     assert np.isin(np.array(probability), np.array(lights.selection.pmf)).all()
-    assert (np.array(lights.selection._cell(points)) < CELLS).all()
+    assert (np.array(lights.selection.grid.cell(points)) < CELLS).all()
 
 
 def _is_dark(emitter: Any) -> bool:
@@ -206,7 +207,7 @@ def test_probabilities_do_not_depend_on_the_image_seed() -> None:
 def test_a_wall_between_two_layers_of_cells_is_as_bright_as_it_should_be(
     facing: int, counts: tuple[int, float], renders: Any, assert_equal_means: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(selection, "_MARGIN", (0.0, 0.0))  # so that the wall does lie there
+    monkeypatch.setattr(grid, "_MARGIN", (0.0, 0.0))  # so that the wall does lie there
     black = grey(0.0)
     scene = load(
         {

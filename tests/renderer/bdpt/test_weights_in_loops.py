@@ -16,11 +16,22 @@ import pytest
 
 from photonfarm.renderer.bdpt import eye_paths, light_paths, weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
+from photonfarm.renderer.bdpt.guiding.learning import LightGuide
+from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
+from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.lights.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.weights import oracle
-from photonfarm.renderer.verify.weights.joined_paths import Bounce, JoinedPaths, Pinhole, stored
+from photonfarm.renderer.verify.weights.joined_paths import (
+    Bounce,
+    JoinedPaths,
+    Pinhole,
+    TechniqueCounts,
+    stored,
+    usefulness,
+)
+from photonfarm.renderer.verify.weights.weight_check import random_guide, random_usefulness
 
 EDGES, SIZE, SPP = 5, 16, 8
 CONNECTIONS, LIGHT_RATIO = 1, 0.5
@@ -68,21 +79,26 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     monkeypatch.setattr(light_paths, "traced_once", keeping(found.light))
     for name in ("hit_emitter", "next_event", "light_tracing"):
         keep_results(weights, name, found.weights.setdefault(name, []))
-    over_r2, connect = weights.connection_over_r2, eye_paths._connect
+    over_r2, connect, draw = weights.connection_over_r2, eye_paths._connect, KeptVertices.drawn
 
     def keep_connection(count: Any, r2: Any, *sums: Any) -> Any:
         found.r2.append(r2)
         found.weights.setdefault("connection", []).append(over_r2(count, r2, *sums) * r2)
         return over_r2(count, r2, *sums)
 
-    def keep_path(scene: Any, options: Any, connectable: Any, own: Any, path: Any) -> Any:
-        found.connected.append((path, connectable.vertices.read(path, own.active).depth))
-        value = connect(scene, options, connectable, own, path)
+    def keep_path(vertices: KeptVertices, slot: Any, active: Any) -> Any:
+        vertex = draw(vertices, slot, active)
+        found.connected.append((dr.gather(mi.UInt32, vertices.slots, slot, active), vertex.depth))
+        return vertex
+
+    def evaluated(*arguments: Any) -> Any:
+        value = connect(*arguments)
         dr.eval(value, found.connected, found.r2, found.weights)
         return value
 
     monkeypatch.setattr(weights, "connection_over_r2", keep_connection)
-    monkeypatch.setattr(eye_paths, "_connect", keep_path)
+    monkeypatch.setattr(KeptVertices, "drawn", keep_path)
+    monkeypatch.setattr(eye_paths, "_connect", evaluated)
     keep_results(eye_paths, "sample_direct", found.direct)
     starts: list[Any] = []
     keep_results(light_paths, "sample_emission", starts)
@@ -197,14 +213,14 @@ def connections(lights: Any, recorder: Recorder, step: int, depth: int) -> Joine
     return JoinedPaths([*others, *own], light, of_path(lit.emitter), index, of_path(lit.on_light), area, None, joined)
 
 
-def errors(lights: Any, lens: Pinhole, joined: JoinedPaths, technique: int, ours: Any) -> Any:
+def errors(lights: Any, lens: Pinhole, counts: TechniqueCounts, joined: JoinedPaths, technique: int, ours: Any) -> Any:
     """[N]: relative difference of the loop's weight from the oracle's."""
     complete = np.array(joined.complete)
     if not complete.any():
         return np.zeros(0)
     paths = stored(lights, joined, lens)
-    counts = oracle.technique_counts(paths.edges, connection_count(CONNECTIONS, EDGES), LIGHT_RATIO)
-    truth = oracle.weights(paths, counts)[:, technique]
+    nominal = oracle.technique_counts(paths.edges, counts.count, counts.light_ratio)
+    truth = oracle.weights(paths, nominal * usefulness(counts, paths))[:, technique]
     found = np.abs(np.broadcast_to(np.array(ours), complete.shape)[complete] - truth) / np.maximum(truth, 1e-4)
     return found[np.isfinite(truth)]
 
@@ -221,20 +237,25 @@ def lit_by_everything(size: int) -> Any:
     return scene
 
 
+@pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("build", [hard_scenes.cornell, lit_by_everything])
-def test_weights_of_a_render_are_the_oracles(build: Any, recorder: Recorder) -> None:
+def test_weights_of_a_render_are_the_oracles(build: Any, guided: bool, recorder: Recorder) -> None:
     scene = mi.load_dict(build(SIZE), optimize=False)
-    lights, lens = read_lights(scene), Pinhole.of(scene)
+    lights, lens, guide, useful = read_lights(scene), Pinhole.of(scene), None, None
     bdpt = {"type": "bdpt", "max_depth": EDGES, "connections": CONNECTIONS, "light_ratio": LIGHT_RATIO, "rr_depth": 99}
-    mi.load_dict(bdpt).render(scene, seed=1, spp=SPP)
+    if guided:
+        guide = LightGuide(random_guide(lights.count, seed=4), random_usefulness(seed=5))
+        lights, useful = lights.guided_by(guide.starts, scene), Usefulness.over(scene, guide.useful)
+    mi.load_dict(bdpt | {"guided_light": guided}).render(scene, seed=1, spp=SPP, guide=guide)
+    counts = TechniqueCounts(connection_count(CONNECTIONS, EDGES, guided=guided), LIGHT_RATIO, useful)
     off: dict[str, list[Any]] = {"hit": [], "next event": [], "light tracing": [], "connection": []}
     for step in range(EDGES):
         if step > 0:
             paths = hits(scene, lights, recorder.eye, step)
-            off["hit"].append(errors(lights, lens, paths, 0, recorder.weights["hit_emitter"][step]))
+            off["hit"].append(errors(lights, lens, counts, paths, 0, recorder.weights["hit_emitter"][step]))
         if step < EDGES - 1:
             paths = next_events(scene, lights, recorder.eye, step, recorder.direct[step])
-            off["next event"].append(errors(lights, lens, paths, 1, recorder.weights["next_event"][step]))
+            off["next event"].append(errors(lights, lens, counts, paths, 1, recorder.weights["next_event"][step]))
     for step in range(1, EDGES - 1):
         (start,) = recorder.start
         si = recorder.light[step]["si"]
@@ -242,11 +263,15 @@ def test_weights_of_a_render_are_the_oracles(build: Any, recorder: Recorder) -> 
         seen = sample_sensor(scene.sensors()[0], si, mi.Point2f(0.5), smooth)
         value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(seen.d))
         paths = seen_by_lens(lights, recorder.light, step, start, seen.valid & (dr.max(value) > 0))
-        off["light tracing"].append(errors(lights, lens, paths, step + 2, recorder.weights["light_tracing"][step]))
+        off["light tracing"].append(
+            errors(lights, lens, counts, paths, step + 2, recorder.weights["light_tracing"][step])
+        )
     for step in range(EDGES - 2):
         for depth in range(1, EDGES - 1 - step):
             paths = connections(lights, recorder, step, depth)
-            off["connection"].append(errors(lights, lens, paths, depth + 1, recorder.weights["connection"][step]))
+            off["connection"].append(
+                errors(lights, lens, counts, paths, depth + 1, recorder.weights["connection"][step])
+            )
     for technique, each in off.items():
         found = np.concatenate(each)
         assert len(found) > (20 if technique == "hit" else 200), technique

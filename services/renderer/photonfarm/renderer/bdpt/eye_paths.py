@@ -15,7 +15,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
-from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
+from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices
 from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
 from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
@@ -51,7 +51,7 @@ class Connectable:
     vertices: KeptVertices
     paths: mi.UInt32  # [1]: how many there are for each image
     image: mi.UInt32  # image of the launch that a lane belongs to
-    first: mi.UInt32  # the light path of its image that a lane is joined to, but for the shift
+    first: mi.UInt32  # the slot of its image that a lane is joined to, but for the shift
     shifts: mi.UInt32  # see randomness.shifts
     tally: TalliedConnections | None = None  # where a guide is learned
 
@@ -110,7 +110,8 @@ def _bounce(
     first = depth == 1
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t + s.before_ray), cos_in)
-    count = mi.Float(dr.select(first, 1, options.count))
+    # Of the technique that joins the vertex before, to a light path that ends here
+    count = dr.select(first, 1, options.count * options.usefulness(si, s.active))
     radiance = mi.Spectrum(s.radiance)
 
     # ------------------------------- Hit a light (s=0) -------------------------------
@@ -271,20 +272,18 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
         row = connectable.image * SHIFTS + own.depth % SHIFTS
         active = own.active if k < later else own.active & near
         shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
-        path = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
-        value = _connect(scene, options, connectable, replace(own, active=active), path)
+        slot = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
+        vertex = connectable.vertices.drawn(slot, active)
+        value = _connect(scene, options, replace(own, active=active), vertex)
         if connectable.tally is not None:
-            connectable.tally.add(path, value * share, active)
+            connectable.tally.add(vertex, value * share, active)
         total += value
     return total * share
 
 
-def _connect(
-    scene: mi.Scene, options: PathOptions, connectable: Connectable, own: OwnVertex, path: mi.UInt32
-) -> mi.Spectrum:
+def _connect(scene: mi.Scene, options: PathOptions, own: OwnVertex, vertex: KeptVertex) -> mi.Spectrum:
     """One connection (Georgiev 2012, §4.3): both vertices' BSDFs, G without its cosines, visibility and weight."""
     ctx = mi.BSDFContext()
-    vertex = connectable.vertices.read(path, own.active)
     active = own.active & (vertex.depth > 0)
     active &= own.depth + vertex.depth + 1 <= options.max_depth
     si, other = own.si, vertex.si
@@ -304,11 +303,9 @@ def _connect(
     p_other = bsdf_other.pdf(ctx, other, wo_other, active)
     f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, *exchanged(other, wo_other), active)
 
-    first_other = vertex.depth == 1
-    count_other = mi.Float(dr.select(first_other, 1, options.count))
-    light_sum = p * cos_other * (count_other * vertex.dvcm + p_reverse_other * vertex.dvc)
+    light_sum = p * cos_other * (vertex.counted_dvcm + p_reverse_other * vertex.dvc)
     eye_sum = p_other * cos_own * (own.count * own.dvcm + p_reverse * own.dvc)
-    w = weights.connection_over_r2(options.count, r2, light_sum, eye_sum)
+    w = weights.connection_over_r2(vertex.count, r2, light_sum, eye_sum)
     value = own.throughput * f * vertex.throughput_over_cos * f_other * (cos_other * w)
     active &= dr.max(value) > 0
     active &= ~scene.ray_test(si.spawn_ray_to(other.p), active)

@@ -13,16 +13,18 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
-from photonfarm.renderer.bdpt.guiding.learning import Effort, learned
+from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learned
 from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally
+from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally, Totals
+from photonfarm.renderer.bdpt.guiding.usefulness import SIDE, Usefulness
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
 from photonfarm.renderer.bdpt.recording import Recorder
-from photonfarm.renderer.bdpt.scenes import UNBOUNDED, check_scene, depth_limit
+from photonfarm.renderer.bdpt.scenes import UNBOUNDED, bounding_box, check_scene, depth_limit
 
 
 class BidirectionalPathTracer(mi.SamplingIntegrator):
@@ -37,8 +39,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
     - ``light_samples`` (int ≥ 1, default 1): samples of the lights by next event estimation at the first eye vertex,
       where most noise of direct light comes from; later vertices take one.
-    - ``guided_light`` (bool, default false): let light paths start where they reach what the camera sees. `render`
-      learns a guide from a few paths of its own first, unless it is given one by `learn_guide`.
+    - ``guided_light`` (bool, default false): let light paths start where they reach what the camera sees, and draw
+      their vertices for connections by how much these add to the image. `render` learns a guide from a few paths of its
+      own first, unless it is given one by `learn_guide`.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -101,7 +104,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
-        guide: StartGuide | None = None,
+        guide: LightGuide | None = None,
     ) -> mi.TensorXf:
         """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
@@ -123,7 +126,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             return image
 
     def render_seeds(
-        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, guide: StartGuide | None = None
+        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, guide: LightGuide | None = None
     ) -> mi.TensorXf:
         """Independent images of one view, [K, H, W, 3], one for each seed; several small images share a launch.
 
@@ -142,7 +145,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         places: Places,
         seeds: Sequence[int],
         spp: int,
-        guide: StartGuide | None = None,
+        guide: LightGuide | None = None,
     ) -> mi.TensorXf:
         """Images of K views, [K, H, W, 3], one for each place and seed; as many as may be share a launch.
 
@@ -160,7 +163,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         seed: int,
         places: Places | None = None,
         effort: Effort | None = None,
-    ) -> StartGuide | None:
+    ) -> LightGuide | None:
         """A guide for light paths that reach what a sensor sees, or what it sees from several ``places``.
 
         It is learned from random numbers of its own, so images that are rendered with it stay independent of each
@@ -185,8 +188,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             keys = randomness.image_keys(seeds)
             lanes = SparseLanes.of(launch, (width, height), 1, keys, shifts, poses)
             lanes.thin(effort.eye_paths // views)
-            images, tally = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes)
-            return learned(layout, lights.emit_probability, images, Tally(*tally), lanes)
+            grid = Grid.over(bounding_box(scene), SIDE)
+            images, totals = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes, grid)
+            return learned(layout, lights.emit_probability, images, totals, lanes)
 
     def _has_light_paths(self, scene: mi.Scene) -> bool:
         return bool(self.light_ratio > 0 and self.max_depth > 2 and scene.emitters())
@@ -203,7 +207,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         seeds: Sequence[int],
         spp: int,
         places: Places | None = None,
-        guide: StartGuide | None = None,
+        guide: LightGuide | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)
         if self.guided_light and guide is None and len(seeds) > 1:
@@ -218,10 +222,13 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
             if lights is not None and guide is not None and light_ratio:
-                lights = lights.guided_by(guide, scene)
+                lights = lights.guided_by(guide.starts, scene)
+            useful = None
+            if guide is not None and guide.useful is not None and self.connections and light_ratio:
+                useful = Usefulness.over(scene, guide.useful)
             images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
-                options = self._options(launch, pixels)
+                options = self._options(launch, pixels, useful)
                 images_of = slice(launch.first_image, launch.first_image + launch.images)
                 own = seeds[images_of]
                 shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
@@ -257,35 +264,38 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         lights: Lights | None,
         options: PathOptions,
         lanes: Lanes,
+        *more: Any,
     ) -> Any:
         if recorder is None:
-            return function(scene, sensor, lights, options, lanes)
+            return function(scene, sensor, lights, options, lanes, *more)
         clipping = (sensor.near_clip(), sensor.far_clip())
         kind = (lanes.kind, options.kind, lights.kind_of_kernels if lights else None, clipping)
-        return recorder(kind, scene, sensor, lights, options, lanes)
+        return recorder(kind, scene, sensor, lights, options, lanes, *more)
 
-    def _options(self, launch: Launch, pixels: int) -> PathOptions:
+    def _options(self, launch: Launch, pixels: int, useful: Usefulness | None = None) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0
+        count = connection_count(self.connections, self.max_depth, guided=self.guided_light) if connects else 0.0
         return PathOptions(
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             connections=self.connections,
-            count=dr.opaque(mi.Float, connection_count(self.connections, self.max_depth) if connects else 0.0),
+            count=dr.opaque(mi.Float, count),
             light_ratio=dr.opaque(mi.Float, launch.light_paths / (pixels * launch.samples)),
             connects=connects,
             traces_light=launch.light_paths > 0,
             light_samples=self.light_samples,
+            useful=useful,
         )
 
 
 def explore(
-    scene: mi.Scene, sensor: mi.Sensor, lights: Lights, options: PathOptions, lanes: SparseLanes
-) -> tuple[ImageStack, tuple[mi.Float, mi.Float, mi.Float]]:
-    """(images, sums of a `Tally`) of a launch from which a guide is learned."""
-    tally = Tally.empty(Layout.of(lights.count), lanes)
+    scene: mi.Scene, sensor: mi.Sensor, lights: Lights, options: PathOptions, lanes: SparseLanes, grid: Grid
+) -> tuple[ImageStack, Totals]:
+    """(images, totals of a `Tally`) of a launch from which a guide is learned; ``grid`` is that of a `Usefulness`."""
+    tally = Tally.empty(Layout.of(lights.count), grid, lanes)
     images = trace(scene, sensor, lights, options, lanes, tally)
-    dr.eval(tally.sums)
-    return images, tally.sums
+    dr.eval(tally.totals)
+    return images, tally.totals
 
 
 def trace(
@@ -310,9 +320,11 @@ def trace(
         if tally is not None:
             splat = TalliedSplat.of(splat, tally, image, dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2])))
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
+        offset = randomness.sampler(randomness.stream(lanes.keys, randomness.SLOTS), lanes.first_light_path)
         vertices = trace_light_paths(
-            scene, lens, lights, options, rng=rng, path=path, paths=lanes.counts[2], splat=splat
-        )
+            scene, lens, lights, options,
+            rng=rng, path=path, paths=lanes.counts[2], offset=offset.next_independent(), splat=splat,
+        )  # fmt: skip
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()
@@ -335,14 +347,15 @@ def trace(
     return images
 
 
-def connection_count(connections: int, max_depth: int) -> float:
+def connection_count(connections: int, max_depth: int, *, guided: bool) -> float:
     """The technique count of connections: n_C over a nominal number of vertices per light path, 3 at most.
 
     A connection gets one of a path's vertices at random, so each technique (s, t) gets about n_C/length of them.
     Every constant keeps the estimate unbiased, as counts only change the weights. About 3 was the mean length in the
-    closed rooms that were measured.
+    closed rooms that were measured. Where vertices are drawn by their usefulness, each connection is worth more, and
+    n_C itself was best.
     """
-    return connections / min(3, max(1, max_depth - 2))
+    return connections / (1 if guided else min(3, max(1, max_depth - 2)))
 
 
 def _whole(props: mi.Properties, name: str, default: int) -> int:

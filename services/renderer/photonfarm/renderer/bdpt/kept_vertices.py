@@ -2,6 +2,9 @@
 
 A connection reads all of a vertex, so one record is a few cache lines where columns would be a line for each number.
 The surface is kept as it was found. To find it again would take longer than to read it.
+
+Connections find the vertices in slots, as many as there are paths, in which paths were drawn in proportion to their
+weights (see `resampling`). So none goes to a path that left the scene.
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
+
+from photonfarm.renderer.bdpt.resampling import resampled
 
 Record: TypeAlias = "tuple[mi.Vector4f, ...]"
 """What is read and written at once."""
@@ -25,8 +30,9 @@ class KeptVertex:
 
     si: mi.SurfaceInteraction3f  # what materials read: p, n, sh_frame, wi, uv, dp_du, dp_dv, shape and prim_index
     throughput_over_cos: mi.Spectrum  # over |cos| of the direction of arrival with the geometric normal
-    dvcm: mi.Float  # on arrival: see weights.py
-    dvc: mi.Float
+    counted_dvcm: mi.Float  # count · dVCM on arrival, with the count of the technique that joins the vertex before
+    dvc: mi.Float  # on arrival: see weights.py
+    count: mi.Float  # of the technique that joins this vertex
     depth: mi.UInt32  # edges from the light
 
     def record(self) -> Record:
@@ -36,30 +42,40 @@ class KeptVertex:
             (*si.p, _as_float(self.depth)),
             (*si.n, _as_float(dr.reinterpret_array(mi.UInt32, si.shape))),
             (*si.sh_frame.n, _as_float(si.prim_index)),
-            (*si.sh_frame.s, self.dvcm),
+            (*si.sh_frame.s, self.counted_dvcm),
             (*si.wi, self.dvc),
             (*self.throughput_over_cos, si.uv.x),
             (*si.dp_du, si.uv.y),
-            (*si.dp_dv, mi.Float(0)),
+            (*si.dp_dv, self.count),
         )
         return tuple(mi.Vector4f(*quad) for quad in quads)
 
 
 @dataclass(slots=True)
 class KeptVertices:
-    """Records of the kept vertices of N light paths."""
+    """Records of the kept vertices of the light paths of K images, N each, and the slots in which they are drawn."""
 
-    numbers: mi.Float  # [N · 32]
+    numbers: mi.Float  # [K·N · 32]
+    slots: mi.UInt32  # [K·N]: the path in each slot
 
     @classmethod
-    def of(cls, record: Record, scale: mi.Float) -> KeptVertices:
-        """The kept vertices of all lanes' paths, their throughputs times ``scale`` [N]."""
-        n = dr.width(scale)
+    def of(cls, record: Record, weight: mi.Float, offset: mi.Float, paths: mi.UInt32) -> KeptVertices:
+        """The kept vertices of all lanes' paths, whose records hold throughputs over their own weights.
+
+        ``weight`` [K·N] are sums over all vertices of a path that could have been kept, ``offset`` [K] random numbers,
+        and ``paths`` [1] is N.
+        """
+        n = dr.width(weight)
+        slots, factor = resampled(weight, offset, paths)
         numbers = dr.empty(mi.Float, n * 4 * _QUADS)
         power = record[_POWER]
-        scaled = mi.Vector4f(*(power[k] * scale for k in range(3)), power.w)
+        scaled = mi.Vector4f(*(power[k] * factor for k in range(3)), power.w)
         _write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
-        return cls(numbers)
+        return cls(numbers, slots)
+
+    def drawn(self, slot: mi.UInt32, active: mi.Bool) -> KeptVertex:
+        """The kept vertices of the paths in slots; their depth is 0 if no path of the image has one."""
+        return self.read(dr.gather(mi.UInt32, self.slots, slot, active), active)
 
     def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
         """The kept vertex of light path ``path``; its depth is 0 if there is none."""
@@ -74,7 +90,7 @@ class KeptVertices:
         si.uv = mi.Point2f(throughput.w, dp_du.w)
         si.prim_index = _as_uint(frame_n.w)
         si.shape = dr.reinterpret_array(mi.ShapePtr, _as_uint(n.w))
-        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, _as_uint(p.w))
+        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, dp_dv.w, _as_uint(p.w))
 
 
 def empty_record() -> Record:

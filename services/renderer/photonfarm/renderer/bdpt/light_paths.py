@@ -3,10 +3,11 @@
 The first surface vertex is not joined to the lens (t=1), but all later ones are. Direct light is left to next event
 estimation, which has less noise than splats. It misses none, as lights that it cannot sample start no light paths.
 
-The vertex kept for connections is drawn among those that a connection can reach, in proportion to their throughput, by
-reservoir sampling (Chao, *A General Purpose Unequal Probability Sampling Plan*, 1982). So each path needs storage for
-one vertex whatever ``max_depth`` is. Its throughput is divided by the probability with which it was drawn, which keeps
-the sum over all vertices unbiased.
+The vertex kept for connections is drawn among those that a connection can reach, in proportion to their weights, by
+reservoir sampling (Chao, *A General Purpose Unequal Probability Sampling Plan*, 1982). A vertex's weight is its
+throughput, times its usefulness where that is known (see `guiding.usefulness`). So each path needs storage for one
+vertex whatever ``max_depth`` is. Its throughput is divided by the probability with which it was drawn, which keeps the
+sum over all vertices unbiased.
 
 The light side never evaluates an adjoint BSDF. It evaluates the radiance-mode BSDF with exchanged directions, times
 |cos_g(out)|/|cos_g(in)|, so both sides integrate the same function under any shading normal (Veach 1997, §5.3).
@@ -24,6 +25,7 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.film import Splat
 from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
+from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
 from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.randomness import Sampler
@@ -39,16 +41,24 @@ class PathOptions:
     max_depth: int  # edges; 2³² − 1 for unbounded
     rr_depth: int  # edges after which Russian roulette begins
     connections: int  # n_C: see eye_paths.connect_all
-    count: mi.Float  # technique count of connections in the weights (see integrator.connection_count)
+    count: mi.Float  # of connections to vertices of usefulness 1, in the weights (see integrator.connection_count)
     light_ratio: mi.Float  # n_T, light paths per eye path
     connects: bool  # whether any connection is made
     traces_light: bool  # whether any light path is joined to the lens
     light_samples: int = 1  # samples of the lights at the first eye vertex
+    useful: Usefulness | None = None  # of light vertices for connections, where it is known
 
     @property
     def kind(self) -> tuple[int, ...]:
         """The numbers for which the kernels are compiled."""
-        return self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light, self.light_samples
+        return (
+            self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light, self.light_samples,
+            self.useful is not None,
+        )  # fmt: skip
+
+    def usefulness(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """How useful light vertices are for connections, 1 on average; 1 for all where it is not known."""
+        return mi.Float(1) if self.useful is None else self.useful.at(si, active)
 
 
 @dataclass(slots=True)
@@ -62,9 +72,10 @@ class LightState:
     throughput: mi.Spectrum
     dvcm: mi.Float  # see weights.py, as they left the vertex before
     dvc: mi.Float
+    count: mi.Float  # of the technique that joins the vertex before
     depth: mi.UInt32  # edges up to this vertex
-    seen: mi.Float  # sum over the vertices that a connection could reach so far, of the throughput left there
-    kept: Record  # of one of them, drawn in proportion to that; empty without connections
+    weight: mi.Float  # sum of the weights of the vertices that a connection could reach so far
+    kept: Record  # of one of them, drawn in proportion to its weight; empty without connections
 
 
 def trace_light_paths(
@@ -76,12 +87,13 @@ def trace_light_paths(
     rng: Sampler,
     path: mi.UInt32,
     paths: mi.UInt32,
+    offset: mi.Float,
     splat: Splat,
 ) -> KeptVertices | None:
     """Trace a light path for each of n points of ``rng``, and add what the lens sees of them by ``splat``.
 
-    ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch. Returns the kept vertices, or
-    None without connections.
+    ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch, and ``offset`` [K] a random
+    number for each image. Returns the kept vertices, or None without connections.
     """
     start = sample_emission(lights, rng, path, paths)
     if isinstance(splat, TalliedSplat):
@@ -96,9 +108,10 @@ def trace_light_paths(
     if isinstance(splat, TalliedSplat):
         splat.end(state.depth)
     if not options.connects:
-        dr.eval(state.seen)
+        dr.eval(state.depth)
         return None
-    vertices = KeptVertices.of(state.kept, state.seen)
+    dr.eval(state.kept, state.weight)
+    vertices = KeptVertices.of(state.kept, state.weight, offset, paths)
     dr.eval(vertices)
     return vertices
 
@@ -111,8 +124,9 @@ def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, 
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(
-        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.UInt32(1), mi.Float(0), kept
-    )
+        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.Float(1), mi.UInt32(1), mi.Float(0),
+        kept,
+    )  # fmt: skip
 
 
 def vertex_bounce(
@@ -135,7 +149,7 @@ def vertex_bounce(
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & (cos_in > 0)
     dvcm, dvc = weights.arrive(s.dvcm, s.dvc, dr.square(si.t), cos_in)
-    count = mi.Float(dr.select(first, 1, options.count))
+    useful = options.usefulness(si, active)
     bsdf = si.bsdf()
     smooth = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
@@ -147,7 +161,7 @@ def vertex_bounce(
         value, p_reverse = bsdf.eval_pdf(ctx, *exchanged(si, si.to_local(seen.d)), seen.valid)
         cos_out = dr.abs(dr.dot(si.n, seen.d))
         w = weights.light_tracing(
-            seen.area_density_over_cos * cos_out, options.light_ratio, count, p_reverse, dvcm, dvc
+            seen.area_density_over_cos * cos_out, options.light_ratio, s.count, p_reverse, dvcm, dvc
         )
         joined = seen.valid & (dr.max(value) > 0)
         joined &= ~scene.ray_test(_from_lens(seen.start, si), joined)
@@ -155,21 +169,22 @@ def vertex_bounce(
 
     # ----------------------------- Keep for connections -----------------------------
 
-    sum_seen = mi.Float(s.seen)
+    total, count = mi.Float(s.weight), options.count * useful
     kept = s.kept
     if options.connects:
         reachable = active & smooth & (depth + 1 < options.max_depth)
-        left = _throughput_left(s, start)
-        sum_seen[reachable] += left
-        keep = reachable & (s.rng.next_independent() * sum_seen < left)
-        vertex = KeptVertex(si, s.throughput / (left * cos_in), dvcm, dvc, depth).record()
+        weight = dr.max(s.throughput) * useful
+        total[reachable] += weight
+        keep = reachable & (s.rng.next_independent() * total < weight)
+        vertex = KeptVertex(si, s.throughput / (weight * cos_in), s.count * dvcm, dvc, count, depth).record()
         kept = tuple(dr.select(keep, new, old) for new, old in zip(vertex, s.kept, strict=True))
 
     # ----------------------------------- Scatter -----------------------------------
 
     goes_on = active & (depth + 1 < options.max_depth)
-    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, seen=sum_seen, kept=kept)
-    scatter(state, si, bsdf, cos_in, count)
+    state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, weight=total, kept=kept)
+    scatter(state, si, bsdf, cos_in)
+    state.count = count
     roulette(state, start, options)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
     state.active &= state.hit.is_valid()
@@ -188,7 +203,7 @@ def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
     return mi.Ray3f(start, way / distance, distance, si.time, si.wavelengths)
 
 
-def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in: mi.Float, count: mi.Float) -> None:
+def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in: mi.Float) -> None:
     """Sample the next direction; delta lobes get their importance-mode weight times Veach's factor (1997, eq. 5.20)."""
     importance = mi.BSDFContext()
     importance.mode = mi.TransportMode.Importance
@@ -204,7 +219,7 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
     s.active &= (bs.pdf > 0) & (dr.max(delta_weight) > 0) & (dr.max(factor) > 0) & dr.isfinite(dr.max(factor))
     s.throughput = dr.select(s.active, s.throughput * factor, 0)
 
-    vcm, vc = weights.scatter(s.dvcm, s.dvc, count, cos_out, bs.pdf, p_reverse)
+    vcm, vc = weights.scatter(s.dvcm, s.dvc, s.count, cos_out, bs.pdf, p_reverse)
     delta_vcm, delta_vc = weights.scatter_delta(s.dvc, cos_out)
     s.dvcm, s.dvc = dr.select(delta, delta_vcm, vcm), dr.select(delta, delta_vc, vc)
     s.ray = si.spawn_ray(d)
@@ -216,15 +231,10 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     After ``rr_depth`` edges it works as in Mitsuba's ``path``. Before, only paths that have lost more than two thirds
     of their throughput may end, since they cost as much as others and carry less.
     """
-    left = _throughput_left(s, start)
+    left = dr.max(s.throughput) / dr.max(start.throughput)
     kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
     s.active &= (s.rng.next_independent() < kept) & (kept > 0)
     s.throughput *= dr.rcp(kept)
-
-
-def _throughput_left(s: LightState, start: Emission) -> mi.Float:
-    """The throughput, relative to that at the start."""
-    return dr.max(s.throughput) / dr.max(start.throughput)
 
 
 def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:

@@ -102,7 +102,7 @@ def _hit(
         dr.scatter(column, value, slot, active)
     dr.scatter(bounce, mi.Int32(s.depth) - 1, slot, active)
     state = replace(s, active=active & (s.depth + 1 < options.max_depth), depth=s.depth + 1)
-    scatter(state, si, si.bsdf(), cos_in, mi.Float(1))
+    scatter(state, si, si.bsdf(), cos_in)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
     state.active &= state.hit.is_valid()
     return (state,)

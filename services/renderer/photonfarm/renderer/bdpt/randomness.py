@@ -23,7 +23,7 @@ import numpy as np
 
 from photonfarm.renderer.bdpt.launches import Launch
 
-LIGHT, EYE, PAIRING, PHOTONS, PIXELS, LEARNING = range(6)
+LIGHT, EYE, PAIRING, PHOTONS, PIXELS, LEARNING, SLOTS = range(7)
 
 _ULP = 1 / (1 << 24)
 

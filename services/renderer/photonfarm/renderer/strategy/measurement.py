@@ -24,9 +24,10 @@ from photonfarm.shared.scene.spec import Film, SceneSpec
 
 GRID = (
     *(Candidate(0, r) for r in (0.0, 0.25, 1.0, 4.0, 16.0)),
-    *(Candidate(c, r) for c, r in ((1, 1.0), (2, 0.25), (4, 0.125), (8, 0.125))),
-    *(Candidate(c, r, light_samples=n) for c, r, n in ((1, 0.25, 2), (2, 0.25, 2), (2, 0.25, 4), (4, 0.125, 2))),
-    *(Candidate(c, r, guided_light=True) for c, r in ((0, 1.0), (0, 16.0), (8, 0.125))),
+    *(Candidate(c, r) for c, r in ((1, 1.0), (2, 0.25), (4, 0.125))),
+    *(Candidate(c, r, light_samples=n) for c, r, n in ((2, 0.25, 2), (2, 0.25, 4), (4, 0.125, 2))),
+    *(Candidate(c, r, True) for c, r in ((0, 1.0), (0, 16.0), (2, 0.25), (4, 0.125), (8, 0.0625))),
+    Candidate(2, 0.25, True, light_samples=2),
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 

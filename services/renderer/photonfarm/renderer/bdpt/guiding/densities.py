@@ -1,10 +1,14 @@
 """Gains from sums over few light paths. Pure numpy.
 
 The error that counts is the sum over pixels of variance/(r² + ε·mean²), with the mean brightness of the pixel's tile
-for r. Light paths of a cell account for E[Σ v²/(r² + ε·mean²)]/q of it, with v what one adds to a pixel and q the
-cell's probability, and their edges for the time. So error × time is least for q in proportion to the root of the second
-moment over the edges. Both are estimated coarse to fine: where only a few light paths started in a cell, its estimate
-is that of the four cells around it together.
+for r. Light paths of a cell account for E[Σ v²/(r² + ε·mean²)]/q of it, with v what one adds to a pixel by splats and q
+the cell's probability, and their edges for the time. So error × time is least for q in proportion to the root of the
+second moment over the edges. Both are estimated coarse to fine: where only a few light paths started in a cell, its
+estimate is that of the four cells around it together.
+
+What connections add hardly depends on q, as their vertices are drawn anew in proportion to their weights, whatever
+cells they come from. So their second moment counts for all cells alike: where most of the error is theirs, light paths
+start nearly as without a guide.
 
 Index letters as in `starts`.
 """
@@ -22,13 +26,15 @@ PRIOR = 16.0
 """The number of light paths that the estimate of the coarser cell counts for; rare bright ones would mislead else."""
 
 
-def gains(layout: Layout, sums: F64, starts: F64, edges: F64, probability: F64) -> F64:
+def gains(layout: Layout, splats: F64, joined: float, starts: F64, edges: F64, probability: F64) -> F64:
     """The gains [T], with the mean 1 over default sampling; all are 1 where no light path added anything.
 
-    ``sums`` [T] are those of weighted squares of what the ``starts`` [T] light paths, of ``edges`` [T] together, added
-    to pixels. ``probability`` [N] is the default one of each light.
+    ``splats`` [T] are sums of weighted squares of what splats of the ``starts`` [T] light paths, of ``edges`` [T]
+    together, added to pixels, and ``joined`` is that of all connections. ``probability`` [N] is the default one of each
+    light.
     """
-    gain = np.sqrt(_means(layout, sums, starts) / np.maximum(_means(layout, edges, starts), 1))
+    of_connections = joined / max(starts.sum(), 1.0)
+    gain = np.sqrt((_means(layout, splats, starts) + of_connections) / np.maximum(_means(layout, edges, starts), 1))
     gain = gain.reshape(layout.lights, layout.of_a_light)
     total = float((gain.mean(axis=1) * probability).sum())
     if not (np.isfinite(total) and total > 0):

@@ -1,4 +1,4 @@
-"""Learns a guide: from what light paths of default sampling add to some images, by the cell that they started in."""
+"""Learns a guide from what light paths of default sampling add to some images."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from photonfarm.renderer.bdpt.film import ImageStack
 from photonfarm.renderer.bdpt.guiding.densities import gains
 from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
-from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.guiding.tally import Tally, column_of, tiles_of
+from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide
+from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
+from photonfarm.renderer.bdpt.guiding.usefulness import usefulness
 from photonfarm.renderer.bdpt.launches import Launch
 
 EPSILON = 1e-2
@@ -43,15 +44,36 @@ class Effort:
         return Launch(images, 0, 1, 0, max(1, self.light_paths // images), 0)
 
 
-def learned(layout: Layout, probability: mi.Float, images: ImageStack, tally: Tally, lanes: SparseLanes) -> StartGuide:
-    """The guide that the images and the tally of a launch suggest, given default probabilities of lights [N]."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LightGuide:
+    """What was learned for the light paths of a scene."""
+
+    starts: StartGuide
+    useful: mi.Float | None  # the table of a `Usefulness`; None without connections
+
+
+def learned(
+    layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes
+) -> LightGuide:
+    """The guide that the images and the totals of a launch suggest, given default probabilities of lights [N]."""
     tiles = tiles_of(lanes.images)
     weight = _weights(images.radiance, lanes, tiles)
     columns = lanes.images * tiles**2
-    column = dr.arange(mi.UInt32, layout.cells * columns) % columns
-    sums = dr.block_sum(tally.squares * dr.gather(mi.Float, weight, column), columns)
-    found = [np.array(values, np.float64) for values in (sums, tally.starts, tally.edges, probability)]
-    return StartGuide.of(layout, gains(layout, *found))
+
+    def weighted(squares: mi.Float) -> mi.Float:
+        column = dr.arange(mi.UInt32, dr.width(squares)) % columns
+        return dr.block_sum(squares * dr.gather(mi.Float, weight, column), columns)
+
+    def on_host(*arrays: mi.Float) -> list[F64]:
+        return [np.array(values, np.float64) for values in arrays]
+
+    splat_squares, started, edges, connection_squares, connections = totals
+    splats, joined = on_host(weighted(splat_squares), weighted(connection_squares))
+    gain = gains(layout, splats, float(joined.sum()), *on_host(started, edges, probability))
+    starts, useful = StartGuide.of(layout, gain), None
+    if lanes.shifts is not None:
+        useful = mi.Float(usefulness(joined, *on_host(connections)).tolist())
+    return LightGuide(starts, useful)
 
 
 def _weights(radiance: mi.Spectrum, lanes: SparseLanes, tiles: int) -> mi.Float:

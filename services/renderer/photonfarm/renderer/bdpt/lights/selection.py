@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt import randomness
+from photonfarm.renderer.bdpt.grid import Grid
 
 CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell
@@ -28,7 +29,6 @@ _PROBES = (
     (0.1, 0.8, 0.1),
     (0.1, 0.1, 0.8),
 )  # points of each face that are looked up
-_MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
 
 BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
 """The first parts of the names of parameters that scale a light's brightness."""
@@ -42,8 +42,7 @@ class Selection:
     """Probabilities of N lights in C = CELLS³ cells."""
 
     count: int  # N
-    lower: mi.Point3f  # [1]: corner of the grid
-    cells_per_length: mi.Vector3f  # [1]
+    grid: Grid
     cdf: mi.Float  # [C·N]: running sums, cell after cell
     pmf: mi.Float  # [C·N]
     slot: mi.UInt32  # by Dr.Jit's registry id of the emitter: its number among the N
@@ -51,7 +50,7 @@ class Selection:
 
     def choose(self, p: mi.Point3f, u: mi.Float) -> tuple[mi.Int32, mi.Float]:
         """(number of a light, its probability) at points ``p``, by inversion of the running sum at ``u`` in [0, 1)."""
-        first = self._cell(p) * self.count
+        first = self.grid.cell(p) * self.count
         target = u * dr.gather(mi.Float, self.cdf, first + (self.count - 1))
         last = self.count - 1
         light = dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self.cdf, first + i) <= target)
@@ -61,16 +60,7 @@ class Selection:
         """The probability of choosing ``emitter`` at points ``p``; 0 for the null pointer."""
         number = dr.reinterpret_array(mi.UInt32, emitter)
         slot = dr.gather(mi.UInt32, self.slot, number)
-        return dr.gather(mi.Float, self.pmf, self._cell(p) * self.count + slot, number != 0)
-
-    def _cell(self, p: mi.Point3f) -> mi.UInt32:
-        """The cell that points lie in or are next to; some cell for points that are not finite.
-
-        The last minimum sees to that: NaN converts to what the processor likes, with AVX2 far outside the table.
-        """
-        place = dr.clip((p - self.lower) * self.cells_per_length, 0, CELLS - 0.5)
-        x, y, z = (mi.UInt32(place[k]) for k in range(3))
-        return dr.minimum((z * CELLS + y) * CELLS + x, CELLS**3 - 1)
+        return dr.gather(mi.Float, self.pmf, self.grid.cell(p) * self.count + slot, number != 0)
 
 
 def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box: mi.ScalarBoundingBox3f) -> Selection:
@@ -79,11 +69,7 @@ def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box:
     ``box`` is the scene's bounding box. Lights with weight 0 are never chosen.
     """
     n, cells = len(ids), CELLS**3
-    low, extent = box.min, box.extents()
-    lower = mi.Point3f(*(dr.opaque(mi.Float, float(low[k] - _MARGIN[0] * extent[k])) for k in range(3)))
-    share = (1 + sum(_MARGIN)) / CELLS
-    size = mi.Vector3f(*(dr.opaque(mi.Float, max(float(extent[k]) * share, 1e-6)) for k in range(3)))
-
+    grid = Grid.over(box, CELLS)
     pair = dr.arange(mi.UInt32, cells * n * _SAMPLES) // _SAMPLES
     cell, light = pair // n, pair % n
     rng = randomness.sampler(
@@ -92,7 +78,7 @@ def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box:
     corner = mi.Point3f(cell % CELLS, cell // CELLS % CELLS, cell // (CELLS * CELLS))
     xy = rng.next_2d()
     seen_from = dr.zeros(mi.Interaction3f)
-    seen_from.p = lower + size * (corner + mi.Vector3f(xy.x, xy.y, rng.next_1d()))
+    seen_from.p = grid.lower + grid.size * (corner + mi.Vector3f(xy.x, xy.y, rng.next_1d()))
     alive = dr.gather(mi.Float, base, light) > 0
     emitter = dr.gather(mi.EmitterPtr, pointers, light)
     cast = dr.max(emitter.sample_direction(seen_from, rng.next_2d(), alive)[1])
@@ -109,7 +95,7 @@ def read_selection(pointers: mi.EmitterPtr, ids: list[int], base: mi.Float, box:
     slot = dr.zeros(mi.UInt32, max(ids) + 1)
     dr.scatter(slot, dr.arange(mi.UInt32, n), mi.UInt32(ids))
     dr.eval(cdf, pmf, slot, overall)
-    return Selection(n, lower, dr.rcp(size), cdf, pmf, slot, overall)
+    return Selection(n, grid, cdf, pmf, slot, overall)
 
 
 def _over_cell(value: mi.Float, n: int) -> mi.Float:

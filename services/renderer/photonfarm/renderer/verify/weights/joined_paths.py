@@ -21,6 +21,8 @@ import numpy as np
 
 from photonfarm.renderer.bdpt import randomness, weights
 from photonfarm.renderer.bdpt.camera import EyeStart, primary_rays, sample_sensor
+from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.light_paths import start_weights
 from photonfarm.renderer.bdpt.lights.emission import (
     AREA,
@@ -171,8 +173,13 @@ def _pdf(bounce: Bounce, wi: Any, wo: Any) -> Any:
 class TechniqueCounts:
     """Technique counts as the integrator's weights use them."""
 
-    count: float  # of connections
+    count: float  # of connections to vertices of usefulness 1
     light_ratio: float
+    useful: Usefulness | None = None
+
+    def of(self, bounce: Bounce) -> Any:
+        """The count of connections to the light vertices ``bounce``."""
+        return self.count if self.useful is None else self.count * self.useful.at(bounce.si, mi.Bool(True))
 
 
 def weights_of(scene: Any, lights: Lights, joined: JoinedPaths, lens: Pinhole, settings: TechniqueCounts) -> F64:
@@ -181,23 +188,25 @@ def weights_of(scene: Any, lights: Lights, joined: JoinedPaths, lens: Pinhole, s
     st = steps(joined, lens)
     eye, before = _eye_sums(joined, st, settings)
     light = _light_sums(lights, joined, st, settings)
-    n, first = settings.count, joined.bounces[0].si
+    first = joined.bounces[0].si
+    counts = [1, *(settings.of(bounce) for bounce in joined.bounces)]  # of the technique whose last light vertex is vⱼ
     found = [
         _hit_weight(scene, lights, joined, st, before),
         weights.next_event(
             dr.select(joined.light.delta, 0, st.to_light[1] / joined.light.density),
             joined.light.ratio_over_cos * dr.abs(dr.dot(first.n, joined.light.d)),
-            0 if k == 2 else n,
+            0 if k == 2 else counts[1],
             st.to_eye[1],
             *eye[1],
         ),
     ]
     for s in range(2, k):
         y, x = s - 1, s
-        counts = (1 if y == 1 else n), (1 if x == k - 1 else n)
-        light_sum = st.to_light[x] * st.cos_left[y] * (counts[0] * light[y][0] + st.to_light[y] * light[y][1])
-        eye_sum = st.to_eye[y] * st.cos_right[y] * (counts[1] * eye[x][0] + st.to_eye[x] * eye[x][1])
-        found.append(weights.connection_over_r2(n, st.r2[y], light_sum, eye_sum) * st.r2[y] if n else mi.Float(0))
+        n, before, after = counts[y], counts[y - 1], (1 if x == k - 1 else counts[x])
+        light_sum = st.to_light[x] * st.cos_left[y] * (before * light[y][0] + st.to_light[y] * light[y][1])
+        eye_sum = st.to_eye[y] * st.cos_right[y] * (after * eye[x][0] + st.to_eye[x] * eye[x][1])
+        w = weights.connection_over_r2(n, st.r2[y], light_sum, eye_sum) * st.r2[y]
+        found.append(w if settings.count else mi.Float(0))
     found.append(_light_tracing_weight(scene, joined, st, light[k - 1], settings) if k > 2 else mi.Float(0))
     for s in range(1, k + 1):
         for j in (s - 1, s):
@@ -213,7 +222,7 @@ def _eye_sums(joined: JoinedPaths, st: Steps, settings: TechniqueCounts) -> tupl
     arrived = {}
     for j in range(k - 1, 0, -1):
         arrived[j] = weights.arrive(dvcm, dvc, st.r2[j], st.cos_left[j])
-        count = 1 if j == k - 1 else settings.count
+        count = 1 if j == k - 1 else settings.of(joined.bounces[j - 1])
         bounce, out = joined.bounces[j - 1], st.cos_right[j - 1]
         dvcm, dvc = _scattered(bounce, arrived[j], count, out, st.to_light[j], st.to_eye[j])
     return arrived, (dvcm, dvc)
@@ -263,7 +272,7 @@ def _light_sums(
     dvcm, dvc = weights.arrive(*left, r2, st.cos_right[0])
     arrived = {1: (dvcm, dvc)}
     for j in range(1, k - 1):
-        count = 1 if j == 1 else settings.count
+        count = 1 if j == 1 else settings.of(joined.bounces[j - 2])
         left = _scattered(joined.bounces[j - 1], arrived[j], count, st.cos_left[j], st.to_eye[j], st.to_light[j])
         arrived[j + 1] = weights.arrive(*left, st.r2[j], st.cos_right[j])
     return arrived
@@ -295,7 +304,8 @@ def _light_tracing_weight(
     si = joined.bounces[-1].si
     seen = sample_sensor(scene.sensors()[0], si, mi.Point2f(0.5), joined.complete)
     camera = seen.area_density_over_cos * dr.abs(dr.dot(si.n, seen.d))
-    return weights.light_tracing(camera, settings.light_ratio, settings.count, st.to_light[k - 1], *sums)
+    count = settings.of(joined.bounces[-2])
+    return weights.light_tracing(camera, settings.light_ratio, count, st.to_light[k - 1], *sums)
 
 
 # ------------------------------------------------ As the oracle sees them ------------------------------------------
@@ -365,12 +375,28 @@ def _selection(lights: Lights, index: Any, seen_from: F64) -> tuple[F64, F64]:
     if lights.selection is None:
         return np.ones(len(index)), np.ones(len(index))
     table = np.array(lights.selection.pmf, np.float64).reshape(-1, lights.count)
-    cells = round(len(table) ** (1 / 3))
-    lower, per_length = (
-        np.array(v, np.float64).ravel() for v in (lights.selection.lower, lights.selection.cells_per_length)
-    )
-    x, y, z = np.clip((seen_from - lower) * per_length, 0, cells - 0.5).astype(int).T
-    return table[(z * cells + y) * cells + x, index], table.mean(axis=0)[index]
+    return table[_cell(lights.selection.grid, seen_from), index], table.mean(axis=0)[index]
+
+
+def _cell(grid: Grid, point: F64) -> Any:
+    """The number of the cell that each point [N, 3] lies in."""
+    lower, size = (np.array(v, np.float64).ravel() for v in (grid.lower, grid.size))
+    x, y, z = np.clip((point - lower) / size, 0, grid.side - 0.5).astype(int).T
+    return (z * grid.side + y) * grid.side + x
+
+
+def usefulness(counts: TechniqueCounts, paths: OraclePaths) -> F64:
+    """[N, k + 1]: usefulness of the last light vertex of each technique, by its position and normal; 1 if none is."""
+    found = np.ones(paths.to_eye.shape)
+    if counts.useful is None:
+        return found
+    table = np.array(counts.useful.table, np.float64)
+    for s in range(2, paths.edges):
+        n = paths.normal[:, s - 1]
+        axis = np.abs(n).argmax(axis=1)
+        kind = 2 * axis + (np.take_along_axis(n, axis[:, None], 1)[:, 0] < 0)
+        found[:, s] = table[_cell(counts.useful.grid, paths.position[:, s - 1]) * 6 + kind]
+    return found
 
 
 def _columns(kept: Any, values: list[Any]) -> Any:

@@ -6,10 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
+from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.verify.scenes import hard_scenes
@@ -17,7 +19,14 @@ from photonfarm.renderer.verify.scenes.case import BdptSettings, SceneDict
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
-from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCounts, stored, walk, weights_of
+from photonfarm.renderer.verify.weights.joined_paths import (
+    Pinhole,
+    TechniqueCounts,
+    stored,
+    usefulness,
+    walk,
+    weights_of,
+)
 from photonfarm.renderer.verify.weights.oracle import Mask, OraclePaths
 
 TOLERANCE = 1e-3
@@ -106,26 +115,30 @@ def compare_weights(
 ) -> WeightComparison:
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays.
 
-    Light paths start by a guide of random gains, for settings that are guided. Of these paths 0.5 % of each length may
-    be off: where the ray of next event estimation arrives is a little beside the sampled point of the light, and may
-    lie in another cell of the guide.
+    For settings that are guided, light paths start by random gains, and their vertices have a random usefulness. Of
+    these paths 0.5 % of each length may be off: where the ray of next event estimation arrives is a little beside the
+    sampled point of the light, and may lie in another cell of the guide.
     """
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     if settings.guided_light:
         lights = lights.guided_by(random_guide(lights.count, seed), scene)
+        useful = Usefulness.over(scene, random_usefulness(seed))
+    else:
+        useful = None
     spared = _AT_EDGES if settings.guided_light else 0.0
-    count = connection_count(settings.connections, EDGES)
+    count = connection_count(settings.connections, EDGES, guided=settings.guided_light)
+    counts = TechniqueCounts(count, settings.light_ratio, useful)
     result = WeightComparison()
     for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
         complete = np.array(joined.complete)
         if not complete.any():
             continue
-        counts = TechniqueCounts(count, settings.light_ratio)
         ours = weights_of(scene, lights, joined, lens, counts)[complete]
         paths = stored(lights, joined, lens)
         walked = _can_be_walked(paths)
-        truth = oracle.weights(paths, oracle.technique_counts(paths.edges, count, settings.light_ratio))
+        nominal = oracle.technique_counts(paths.edges, count, settings.light_ratio)
+        truth = oracle.weights(paths, nominal * usefulness(counts, paths))
         ours, truth = ours[walked], truth[walked]
         result.paths += len(truth)
         result.with_delta += int(paths.delta[walked].any(axis=1).sum())
@@ -142,6 +155,11 @@ def random_guide(lights: int, seed: int) -> StartGuide:
     """A guide that follows nothing: its gains are random, from 0.1 to 10. Its cells are large, with short edges."""
     layout = Layout(lights, directions=4, positions=1)
     return StartGuide.of(layout, 10 ** np.random.default_rng(seed).uniform(-1, 1, layout.cells))
+
+
+def random_usefulness(seed: int) -> mi.Float:
+    """A table that follows nothing: random numbers from 0.1 to 10."""
+    return mi.Float((10 ** np.random.default_rng(seed).uniform(-1, 1, CELLS)).tolist())
 
 
 def _can_be_walked(paths: OraclePaths) -> Mask:

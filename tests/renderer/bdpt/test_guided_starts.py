@@ -229,6 +229,6 @@ def test_more_lights_have_fewer_cells_each(lights: int, cells: int) -> None:
 
 
 def test_the_paths_that_teach_are_a_small_share_of_an_image() -> None:
-    for eye_paths, light_ratio in ((1 << 17, 1.0), (1 << 20, 16.0), (1 << 30, 0.25)):
-        effort = learning.Effort.of_image(eye_paths, light_ratio)
+    for eye_paths, light_ratio, connections in ((1 << 17, 1.0, 0), (1 << 20, 16.0, 1), (1 << 18, 0.125, 4)):
+        effort = learning.Effort.of_image(eye_paths, light_ratio, connections)
         assert effort.eye_paths + effort.light_paths < 0.1 * eye_paths * (1 + light_ratio)

@@ -217,7 +217,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
             if self.guided_light and guide is None:
-                effort = Effort.of_image(pixels * spp, self.light_ratio)
+                effort = Effort.of_image(pixels * spp, self.light_ratio, self.connections)
                 guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if self._has_light_paths(scene) else 0

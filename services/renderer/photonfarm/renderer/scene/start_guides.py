@@ -57,5 +57,6 @@ class SceneGuides:
         views = [sample_view(spec, key, seed, i, state) for i in range(VIEWS)]
         places = np.stack([self._sensor.place(view) for view in views])
         eye_paths = 2 * spec.film.width * spec.film.height * spec.transport.half_spp
-        effort = Effort.of_image(eye_paths * (1 if spec.groups else STATIC), integrator.light_ratio)
+        images = 1 if spec.groups else STATIC
+        effort = Effort.of_image(eye_paths * images, integrator.light_ratio, integrator.connections)
         return integrator.learn_guide(scene, self._sensor.at_origin, seed, places, effort)

@@ -34,10 +34,14 @@ class Effort:
     light_paths: int = 8192
 
     @classmethod
-    def of_image(cls, eye_paths: int, light_ratio: float) -> Effort:
-        """A few per cent of the work of an image of so many eye paths; one of few sizes, as each has its kernels."""
+    def of_image(cls, eye_paths: int, light_ratio: float, connections: int) -> Effort:
+        """A few per cent of the work of an image of so many eye paths; one of few sizes, as each has its kernels.
+
+        Connections teach from fewer light paths than splats do, as each light path is joined to many eye paths.
+        """
         eyes = int(np.clip(2 ** np.round(np.log2(eye_paths / SHARE)), *LIMITS))
-        return cls(eyes, eyes * int(2 ** np.round(np.log2(np.clip(2 * light_ratio, 2, 16)))))
+        of_an_eye = 2 ** np.round(np.log2(np.clip(2 * light_ratio, 0.5 if connections else 2, 16)))
+        return cls(eyes, int(eyes * of_an_eye))
 
     def launch(self, images: int) -> Launch:
         """The launch that learns from so many images."""

@@ -23,14 +23,8 @@ from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.lights.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
 from photonfarm.renderer.verify.scenes import hard_scenes
 from photonfarm.renderer.verify.weights import oracle
-from photonfarm.renderer.verify.weights.joined_paths import (
-    Bounce,
-    JoinedPaths,
-    Pinhole,
-    TechniqueCounts,
-    stored,
-    usefulness,
-)
+from photonfarm.renderer.verify.weights.joined_paths import Bounce, JoinedPaths, Pinhole, TechniqueCounts
+from photonfarm.renderer.verify.weights.oracle_paths import stored, usefulness
 from photonfarm.renderer.verify.weights.weight_check import random_guide, random_usefulness
 
 EDGES, SIZE, SPP = 5, 16, 8

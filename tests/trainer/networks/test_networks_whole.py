@@ -1,4 +1,4 @@
-"""The network of every architecture: what it sees and what it does not, order, weights, training, resume."""
+"""The network of every architecture: what it sees and what it does not, order, weights."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,6 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
-from held_out_errors import held_out_errors
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import Photons, arrays_of
@@ -20,10 +19,7 @@ from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import Architecture, NetworkSettings
-from photonfarm.trainer.training.loop import train
 
 PHOTONS = ["light_transport_photons", "light_transport_photons, transport"]
 """What the two are made of: gathered in the image, and projected after a layer of their own."""
@@ -379,31 +375,3 @@ def test_photons_are_fed_as_the_store_has_them(make_source, commit, tiny, tmp_pa
 def test_a_scene_without_photons_is_refused_where_they_are_needed(make_source) -> None:
     with pytest.raises(SpecError):
         network(make_source(1, photons=0), PHOTONS[0])
-
-
-# ------------------------------------------------------------------------------------------------------------- training
-
-
-@pytest.mark.parametrize(
-    "architecture",
-    [
-        "cnn",
-        "feature_projection",
-        "light_transport_photons",
-        "guided_transport",
-        "guided_transport_photons",
-        "denoise_4",
-    ],
-)
-def test_a_run_of_any_architecture_goes_on_to_the_same_weights_to_the_bit(
-    make_source, tiny, tmp_path: Path, architecture: str
-) -> None:
-    def weights(name: str, *stops: int) -> dict[str, Any]:
-        for stop in stops:
-            settings = tiny(network=NetworkSettings(width=4, architecture=architecture), max_steps=stop)
-            train(make_source(24, photons=16), settings, tmp_path / name)
-        return checkpoint.load(tmp_path / name / CHECKPOINT)["network"]
-
-    straight, resumed = weights("straight", 7), weights("resumed", 3, 7)
-    assert all(torch.equal(straight[name], resumed[name]) for name in straight)
-    assert np.isfinite(held_out_errors(lambda: make_source(24, photons=16), tmp_path / "straight").last)

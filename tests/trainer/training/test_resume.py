@@ -1,4 +1,4 @@
-"""Training runs that are ended by SIGKILL, in processes of their own, and go on to the same weights to the bit."""
+"""Training runs that go on to the same weights to the bit, most of them ended by SIGKILL in processes of their own."""
 
 import json
 import multiprocessing
@@ -11,8 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from held_out_errors import held_out_errors
 from safetensors import safe_open
 
 from photonfarm.shared.core.errors import SpecError
@@ -23,6 +25,7 @@ from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
+from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.training.loop import Hooks, train
 from photonfarm.trainer.training.recovery import GOOD, NEXT
 
@@ -225,3 +228,28 @@ def test_a_run_is_not_continued_on_a_store_of_other_plans(scene, analytic, commi
     scene.plan(Request(modifications=8, seed=1), shard_rows=8)
     commit(scene, 1)
     assert train(other_seed, tiny(max_steps=4, hold_out=0.3), run).step == 4
+
+
+@pytest.mark.parametrize(
+    "architecture",
+    [
+        "cnn",
+        "feature_projection",
+        "light_transport_photons",
+        "guided_transport",
+        "guided_transport_photons",
+        "denoise_4",
+    ],
+)
+def test_a_run_of_any_architecture_goes_on_to_the_same_weights_to_the_bit(
+    make_source, tiny, tmp_path: Path, architecture: str
+) -> None:
+    def weights(name: str, *stops: int) -> dict[str, Any]:
+        for stop in stops:
+            settings = tiny(network=NetworkSettings(width=4, architecture=architecture), max_steps=stop)
+            train(make_source(24, photons=16), settings, tmp_path / name)
+        return checkpoint.load(tmp_path / name / CHECKPOINT)["network"]
+
+    straight, resumed = weights("straight", 7), weights("resumed", 3, 7)
+    assert all(torch.equal(straight[name], resumed[name]) for name in straight)
+    assert np.isfinite(held_out_errors(lambda: make_source(24, photons=16), tmp_path / "straight").last)

@@ -19,15 +19,9 @@ from photonfarm.renderer.verify.scenes.case import BdptSettings, SceneDict
 from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.verify.scenes.truths import load
 from photonfarm.renderer.verify.weights import oracle
-from photonfarm.renderer.verify.weights.joined_paths import (
-    Pinhole,
-    TechniqueCounts,
-    stored,
-    usefulness,
-    walk,
-    weights_of,
-)
+from photonfarm.renderer.verify.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
 from photonfarm.renderer.verify.weights.oracle import Mask, OraclePaths
+from photonfarm.renderer.verify.weights.oracle_paths import stored, usefulness
 
 TOLERANCE = 1e-3
 """The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""

@@ -153,7 +153,7 @@ def test_equal_seeds_give_equal_images_and_guides() -> None:
     np.testing.assert_array_equal(images[1], images[2])
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4, atol=1e-5)
     guides = [plugins[1].learn_guide(scene, sensor, seed) for seed in (7, 7, 8)]
-    for a, b, other in ([guide.starts.gain for guide in guides], [guide.useful for guide in guides]):
+    for a, b, other in ([guide.starts.gain for guide in guides], [guide.usefulness_table for guide in guides]):
         np.testing.assert_array_equal(np.array(a), np.array(b))
         assert not np.array_equal(np.array(a), np.array(other))
 
@@ -202,8 +202,8 @@ def test_gains_follow_the_root_of_what_cells_add() -> None:
 def test_light_paths_start_as_without_a_guide_where_connections_make_the_error() -> None:
     layout = Layout(1, 2, 1)
     starts = np.full(4, 1e6)
-    splats = starts * [1, 4, 9, 0]
-    found = gains(layout, splats, 1000 * splats.sum(), starts, starts, np.ones(1))
+    splats, edges = starts * [1, 4, 9, 0], starts * [1, 4, 2, 8]
+    found = gains(layout, splats, 1e4 * splats.sum(), starts, edges, np.ones(1))
     np.testing.assert_allclose(found, 1, atol=1e-3)
 
 

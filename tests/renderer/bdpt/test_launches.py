@@ -45,6 +45,16 @@ def test_light_paths_are_used_equally_often(light_ratio: float) -> None:
     assert (used == 1 / light_ratio).all()
 
 
+@pytest.mark.parametrize("light_ratio", [0.5, 1.0, 4.0])
+def test_neighbours_take_slots_far_apart(light_ratio: float) -> None:
+    paths = round(8 * PIXELS * light_ratio)
+    joined = partners(8, paths).reshape(8, HEIGHT, WIDTH)
+    share = paths // 8
+    for axis in (1, 2):
+        apart = np.diff(joined, axis=axis) % share
+        assert np.minimum(apart, share - apart).min() >= 5
+
+
 def test_there_may_be_fewer_light_paths_than_samples() -> None:
     joined = partners(8, 3)
     assert (joined == np.arange(8)[:, None]).all()  # the shift's modulus brings them below 3

@@ -70,6 +70,12 @@ def test_where_connections_add_nothing_all_are_alike() -> None:
     np.testing.assert_array_equal(usefulness(np.zeros(CELLS), np.zeros(CELLS)), np.ones(CELLS))
 
 
+@pytest.mark.parametrize("wrong", [np.full(CELLS, np.nan), np.zeros(CELLS), np.ones(2)], ids=["nan", "zero", "short"])
+def test_a_table_that_would_lose_light_is_refused(wrong: Any) -> None:
+    with pytest.raises(ValueError, match=r"table of usefulness .* above 0"):
+        LightGuide.of(StartGuide.neutral(Layout.of(1)), wrong)
+
+
 # ------------------------------------------------ Images ------------------------------------------------
 
 
@@ -77,7 +83,7 @@ def test_useful_vertices_lower_the_error_behind_a_door() -> None:
     scene = loaded(hard_scenes.door_gap)
     plugin = mi.load_dict(CONNECTED | {"record": True})
     learned = plugin.learn_guide(scene, scene.sensors()[0], 1)
-    assert learned.useful is not None
+    assert learned.usefulness_table is not None
     without = LightGuide(learned.starts, None)
     error = []
     for guide in (without, learned):
@@ -91,13 +97,13 @@ def test_useful_vertices_lower_the_error_behind_a_door() -> None:
 def test_nothing_is_learned_of_vertices_without_connections() -> None:
     scene = loaded(hard_scenes.cornell)
     plugin = mi.load_dict(CONNECTED | {"connections": 0})
-    assert plugin.learn_guide(scene, scene.sensors()[0], 1).useful is None
+    assert plugin.learn_guide(scene, scene.sensors()[0], 1).usefulness_table is None
 
 
-def test_the_number_of_threads_changes_no_bit_of_an_image() -> None:
+def test_an_image_hardly_depends_on_the_number_of_threads() -> None:
     scene = loaded(hard_scenes.cornell)
     plugin = mi.load_dict(CONNECTED)
-    guide = LightGuide(StartGuide.neutral(Layout.of(1)), mi.Float(np.random.default_rng(0).uniform(0.3, 3, CELLS)))
+    guide = LightGuide.of(StartGuide.neutral(Layout.of(1)), np.random.default_rng(0).uniform(0.3, 3, CELLS))
     threads, images = dr.thread_count(), []
     try:
         for count in (1, 2):

@@ -239,7 +239,7 @@ def test_weights_of_a_render_are_the_oracles(build: Any, guided: bool, recorder:
     bdpt = {"type": "bdpt", "max_depth": EDGES, "connections": CONNECTIONS, "light_ratio": LIGHT_RATIO, "rr_depth": 99}
     if guided:
         guide = LightGuide(random_guide(lights.count, seed=4), random_usefulness(seed=5))
-        lights, useful = lights.guided_by(guide.starts, scene), Usefulness.over(scene, guide.useful)
+        lights, useful = lights.guided_by(guide.starts, scene), Usefulness.over(scene, guide.usefulness_table)
     mi.load_dict(bdpt | {"guided_light": guided}).render(scene, seed=1, spp=SPP, guide=guide)
     counts = TechniqueCounts(connection_count(CONNECTIONS, EDGES, guided=guided), LIGHT_RATIO, useful)
     off: dict[str, list[Any]] = {"hit": [], "next event": [], "light tracing": [], "connection": []}

@@ -225,7 +225,7 @@ def test_savings_are_ratios_of_time_to_equal_error() -> None:
 def test_what_was_not_shown_is_not_claimed() -> None:
     rows = row(PLAIN, 0.1, 0.01, 0.01), row(LIGHT, 0.05, 0.01, 0.02, 0.3), row(JOINED, 0.0501, 0.01, 0.02, 0.9)
     text = text_of(plan_of(spec_with(connections=0), measurement(*rows), cached=False))
-    assert "not distinguishable from it, within 2 standard errors: plain path tracing, light ratio 1 with 1" in text
+    assert "not distinguishable from it, within 2 standard errors: plain path tracing; light ratio 1 with 1" in text
     assert "connections: no settings with them that fit the cost are shown to be worth a change" in text
     text = text_of(plan_of(spec_with(connections=0, light_ratio=0.0), measurement(*rows), cached=False))
     assert "light paths: no settings with them that fit the cost are shown to be worth a change" in text

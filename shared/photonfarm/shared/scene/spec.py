@@ -143,7 +143,7 @@ class Transport(Frozen):
     # The next two are left out of ids at their defaults
     guided_light: bool = Field(
         default=False, exclude_if=lambda said: not said
-    )  # light paths start where views see them
+    )  # light paths start where views see them, connections go to useful light vertices
     light_samples: int = Field(default=1, ge=1, le=64, exclude_if=lambda said: said == 1)  # at the first eye vertex
 
     @model_validator(mode="after")

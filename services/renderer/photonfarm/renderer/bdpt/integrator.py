@@ -164,7 +164,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         places: Places | None = None,
         effort: Effort | None = None,
     ) -> LightGuide | None:
-        """A guide for light paths that reach what a sensor sees, or what it sees from several ``places``.
+        """A guide to what a sensor sees, or sees from several ``places``, for light paths and for connections.
 
         It is learned from random numbers of its own, so images that are rendered with it stay independent of each
         other, and unbiased. None where light paths cannot be guided, as there are none. Raises as ``render`` does.
@@ -224,8 +224,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             if lights is not None and guide is not None and light_ratio:
                 lights = lights.guided_by(guide.starts, scene)
             useful = None
-            if guide is not None and guide.useful is not None and self.connections and light_ratio:
-                useful = Usefulness.over(scene, guide.useful)
+            if guide is not None and guide.usefulness_table is not None and self.connections and light_ratio:
+                useful = Usefulness.over(scene, guide.usefulness_table)
             images = ImageStack.black(len(seeds) * pixels)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
                 options = self._options(launch, pixels, useful)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
+from math import gcd
 from typing import Self
 
 import drjit as dr
@@ -20,6 +22,10 @@ the same mean. The number of images in a launch changes no image.
 
 SQUARE = 4
 """The edge of the squares of pixels whose eye paths a packet of 16 lanes traces."""
+
+LEAST_STRIDE = 37
+"""The least distance between the slots of neighbouring pixels, more than the copies that most light paths have: else
+neighbours would be joined to copies of one path, and have noise in common."""
 
 _GOLDEN = (5**0.5 - 1) / 2
 
@@ -89,6 +95,7 @@ class Lanes:
     keys: mi.UInt32  # one for each image: see randomness.image_keys
     shifts: mi.UInt32 | None  # see randomness.shifts; None without connections
     counts: list[mi.UInt32]  # (pixels, samples, light paths), [1] each: the integers above once more
+    stride: mi.UInt32  # [1], slots: see partner
     first_sample: mi.UInt32  # [1]
     first_light_path: mi.UInt32  # [1]
     eye_scale: mi.Float  # [1]: 1 over all samples per pixel
@@ -108,9 +115,12 @@ class Lanes:
         """The lanes of a launch whose images have the size ``size`` (W, H) and get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
+        share = max(launch.light_paths // launch.samples, 1)
+        stride = next(step for step in count(LEAST_STRIDE) if gcd(step, share) == 1)
         return cls(
             launch.images, *size, launch.samples, launch.light_paths, keys, shifts,
             counts=[dr.opaque(mi.UInt32, n) for n in (pixels, launch.samples, launch.light_paths)],
+            stride=dr.opaque(mi.UInt32, stride),
             first_sample=dr.opaque(mi.UInt32, launch.first_sample),
             first_light_path=dr.opaque(mi.UInt32, launch.first_light_path),
             eye_scale=dr.opaque(mi.Float, 1 / spp),
@@ -146,20 +156,21 @@ class Lanes:
         return (strip * SQUARE + inside // SQUARE) * self.width + square * SQUARE + inside % SQUARE
 
     def partner(self, sample: mi.UInt32, pixel: mi.UInt32) -> mi.UInt32:
-        """The number of the light path that an eye path is joined to, before the shift (see randomness.shifts).
+        """The slot whose light path an eye path is joined to, before the shift (see randomness.shifts).
 
-        Light paths of close numbers start alike. So each sample of the pixels has an equal share of the numbers for
-        itself, and a pixel is joined to light paths from everywhere. In a share pixels take light paths one by one, in
-        turn where there are fewer of them than pixels, and evenly spread where there are more. From sample to sample
-        the share is turned by the golden ratio, or a pixel would have the same place in all of them.
+        Slots of close numbers hold light paths that start alike, or copies of one. So each sample of the pixels has an
+        equal share of the slots for itself, and a pixel is joined to light paths from everywhere. In a share pixels
+        walk with a stride that has no divisor in common with it, so that all slots are used equally often where there
+        are fewer of them than pixels. Where there are more, pixels are evenly spread before. From sample to sample the
+        share is turned by the golden ratio, or a pixel would have the same place in all of them.
 
-        Every choice is unbiased, as the shift is uniform over all light paths.
+        Every choice is unbiased, as the shift is uniform over all slots.
         """
         pixels, samples, paths = self.counts
         share = dr.maximum(paths // samples, 1)
         step = dr.maximum(mi.Float64(share) / mi.Float64(pixels), 1)
         turn = mi.UInt32(_GOLDEN * mi.Float64(share))
-        return sample * share + (mi.UInt32(mi.Float64(pixel) * step) + sample * turn) % share
+        return sample * share + (mi.UInt32(mi.Float64(pixel) * step) * self.stride + sample * turn) % share
 
     def light(self) -> tuple[mi.UInt32, mi.UInt32]:
         """(image, number within the image) of each light path's lane."""

@@ -1,7 +1,7 @@
 """Draws paths anew in proportion to their weights: systematic resampling (Kitagawa 1996), the same on any machine.
 
 N slots stand side by side; a path of the weight w takes N·w/Σw of them on average, and the next path the slots after
-it. A single random offset shifts all of them, so that a path gets one slot more or less than its part at most.
+it. A single random offset shifts all of them, so that a path gets its part of the slots, rounded up or down.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 STEPS = 1 << 24
-"""Weights are whole multiples of the largest one over this. So their sums are exact, in whatever order they are taken,
-and equal seeds give equal bytes on any number of threads."""
+"""Weights are rounded up to whole multiples of the largest one over this. So their sums are exact in any order, and the
+same paths are drawn on any number of threads."""
 
 
 def resampled(weight: mi.Float, offset: mi.Float, paths: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
@@ -19,7 +19,7 @@ def resampled(weight: mi.Float, offset: mi.Float, paths: mi.UInt32) -> tuple[mi.
 
     ``weight`` [K·N] ≥ 0 are those of ``paths`` [1] = N paths for each of K images, ``offset`` [K] are random numbers in
     [0, 1). An image's slots get paths of its own; where all its weights are 0, its first. For any x, the sum of
-    factor·x/weight over an image's slots has the expectation of the sum of x over its paths of a weight above 0.
+    factor·x/weight over an image's slots has as its expectation the sum of x over its paths of a weight above 0.
     """
     n, images = dr.width(weight), dr.width(offset)
     lane = dr.arange(mi.UInt32, n)

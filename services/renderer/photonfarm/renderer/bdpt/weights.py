@@ -6,11 +6,12 @@ Transport Simulation*, 1997, §9.2.4, §10.2.1). Each sub-path carries the part 
 decide in two numbers, dVCM and dVC (Georgiev, *Implementing Vertex Connection and Merging*, 2012, eqs. 31–46, with the
 merging terms left out).
 
-Counts, per eye path: 1 for a hit emitter (s=0) and for next event estimation (s=1), ``connection_count`` for a
-connection, and ``light_ratio`` for light tracing (t=1), but 0 for paths of two edges; for these alone the count of s=1
-may be more, which multiplies its density. A technique that is left out has count 0; the weights stay a partition of
-unity over the others, so the estimate stays unbiased for every choice. Russian roulette is in none of the densities: it
-thins samples of a technique and compensates each, so it does not change what a technique's density is.
+Counts, per eye path: 1 for a hit emitter (s=0) and for next event estimation (s=1), ``connection_count`` times the
+usefulness of the light vertex for a connection, and ``light_ratio`` for light tracing (t=1), but 0 for paths of two
+edges; for these alone the count of s=1 may be more, which multiplies its density. A technique that is left out has
+count 0; the weights stay a partition of unity over the others, so the estimate stays unbiased for every choice. Russian
+roulette is in none of the densities: it thins samples of a technique and compensates each, so it does not change what a
+technique's density is.
 
 Letters: p solid-angle densities, cos = |n_geometric · d|, "in" the edge by which a vertex was reached, "rev" against
 the walk. All functions take and return ``mi.Float``, or plain floats: tests sum the weights of one path by hand.

@@ -21,7 +21,7 @@ def reasons_for(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate], sh
     """
     reasons = [_against_plain(chosen, rows)]
     if alike := [str(row.candidate) for row in rows if row is not chosen and is_alike(row, chosen)]:
-        reasons.append(f"not distinguishable from it, within {CLEAR:g} standard errors: {', '.join(alike)}")
+        reasons.append(f"not distinguishable from it, within {CLEAR:g} standard errors: {'; '.join(alike)}")
     reasons += [
         f"{row.candidate} misses light that others find: {row.missed / row.error:.0%} of its error is inferred from "
         "that, and the true one may be larger"

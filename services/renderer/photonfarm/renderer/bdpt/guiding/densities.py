@@ -7,8 +7,8 @@ second moment over the edges. Both are estimated coarse to fine: where only a fe
 estimate is that of the four cells around it together.
 
 What connections add hardly depends on q, as their vertices are drawn anew in proportion to their weights, whatever
-cells they come from. So their second moment counts for all cells alike: where most of the error is theirs, light paths
-start nearly as without a guide.
+cells they come from. So their second moment counts for all cells alike, over the mean number of edges: where most of
+the error is theirs, light paths start nearly as without a guide.
 
 Index letters as in `starts`.
 """
@@ -33,8 +33,9 @@ def gains(layout: Layout, splats: F64, joined: float, starts: F64, edges: F64, p
     together, added to pixels, and ``joined`` is that of all connections. ``probability`` [N] is the default one of each
     light.
     """
-    of_connections = joined / max(starts.sum(), 1.0)
-    gain = np.sqrt((_means(layout, splats, starts) + of_connections) / np.maximum(_means(layout, edges, starts), 1))
+    of_connections = joined / max(edges.sum(), 1.0)
+    of_splats = _means(layout, splats, starts) / np.maximum(_means(layout, edges, starts), 1)
+    gain = np.sqrt(of_splats + of_connections)
     gain = gain.reshape(layout.lights, layout.of_a_light)
     total = float((gain.mean(axis=1) * probability).sum())
     if not (np.isfinite(total) and total > 0):

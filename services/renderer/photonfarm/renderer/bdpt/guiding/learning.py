@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +14,7 @@ from photonfarm.renderer.bdpt.guiding.densities import gains
 from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
-from photonfarm.renderer.bdpt.guiding.usefulness import usefulness
+from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, usefulness
 from photonfarm.renderer.bdpt.launches import Launch
 
 EPSILON = 1e-2
@@ -53,7 +54,19 @@ class LightGuide:
     """What was learned for the light paths of a scene."""
 
     starts: StartGuide
-    useful: mi.Float | None  # the table of a `Usefulness`; None without connections
+    usefulness_table: mi.Float | None  # of a `Usefulness`; None without connections
+
+    @classmethod
+    def of(cls, starts: StartGuide, table: F64 | None) -> Self:
+        """The guide of these parts. Raises ValueError unless all of a table's [U] numbers are finite and above 0."""
+        if table is None:
+            return cls(starts, None)
+        if table.shape != (CELLS,) or not (np.isfinite(table).all() and (table > 0).all()):
+            raise ValueError(
+                f"bdpt: a table of usefulness has the shape {table.shape}; ({CELLS},) finite numbers above 0 are "
+                "required, or light would be lost"
+            )
+        return cls(starts, mi.Float(table.tolist()))
 
 
 def learned(
@@ -74,10 +87,8 @@ def learned(
     splat_squares, started, edges, connection_squares, connections = totals
     splats, joined = on_host(weighted(splat_squares), weighted(connection_squares))
     gain = gains(layout, splats, float(joined.sum()), *on_host(started, edges, probability))
-    starts, useful = StartGuide.of(layout, gain), None
-    if lanes.shifts is not None:
-        useful = mi.Float(usefulness(joined, *on_host(connections)).tolist())
-    return LightGuide(starts, useful)
+    table = None if lanes.shifts is None else usefulness(joined, *on_host(connections))
+    return LightGuide.of(StartGuide.of(layout, gain), table)
 
 
 def _weights(radiance: mi.Spectrum, lanes: SparseLanes, tiles: int) -> mi.Float:

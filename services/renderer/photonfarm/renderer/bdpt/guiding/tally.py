@@ -82,7 +82,7 @@ class Tally:
     def add_connection(self, vertex: KeptVertex, column: mi.UInt32, value: mi.Spectrum, active: mi.Bool) -> None:
         """Add what connections to light vertices add to tiles."""
         cell = cell_of(self.grid, vertex.si)
-        active &= vertex.depth > 0
+        active = active & (vertex.depth > 0)  # `&=` would change the caller's
         dr.scatter_add(self.connection_squares, _square(value), cell * self.columns + column, active)
         dr.scatter_add(self.connections, mi.Float(1), cell, active)
 

@@ -52,8 +52,9 @@ def legend(spec: SceneSpec, purpose: Purpose) -> list[str]:
     return [
         "connections: light vertices joined to each of the first two eye vertices; light ratio: light paths per eye "
         "path; plain path tracing: 0 and 0; light samples: of next event estimation at the first eye vertex; guided: "
-        "light paths start where they reach what is seen; images: rendered to measure it, over all views; settings "
-        "with fewer of them than others were dropped early and cannot be chosen",
+        "light paths start where they reach what is seen, and connections go to useful light vertices; images: "
+        "rendered to measure it, over all views; settings with fewer of them than others were dropped early and "
+        "cannot be chosen",
         f"half_spp: samples per pixel, 1 at least, for the time that {now} of the spec's settings take now, "
         f"{present(spec)}; {error} and ms: {_MEANING[purpose]} and CPU milliseconds of such a half-estimate, "
         f"{film.width} × {film.height} pixels",

@@ -15,13 +15,16 @@ def load(name: str, size: int) -> Any:
     """
     import mitsuba as mi
 
+    from photonfarm.renderer.scene.loading import threads_to_read_with
+
     loaders = scene_loaders()
     if name in loaders:
         return loaders[name](size)
     folder = Path(os.environ.get("PHOTONFARM_SCENES", "."))
     for path in (Path(name), folder / name / "scene.xml"):
         if path.is_file():
-            return mi.load_file(str(path), optimize=False, resx=size, resy=size)
+            with threads_to_read_with():
+                return mi.load_file(str(path), optimize=False, resx=size, resy=size)
     raise ValueError(
         f"scene {name!r} is neither one of {sorted(loaders)}, nor a file, nor a folder with a scene.xml under "
         f"PHOTONFARM_SCENES ({folder})"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.renderer.bdpt import grid
+from photonfarm.renderer.bdpt.guiding import grid
 from photonfarm.renderer.bdpt.lights import selection
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, LEAST, NORMALS, SIDE, cell_of, usefulness

@@ -13,7 +13,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
-from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learned
 from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide

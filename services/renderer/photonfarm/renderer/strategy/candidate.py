@@ -15,7 +15,7 @@ class Candidate:
 
     connections: int  # light vertices joined to each of the first two eye vertices
     light_ratio: float  # light paths per eye path; 0: plain path tracing
-    guided_light: bool = False  # see `Transport`
+    guided_light: bool = False  # whether a guide says where light paths start and connections go
     light_samples: int = 1  # of next event estimation at the first eye vertex
 
     def __str__(self) -> str:

@@ -1,1 +1,1 @@
-"""Guided starts of light paths: which light, from where and in which direction, by what reaches the image."""
+"""Guides learned from what reaches the image: where light paths start, and which light vertices are useful."""

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.scenes import bounding_box
 
 F64 = NDArray[np.float64]

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid
 
 CELLS = 8  # of the grid, along each axis
 _SAMPLES = 4  # of each light in each cell

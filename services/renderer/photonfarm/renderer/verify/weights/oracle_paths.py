@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.bdpt.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.lights.emission import Lights
 from photonfarm.renderer.verify.weights.joined_paths import JoinedPaths, Pinhole, TechniqueCounts, gain, steps
 from photonfarm.renderer.verify.weights.oracle import F64, OraclePaths

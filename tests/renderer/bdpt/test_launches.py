@@ -14,12 +14,12 @@ WIDTH, HEIGHT = 16, 8
 PIXELS = WIDTH * HEIGHT
 
 
-def partners(samples: int, light_paths: int) -> Any:
+def partners(samples: int, light_paths: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Any:
     """[samples, pixels]: the numbers of the light paths."""
     launch = Launch(1, 0, samples, 0, light_paths, 0)
-    lanes = Lanes.of(launch, (WIDTH, HEIGHT), samples, mi.UInt32(0), None)
+    lanes = Lanes.of(launch, size, samples, mi.UInt32(0), None)
     _, sample, pixel = lanes.eye()
-    joined = np.zeros((samples, PIXELS), np.int64)
+    joined = np.zeros((samples, lanes.pixels), np.int64)
     joined[np.array(sample), np.array(pixel)] = np.array(lanes.partner(sample, pixel))
     return joined
 
@@ -45,14 +45,18 @@ def test_light_paths_are_used_equally_often(light_ratio: float) -> None:
     assert (used == 1 / light_ratio).all()
 
 
-@pytest.mark.parametrize("light_ratio", [0.5, 1.0, 4.0])
-def test_neighbours_take_slots_far_apart(light_ratio: float) -> None:
-    paths = round(8 * PIXELS * light_ratio)
-    joined = partners(8, paths).reshape(8, HEIGHT, WIDTH)
-    share = paths // 8
-    for axis in (1, 2):
-        apart = np.diff(joined, axis=axis) % share
-        assert np.minimum(apart, share - apart).min() >= 5
+@pytest.mark.parametrize("size", [(32, 32), (64, 64), (256, 256), (100, 75)], ids=str)
+@pytest.mark.parametrize("light_ratio", [0.125, 0.25, 1.0, 4.0])
+def test_neighbours_take_slots_far_apart(size: tuple[int, int], light_ratio: float) -> None:
+    """Along rows and along columns: light paths of close slots start alike, and noise in common is seen as streaks."""
+    width, height = size
+    share = round(width * height * light_ratio)
+    joined = partners(2, 2 * share, size).reshape(2, height, width)
+    for axis, farthest, least in ((2, 8, 0.02), (1, 3, 0.04)):
+        for distance in range(1, farthest + 1):
+            far, near = np.split(joined, [distance], axis)[1], np.split(joined, [-distance], axis)[0]
+            apart = (far - near) % share
+            assert np.minimum(apart, share - apart).min() >= least * share
 
 
 def test_there_may_be_fewer_light_paths_than_samples() -> None:

@@ -29,7 +29,7 @@ def save(result: dict[str, Any], path: Path, clock: str) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4.0), sharex=True, sharey=True, layout="constrained")
     for axis, kind in zip(axes, ("full", "trimmed"), strict=True):
         for method in (m for m in STYLES if m in result["curves"]):
             draw(axis, method, result["curves"][method], kind)
@@ -39,7 +39,7 @@ def save(result: dict[str, Any], path: Path, clock: str) -> None:
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.grid(visible=True, which="both", linewidth=0.3, alpha=0.6)
     axes[0].set_ylabel("relMSE")
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100, metadata={"Software": None})
     plt.close(figure)

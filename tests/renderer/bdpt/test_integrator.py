@@ -200,6 +200,7 @@ def test_what_stands_just_behind_the_near_plane_hides_the_scene_from_light_paths
         {"light_ratio": -0.5},
         {"connections": 1, "light_ratio": 0.0},
         {"connections": 4, "light_ratio": 0.0},
+        {"guided_light": True, "connections": 0, "light_ratio": 0.0},
         {"max_depth": -2},
         {"rr_depth": 0},
     ],

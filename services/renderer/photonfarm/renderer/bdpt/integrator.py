@@ -41,7 +41,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
       where most noise of direct light comes from; later vertices take one.
     - ``guided_light`` (bool, default false): let light paths start where they reach what the camera sees, and draw
       their vertices for connections by how much these add to the image. `render` learns a guide from a few paths of its
-      own first, unless it is given one by `learn_guide`.
+      own first, unless it is given one by `learn_guide`. Needs ``light_ratio`` > 0.
     - ``record`` (bool, default false): trace each kind of launch once with Python and replay it afterwards, which saves
       up to 0.8 s an image in scenes of many materials. For scenes that stay as they are, or that are edited with arrays
       in Dr.Jit's own memory only: Dr.Jit 1.5 does not notice when a mesh gets other memory of numpy's.
@@ -80,6 +80,11 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             raise ValueError(
                 f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
                 "connect to; use connections=0 or a light_ratio above 0"
+            )
+        if self.guided_light and not self.light_ratio:
+            raise ValueError(
+                "bdpt: guided_light is true and light_ratio is 0, which has no light paths to guide; use "
+                "guided_light=false or a light_ratio above 0"
             )
         if self.paths_at_once < 1:
             raise ValueError(f"bdpt: paths_at_once is {self.paths_at_once}; allowed are numbers of paths from 1")
@@ -328,13 +333,14 @@ def trace(
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()
-    sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.EYE, pixel)
+    keys = dr.gather(mi.UInt32, lanes.keys, image)
+    sequence = randomness.stream(keys, randomness.EYE, pixel)
     rng = randomness.sampler(sequence, sample + lanes.first_sample)
     lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
     start = primary_rays(lens, rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
-        first = lanes.partner(sample, pixel)
+        first = lanes.partner(sample, randomness.places(keys, sample + lanes.first_sample, pixel))
         noted = None if tally is None else TalliedConnections.of(tally, image, pixel, lanes)
         connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, noted)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
-from math import gcd, hypot
 from typing import Self
 
 import drjit as dr
@@ -22,11 +20,6 @@ the same mean. The number of images in a launch changes no image.
 
 SQUARE = 4
 """The edge of the squares of pixels whose eye paths a packet of 16 lanes traces."""
-
-_GOLDEN = (5**0.5 - 1) / 2
-
-_NEIGHBOURS = [(x, 0) for x in range(1, 9)] + [(x, y) for y in range(1, 4) for x in range(-3, 4)]
-"""Offsets to pixels so close that noise in common would be seen as a streak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +87,6 @@ class Lanes:
     keys: mi.UInt32  # one for each image: see randomness.image_keys
     shifts: mi.UInt32 | None  # see randomness.shifts; None without connections
     counts: list[mi.UInt32]  # (pixels, samples, light paths), [1] each: the integers above once more
-    stride: mi.UInt32  # [1]: see partner
     first_sample: mi.UInt32  # [1]
     first_light_path: mi.UInt32  # [1]
     eye_scale: mi.Float  # [1]: 1 over all samples per pixel
@@ -114,11 +106,9 @@ class Lanes:
         """The lanes of a launch whose images have the size ``size`` (W, H) and get ``spp`` samples per pixel in all."""
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
-        places = min(max(launch.light_paths // launch.samples, 1), pixels)
         return cls(
             launch.images, *size, launch.samples, launch.light_paths, keys, shifts,
             counts=[dr.opaque(mi.UInt32, n) for n in (pixels, launch.samples, launch.light_paths)],
-            stride=dr.opaque(mi.UInt32, _stride(places, size[0])),
             first_sample=dr.opaque(mi.UInt32, launch.first_sample),
             first_light_path=dr.opaque(mi.UInt32, launch.first_light_path),
             eye_scale=dr.opaque(mi.Float, 1 / spp),
@@ -153,45 +143,18 @@ class Lanes:
         square, inside = along // SQUARE**2, along % SQUARE**2
         return (strip * SQUARE + inside // SQUARE) * self.width + square * SQUARE + inside % SQUARE
 
-    def partner(self, sample: mi.UInt32, pixel: mi.UInt32) -> mi.UInt32:
+    def partner(self, sample: mi.UInt32, u: mi.Float) -> mi.UInt32:
         """The slot whose light path an eye path is joined to, before the shift (see randomness.shifts).
 
-        Slots of close numbers hold light paths that start alike, or copies of one: pixels joined to them have noise in
-        common. So each sample of the pixels has an equal share of the slots for itself, and in a share neighbouring
-        pixels are far apart: they walk over its places with a stride, see _stride. Where there are more slots than
-        pixels, the places are as many as the pixels, evenly spread over the slots. From sample to sample the share is
-        turned by the golden ratio, or a pixel would have the same place in all of them.
-
-        Every choice is unbiased, as the shift is uniform over all slots.
+        Each sample of the pixels has an equal share of the slots for itself, in which ``u`` in [0, 1) is the place (see
+        randomness.places). Every choice is unbiased, as the shift is uniform over all slots.
         """
-        pixels, samples, paths = self.counts
+        _, samples, paths = self.counts
         share = dr.maximum(paths // samples, 1)
-        places = dr.minimum(share, pixels)
-        place = mi.UInt32(mi.UInt64(pixel) * mi.UInt64(self.stride) % mi.UInt64(places))
-        slot = mi.UInt32(mi.Float64(place) * (mi.Float64(share) / mi.Float64(places)))
-        turn = mi.UInt32(_GOLDEN * mi.Float64(share))
-        return sample * share + (slot + sample * turn) % share
+        return sample * share + mi.UInt32(mi.Float64(u) * mi.Float64(share))
 
     def light(self) -> tuple[mi.UInt32, mi.UInt32]:
         """(image, number within the image) of each light path's lane."""
         lane = dr.arange(mi.UInt32, self.images * self.light_paths)
         image = lane // self.counts[2] if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
         return image, lane - image * self.counts[2]
-
-
-@cache
-def _stride(places: int, width: int) -> int:
-    """The stride that brings pixels, numbered along rows of ``width``, to places on a circle: neighbours far apart.
-
-    It has no divisor in common with the number of places, so that all are used equally often. Numbers close to the
-    golden ratio of it keep neighbours in a row apart. Of these the stride keeps rows apart best: its least distance
-    between the places of neighbours, times the distance between the pixels, is greatest. Among equals the second least
-    decides, and so on.
-    """
-
-    def distances(stride: int) -> list[float]:
-        ahead = ((hypot(x, y), (x + y * width) * stride % places) for x, y in _NEIGHBOURS)
-        return sorted(pixels * min(steps, places - steps) for pixels, steps in ahead)
-
-    golden = round(_GOLDEN * places)
-    return max((step for step in range(golden, golden + 256) if gcd(step, places) == 1), key=distances)

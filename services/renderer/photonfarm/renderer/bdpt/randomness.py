@@ -108,6 +108,16 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
     return mi.UInt32(np.concatenate(table).tolist())  # a list: Dr.Jit compiles again for each alignment of numpy's
 
 
+def places(keys: mi.UInt32, sample: mi.UInt32, pixel: mi.UInt32) -> mi.Float:
+    """Where in a sample's share of the light paths each pixel finds the one that its eye path is joined to, in [0, 1).
+
+    Light paths close to each other start alike, or are copies of one, so pixels joined to them have noise in common.
+    The places of a sample's pixels are stratified, so that light paths are used about equally often. They are random,
+    since every rule puts pixels at some distance from each other close together, which shows as streaks or a pattern.
+    """
+    return sampler(stream(keys, PAIRING, sample), pixel).next_1d()
+
+
 def learning_seeds(seed: int, images: int) -> list[int]:
     """The seeds of images from which a guide is learned; images that are rendered with it have others."""
     return [int(s) for s in np.random.default_rng([seed, LEARNING]).integers(1 << 32, size=images)]

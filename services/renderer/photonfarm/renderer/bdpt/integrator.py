@@ -83,7 +83,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             )
         if self.guided_light and not self.light_ratio:
             raise ValueError(
-                "bdpt: guided_light is true and light_ratio is 0, which has no light paths to guide; use "
+                "bdpt: guided_light is true and light_ratio is 0; without light paths there is nothing to guide; use "
                 "guided_light=false or a light_ratio above 0"
             )
         if self.paths_at_once < 1:

@@ -76,7 +76,6 @@ class Lanes:
 
     Lanes go image after image, sample after sample, pixel after pixel: neighbours see neighbouring pixels, squares of
     4 × 4 together where the window consists of such squares. Rays of a packet then meet the same surfaces more often.
-    The samples of a pixel lie far apart, so that they are joined to light paths that have little in common.
     """
 
     images: int
@@ -146,7 +145,7 @@ class Lanes:
     def partner(self, sample: mi.UInt32, u: mi.Float) -> mi.UInt32:
         """The slot whose light path an eye path is joined to, before the shift (see randomness.shifts).
 
-        Each sample of the pixels has an equal share of the slots for itself, in which ``u`` in [0, 1) is the place (see
+        Each sample number has an equal share of the slots for itself, in which ``u`` in [0, 1) is the place (see
         randomness.places). Every choice is unbiased, as the shift is uniform over all slots.
         """
         _, samples, paths = self.counts

@@ -1,11 +1,12 @@
 """Random numbers: Owen-scrambled Sobol' points, in pairs of dimensions, each with its own scramble.
 
-The points of a *sequence* are stratified together. A sequence is the samples of one pixel for eye paths, and all light
-paths of an image for light paths. Point number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol',
-whose index and coordinates are scrambled by Owen's method, with a hash (Burley, *Practical Hash-based Owen Scrambling*,
-JCGT 2020; the permutation is that of Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point
-is uniform, and an estimate has the same expectation as from independent points. Sequences of different seeds, pixels or
-purposes are independent of each other.
+The points of a *sequence* are stratified together. A sequence is the samples of one pixel for eye paths, all light
+paths of an image for light paths, and all pixels for the places where a sample of them finds its light paths. Point
+number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol', whose index and coordinates are scrambled
+by Owen's method, with a hash (Burley, *Practical Hash-based Owen Scrambling*, JCGT 2020; the permutation is that of
+Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point is uniform, and an estimate has the
+same expectation as from independent points. Sequences of different seeds, pixels or purposes are independent of each
+other.
 
 Seeds enter the kernels as data, so a new seed compiles nothing. The sensor's own sampler only sets the default number
 of samples per pixel, since the two kinds of path would draw from it differently.
@@ -39,7 +40,10 @@ def image_keys(seeds: Sequence[int]) -> mi.UInt32:
 
 
 def stream(key: mi.UInt32, purpose: int, number: mi.UInt32 | int = 0) -> mi.UInt32:
-    """The sequence of an image's key, a purpose and a pixel's number, by Tiny Encryption (Zafar et al. 2010)."""
+    """The sequence of an image's key, a purpose and a number (of a pixel or sample), by Tiny Encryption.
+
+    Zafar et al. 2010.
+    """
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
 
@@ -95,7 +99,7 @@ def sampler(sequence: mi.UInt32, index: mi.UInt32) -> Sampler:
 
 
 def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
-    """The shifts from numbers of eye paths to numbers of the light paths that they are joined to, [K·64·n_C].
+    """The shifts that are added to the slots that eye paths are joined to (see Lanes.partner), [K·64·n_C].
 
     There is one for each image of a launch, depth and connection, uniform below the number of light paths.
     """
@@ -113,7 +117,8 @@ def places(keys: mi.UInt32, sample: mi.UInt32, pixel: mi.UInt32) -> mi.Float:
 
     Light paths close to each other start alike, or are copies of one, so pixels joined to them have noise in common.
     The places of a sample's pixels are stratified, so that light paths are used about equally often. They are random,
-    since every rule puts pixels at some distance from each other close together, which shows as streaks or a pattern.
+    because under any regular rule pixels at certain offsets would be joined to close light paths, which shows as
+    streaks or a pattern.
     """
     return sampler(stream(keys, PAIRING, sample), pixel).next_1d()
 

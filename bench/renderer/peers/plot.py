@@ -29,11 +29,12 @@ def save(result: dict[str, Any], path: Path, clock: str) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
+    name = {"cpu": "CPU"}.get(clock, clock)
     figure, axes = plt.subplots(1, 2, figsize=(9, 4.0), sharex=True, sharey=True, layout="constrained")
     for axis, kind in zip(axes, ("full", "trimmed"), strict=True):
         for method in (m for m in STYLES if m in result["curves"]):
             draw(axis, method, result["curves"][method], kind)
-        axis.set(xscale="log", yscale="log", xlabel=f"{clock} seconds", title=f"{result['line']}: {title(kind)}")
+        axis.set(xscale="log", yscale="log", xlabel=f"{name} seconds", title=f"{result['line']}: {title(kind)}")
         axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set_major_formatter("{x:g}")
         axis.xaxis.set_minor_formatter(NullFormatter())

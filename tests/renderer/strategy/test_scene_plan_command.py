@@ -39,7 +39,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("box.toml", "--seconds", "20", "--json")
+    code, out, err = run("box.toml", "--seconds", "40", "--json")
     assert code == 0
     assert f"measuring {len(GRID)} settings" in err
     first = json.loads(out)
@@ -48,7 +48,7 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     }
     assert (tmp_path / "box.toml").read_text() == SPEC
 
-    code, out, err = run("box.toml", "--seconds", "20", "--json", "--write")
+    code, out, err = run("box.toml", "--seconds", "40", "--json", "--write")
     assert (code, json.loads(out)["cached"]) == (0, True)
     assert json.loads(out)["settings"] == first["settings"]
     for table in ("transport", "photons"):

@@ -40,10 +40,7 @@ def image_keys(seeds: Sequence[int]) -> mi.UInt32:
 
 
 def stream(key: mi.UInt32, purpose: int, number: mi.UInt32 | int = 0) -> mi.UInt32:
-    """The sequence of an image's key, a purpose and a number (of a pixel or sample), by Tiny Encryption.
-
-    Zafar et al. 2010.
-    """
+    """The sequence of a key, a purpose and a pixel's or sample's number, by Tiny Encryption (Zafar et al. 2010)."""
     first, second = mi.sample_tea_32(key, mi.UInt32(purpose), 8)
     return mi.sample_tea_32(first, second ^ number)[0]
 

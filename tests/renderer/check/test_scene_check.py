@@ -84,7 +84,7 @@ ORIGIN = "origin = { min = [-1.8, 1.2, -1.8], max = [1.8, 2, 1.8] }"
         ((), [], []),
         ([(ORIGIN, "origin = { min = [230, 1, 0], max = [231, 2, 1] }")], ["view.origin"], []),
         ([(ORIGIN, "origin = { min = [-6, 1.2, -1], max = [0, 2, 1] }")], ["view.origin"], []),
-        ([(ORIGIN, "origin = { min = [-0.3, 0.4, -0.3], max = [0.3, 0.7, 0.3] }"), (BOX, "box.min = [0, 0, 0]\n"
+        ([(ORIGIN, "origin = { min = [-0.3, 0.1, -0.3], max = [0.3, 0.7, 0.3] }"), (BOX, "box.min = [0, 0, 0]\n"
            "box.max = [0.1, 0, 0.1]")], ["view.origin"], []),
         ([(AT, "at = [5, 0, 0]")], ["objects.0.at"], []),
         ([(BOX, "box = { min = [-120, 0, -120], max = [120, 0, 120] }")], ["objects.0.box"], []),

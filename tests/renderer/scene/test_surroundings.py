@@ -60,6 +60,15 @@ def test_a_wall_of_two_sides_is_a_solid_and_the_room_between_walls_is_open() -> 
     np.testing.assert_array_equal(found.open, [True, False, False])
 
 
+def test_a_solid_on_the_floor_holds_the_points_just_above_the_floor() -> None:
+    """Its bottom and the floor are one plane, in which a ray of the whole scene meets one of them."""
+    block = [-0.4, 0, -0.4], [0.4, 0.8, 0.4]
+    scene = scene_of(walls=box([-2, 0, -2], [2, 3, 2]), block=box(*block), vase=box([-1, 0, 1], [-0.8, 0.5, 1.2]))
+    low = np.random.default_rng(0).uniform([-0.39, 0.002, -0.39], [0.39, 0.05, 0.39], (256, 3)).astype(np.float32)
+    assert (surroundings(scene, low).solid == numbered(scene, "block")).all()
+    assert [shape.id() for shape in scene.shapes()] == ["walls", "block", "vase"]
+
+
 def test_a_single_sheet_holds_no_point() -> None:
     sheet = mi.ScalarTransform4f().translate([0, 1, 0]).scale(0.9)
     scene = scene_of(walls=box([-2, 0, -2], [2, 3, 2]), curtain={"type": "rectangle", "to_world": sheet})

@@ -39,16 +39,17 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("box.toml", "--seconds", "40", "--json")
+    code, out, err = run("box.toml", "--seconds", "20", "--json")
     assert code == 0
-    assert f"measuring {len(GRID)} settings" in err
     first = json.loads(out)
-    assert {(r["connections"], r["light_ratio"]) for r in first["measurement"]["rows"]} == {
-        (c.connections, c.light_ratio) for c in GRID
-    }
+    measured, grid = first["measurement"], {(c.connections, c.light_ratio) for c in GRID}
+    assert f"measuring {len(measured['rows'])} settings" in err
+    assert measured["left_out"] == [], "here each may be of use; how many there is time for depends on the machine"
+    assert (0, 0) in {(r["connections"], r["light_ratio"]) for r in measured["rows"]} <= grid
+    assert any("settings compared" in line for line in measured["modelled"]) == (len(measured["rows"]) < len(GRID))
     assert (tmp_path / "box.toml").read_text() == SPEC
 
-    code, out, err = run("box.toml", "--seconds", "40", "--json", "--write")
+    code, out, err = run("box.toml", "--seconds", "20", "--json", "--write")
     assert (code, json.loads(out)["cached"]) == (0, True)
     assert json.loads(out)["settings"] == first["settings"]
     for table in ("transport", "photons"):

@@ -43,6 +43,7 @@ def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path
     assert code == 0
     first = json.loads(out)
     measured, grid = first["measurement"], {(c.connections, c.light_ratio) for c in GRID}
+    assert len(measured["rows"]) > 1
     assert f"measuring {len(measured['rows'])} settings" in err
     assert measured["left_out"] == [], "here each may be of use; how many there is time for depends on the machine"
     assert (0, 0) in {(r["connections"], r["light_ratio"]) for r in measured["rows"]} <= grid

@@ -181,6 +181,13 @@ def test_a_guide_of_other_lights_is_refused() -> None:
         mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=guide)
 
 
+def test_a_guide_is_refused_without_guided_light() -> None:
+    scene = loaded(hard_scenes.cornell)
+    guide = LightGuide(StartGuide.neutral(Layout.of(1)), None)
+    with pytest.raises(ValueError, match="guided_light is false"):
+        mi.load_dict(BDPT).render(scene, spp=1, guide=guide)
+
+
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
 def test_a_guide_that_would_lose_light_is_refused(wrong: float) -> None:
     layout = Layout(1, 2, 1)

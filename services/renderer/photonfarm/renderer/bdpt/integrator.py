@@ -34,11 +34,12 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
       in ``path``.
     - ``rr_depth`` (int, default 5): edges after which Russian roulette begins, as in ``path``; paths that have lost
       most of their throughput meet it before.
-    - ``connections`` (int ≥ 0, default 1): light vertices that the first two eye vertices are connected to, later ones
-      to half as many. Needs ``light_ratio`` > 0.
-    - ``light_ratio`` (float ≥ 0, default 1): light paths per eye path, fractions allowed; 0 leaves a plain path tracer.
-    - ``light_samples`` (int ≥ 1, default 1): samples of the lights by next event estimation at the first eye vertex,
-      where most noise of direct light comes from; later vertices take one.
+    - ``connections`` (int from 0 to 64, default 1): light vertices that the first two eye vertices are connected to,
+      later ones to half as many. Needs ``light_ratio`` > 0.
+    - ``light_ratio`` (float from 0 to 64, default 1): light paths per eye path, fractions allowed; 0 leaves a plain
+      path tracer.
+    - ``light_samples`` (int from 1 to 64, default 1): samples of the lights by next event estimation at the first eye
+      vertex, where most noise of direct light comes from; later vertices take one.
     - ``guided_light`` (bool, default false): let light paths start where they reach what the camera sees, and draw
       their vertices for connections by how much these add to the image. `render` learns a guide from a few paths of its
       own first, unless it is given one by `learn_guide`. Needs ``light_ratio`` > 0.
@@ -56,7 +57,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         self.max_depth = depth_limit(_whole(props, "max_depth", -1))
         self.rr_depth = _whole(props, "rr_depth", 5)
         self.connections = _whole(props, "connections", 1)
-        self.light_ratio = float(props.get("light_ratio", 1.0))
+        self.light_ratio = _number(props, "light_ratio", 1.0)
         self.light_samples = _whole(props, "light_samples", 1)
         self.paths_at_once = _whole(props, "paths_at_once", LAUNCH_PATHS)
         self.guided_light = _yes_or_no(props, "guided_light")
@@ -68,14 +69,14 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def _check_parameters(self) -> None:
         if self.rr_depth < 1:
             raise ValueError(f"bdpt: rr_depth is {self.rr_depth}; allowed are numbers of edges from 1")
-        if self.connections < 0:
-            raise ValueError(f"bdpt: connections is {self.connections}; allowed are whole numbers from 0")
+        if not 0 <= self.connections <= 64:
+            raise ValueError(f"bdpt: connections is {self.connections}; allowed are whole numbers from 0 to 64")
         if not 0 <= self.light_ratio <= 64:
             raise ValueError(
                 f"bdpt: light_ratio is {self.light_ratio}; allowed are light paths per eye path from 0 to 64"
             )
-        if self.light_samples < 1:
-            raise ValueError(f"bdpt: light_samples is {self.light_samples}; allowed are whole numbers from 1")
+        if not 1 <= self.light_samples <= 64:
+            raise ValueError(f"bdpt: light_samples is {self.light_samples}; allowed are whole numbers from 1 to 64")
         if self.connections and not self.light_ratio:
             raise ValueError(
                 f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
@@ -172,7 +173,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         """A guide to what a sensor sees, or sees from several ``places``, for light paths and for connections.
 
         It is learned from random numbers of its own, so images that are rendered with it stay independent of each
-        other, and unbiased. None where light paths cannot be guided, as there are none. Raises as ``render`` does.
+        other, and unbiased. None without ``guided_light``, and where there are no light paths to guide. Raises as
+        ``render`` does.
         """
         if not (self.guided_light and self._has_light_paths(scene)):
             return None
@@ -215,6 +217,8 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         guide: LightGuide | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)
+        if guide is not None and not self.guided_light:
+            raise ValueError("bdpt: a guide is given and guided_light is false; use guided_light=true, or no guide")
         if self.guided_light and guide is None and len(seeds) > 1:
             return self._render_with_own_guides(scene, sensor, seeds, spp, places)
         with dr.suspend_grad():
@@ -370,6 +374,14 @@ def _whole(props: mi.Properties, name: str, default: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1:
         raise ValueError(f"bdpt: {name} is {value!r}; allowed are whole numbers")
     return int(value)
+
+
+def _number(props: mi.Properties, name: str, default: float) -> float:
+    """A number of the plugin's parameters; raises ValueError for anything else."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"bdpt: {name} is {value!r}; allowed are numbers")
+    return float(value)
 
 
 def _yes_or_no(props: mi.Properties, name: str) -> bool:

@@ -62,7 +62,7 @@ class Budget:
             least, best = (_tens(self.spent_s + seconds) for seconds in (more_s, max(best_s, more_s)))
             raise IncompleteError(
                 f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used, "
-                f"and about {ceil(more_s)} s more are needed; give it {least}"
+                f"and about {max(ceil(more_s), 1)} s more are needed; give it {least}"
                 + (f", or {best} for all settings" if best > least else "")
             )
 

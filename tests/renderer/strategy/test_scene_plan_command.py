@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from plan_measurements import JOINED, SPEC, measurement, row
+from plan_measurements import JOINED, LIGHT, SPEC, measurement, row
 
 from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)
 
+from photonfarm.renderer.strategy import measurement as measurement_module  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy import plan  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidate import PLAIN  # noqa: E402
 from photonfarm.renderer.strategy.measurement import GRID, Measurement  # noqa: E402
@@ -38,16 +39,18 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return command
 
 
-def test_a_spec_is_measured_once_written_and_then_known(run: Run, tmp_path: Path) -> None:
+def test_a_spec_is_measured_once_written_and_then_known(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = (PLAIN, LIGHT, JOINED, GRID[-1])  # for which any machine has the time
+    monkeypatch.setattr(measurement_module, "GRID", few)
     code, out, err = run("box.toml", "--seconds", "20", "--json")
     assert code == 0
+    assert f"measuring {len(few)} settings" in err
     first = json.loads(out)
-    measured, grid = first["measurement"], {(c.connections, c.light_ratio) for c in GRID}
-    assert len(measured["rows"]) > 1
-    assert f"measuring {len(measured['rows'])} settings" in err
-    assert measured["left_out"] == [], "here each may be of use; how many there is time for depends on the machine"
-    assert (0, 0) in {(r["connections"], r["light_ratio"]) for r in measured["rows"]} <= grid
-    assert any("settings compared" in line for line in measured["modelled"]) == (len(measured["rows"]) < len(GRID))
+    assert {(r["connections"], r["light_ratio"]) for r in first["measurement"]["rows"]} == {
+        (c.connections, c.light_ratio) for c in few
+    }
     assert (tmp_path / "box.toml").read_text() == SPEC
 
     code, out, err = run("box.toml", "--seconds", "20", "--json", "--write")

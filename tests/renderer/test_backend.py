@@ -6,7 +6,7 @@ from pathlib import Path
 import nvidia_driver
 import pytest
 
-from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene import backend, gathers
 from photonfarm.shared.core.errors import BackendError
 
 LOAD = "from photonfarm.renderer.scene import backend; print(backend.load(1).variant())"
@@ -30,6 +30,20 @@ def test_mitsuba_is_loaded_with_the_plugin_registered() -> None:
     assert mi.variant() == backend.DEFAULT_VARIANT
     assert mi.load_dict({"type": "bdpt"}).class_name()
     assert backend.load() is mi
+
+
+def test_kernels_gather_by_instruction_where_that_is_faster() -> None:
+    backend.load(1)
+    cpu, features = gathers.target()
+    assert cpu
+    assert gathers.features_for(cpu, features) == features  # all is set that is wanted
+    assert (gathers.FEATURE in features) == (cpu in gathers.FASTER_ON)
+
+
+def test_other_processors_keep_their_features() -> None:
+    for cpu in ("skylake-avx512", "znver2", "znver4", "apple-m1"):
+        assert gathers.features_for(cpu, "+avx,-sse4a") == "+avx,-sse4a"
+    assert gathers.features_for("znver3", "+avx,-sse4a") == "+avx,-sse4a,+fast-gather"
 
 
 def test_a_libllvm_that_is_not_there_is_one_sentence_that_says_what_to_install() -> None:

@@ -22,6 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from photonfarm.renderer.scene import gathers
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.farm import devices
 from photonfarm.shared.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
@@ -115,6 +116,8 @@ def load(threads: int | None = None) -> Any:
         os.environ[LLVM_VARIABLE] = find_llvm()
     mitsuba, drjit = _import("mitsuba"), _import("drjit")
     _set_variant(mitsuba, chosen.variant)
+    if chosen.variant.startswith("llvm"):
+        gathers.use_where_faster()
     if threads is not None:
         drjit.set_thread_count(threads)
     _import("photonfarm.renderer.bdpt")

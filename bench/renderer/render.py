@@ -147,10 +147,10 @@ def versions() -> dict[str, str]:
 
 
 def code() -> str:
-    """Digest of the integrator, its strategy and the scenes: a result of other code does not count."""
+    """Digest of the integrator, its strategy, and what loads scenes: a result of other code does not count."""
     package = results.ROOT / "services/renderer/photonfarm/renderer"
     digest = hashlib.sha256()
-    for part in ("bdpt", "strategy", "scene/rooms"):
+    for part in ("bdpt", "strategy", "scene"):
         for path in sorted((package / part).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

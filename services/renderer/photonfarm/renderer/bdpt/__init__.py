@@ -1,7 +1,7 @@
 """The integrator plugin ``bdpt`` for Mitsuba 3: unbiased bidirectional path tracing.
 
 Importing this package *after* ``mitsuba.set_variant`` registers the plugin, for ``mi.load_dict({"type": "bdpt", …})``
-and XML alike::
+and XML alike. `photonfarm.renderer.load_mitsuba` does both, and chooses an LLVM that works::
 
     import mitsuba as mi
     mi.set_variant("llvm_ad_rgb")

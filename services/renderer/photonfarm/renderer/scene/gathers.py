@@ -21,23 +21,30 @@ _WIDTH, _SET = "_Z21jit_llvm_vector_widthv", "_Z19jit_llvm_set_targetPKcS0_j"
 
 
 def use_where_faster() -> None:
-    """Have Dr.Jit use gather instructions in the kernels that it compiles from now on, if they are faster here.
-
-    Nothing happens if LLVM is not in use. The functions are declared in drjit-core/jit.h; Dr.Jit's Python module does
-    not offer them.
-    """
-    library = _dr_jit()
-    cpu, features = target()  # waits until LLVM is initialised, which the width does not
-    if library is None or cpu not in FASTER_ON or FEATURE in features.split(","):
-        return
-    width = ctypes.c_uint32(getattr(library, _WIDTH)())
-    getattr(library, _SET)(cpu.encode(), f"{features},{FEATURE}".encode(), width)
+    """Have Dr.Jit use gather instructions in the kernels that it compiles from now on, if they are faster here."""
+    cpu, features = target()
+    if cpu in FASTER_ON and FEATURE not in features.split(","):
+        set_features(f"{features},{FEATURE}")
 
 
 def target() -> tuple[str, str]:
     """The processor that Dr.Jit compiles for and its features, separated by commas, in LLVM's names; "" if unknown."""
     library = _dr_jit()
     return ("", "") if library is None else (_text(library, _CPU), _text(library, _FEATURES))
+
+
+def set_features(features: str) -> None:
+    """Have Dr.Jit compile for these features of the processor from now on; `target` tells which there are.
+
+    Nothing happens if LLVM is not in use. The functions are declared in drjit-core/jit.h; Dr.Jit's Python module does
+    not offer them.
+    """
+    library = _dr_jit()
+    if library is None:
+        return
+    cpu = target()[0]  # waits until LLVM is initialised, which the width does not
+    width = ctypes.c_uint32(getattr(library, _WIDTH)())
+    getattr(library, _SET)(cpu.encode(), features.encode(), width)
 
 
 def _text(library: ctypes.CDLL, name: str) -> str:

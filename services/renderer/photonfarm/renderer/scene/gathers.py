@@ -2,8 +2,8 @@
 
 Without AVX-512, LLVM uses gather instructions only on processors whose gathers it holds to be fast. None of AMD's are
 among them. Elsewhere it loads one lane after the other, with a branch for each. Kernels that shade surfaces gather
-often. On Zen 3 they take 9 to 28 % less time with the instruction (`path` and `bdpt` in five scenes, medians of seven
-turns), and results have the same bits. No other processor has been measured, so all others keep LLVM's choice.
+often. On Zen 3 they take a fifth less time with the instruction (docs/results/gathers.md), and results have the same
+bits. No other processor has been measured, so all others keep LLVM's choice.
 """
 
 from __future__ import annotations

@@ -61,16 +61,18 @@ def pilot_spp(known: Calibration) -> int:
     return max(1, round((max(2 * known.fixed_s, LEAST_IMAGE_S) - known.fixed_s) / known.sample_s))
 
 
-def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
-    """What the pilot of `photonfarm scene plan` finds for this one view.
+def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int, image_s: float) -> Chosen:
+    """What the pilot of `photonfarm scene plan` finds for this one view, for images that take `image_s`.
 
-    It takes about `seconds` of CPU time, and more where its first round and the kernels of all candidates need more.
+    It takes about `seconds` of CPU time, and more to time images, and where its first round and the kernels of all
+    candidates need more.
     """
     import time
 
     import mitsuba as mi
 
-    from photonfarm.renderer.strategy import content, measurement, pilot
+    from photonfarm.renderer.scene import backend
+    from photonfarm.renderer.strategy import content, image_cost, measurement, pilot
 
     plugins: dict[Any, Any] = {}
 
@@ -84,7 +86,9 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
     start = time.perf_counter()
     found = content.read(scene, scene.sensors()[0])
     candidates, _ = content.restrict(found, max_depth, 1.0, measurement.GRID)
-    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
+    costs = image_cost.time_images(render, candidates, spp, measurement.TIMING * seconds, backend.work_s)
+    later = {c: spp / cost.bought(image_s) * image_s / cost.time_s(spp) for c, cost in costs.items()}
+    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED, later=later)
     best = choice.candidate
     spent_s = time.perf_counter() - start
     return Chosen(

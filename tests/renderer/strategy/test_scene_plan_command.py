@@ -14,8 +14,8 @@ backend.load(threads=1)
 
 from photonfarm.renderer.strategy import measurement as measurement_module  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy import plan  # noqa: E402 - after the variant is set
-from photonfarm.renderer.strategy.candidate import PLAIN  # noqa: E402
-from photonfarm.renderer.strategy.measurement import GRID, Measurement  # noqa: E402
+from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
+from photonfarm.renderer.strategy.measurement import Measurement  # noqa: E402
 from photonfarm.renderer.strategy.objective.purpose import Purpose  # noqa: E402
 from photonfarm.shared.cli.main import main  # noqa: E402
 from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
@@ -42,7 +42,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 def test_a_spec_is_measured_once_written_and_then_known(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    few = (PLAIN, LIGHT, JOINED, GRID[-1])  # for which any machine has the time
+    few = (PLAIN, LIGHT, JOINED, Candidate(2, 0.25, True, light_samples=2))  # for which any machine has the time
     monkeypatch.setattr(measurement_module, "GRID", few)
     code, out, err = run("box.toml", "--seconds", "20", "--json")
     assert code == 0

@@ -23,13 +23,25 @@ from photonfarm.shared.core.waiting import Log, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
 
 GRID = (
-    *(Candidate(0, r) for r in (0.0, 0.25, 1.0, 4.0, 16.0)),
-    *(Candidate(c, r) for c, r in ((1, 1.0), (2, 0.25), (4, 0.125))),
-    *(Candidate(c, r, light_samples=n) for c, r, n in ((2, 0.25, 2), (2, 0.25, 4), (4, 0.125, 2))),
-    *(Candidate(c, r, True) for c, r in ((0, 1.0), (0, 16.0), (2, 0.25), (4, 0.125), (8, 0.0625))),
+    PLAIN,
+    Candidate(4, 0.125, True),
+    Candidate(2, 0.25, light_samples=4),
+    Candidate(0, 1.0, True),
+    Candidate(8, 0.0625, True),
+    Candidate(4, 0.125, light_samples=2),
+    Candidate(2, 0.25),
     Candidate(2, 0.25, True, light_samples=2),
+    Candidate(0, 16.0, True),
+    Candidate(4, 0.125),
+    Candidate(2, 0.25, light_samples=2),
+    Candidate(2, 0.25, True),
+    Candidate(1, 1.0),
+    *(Candidate(0, ratio) for ratio in (0.25, 1.0, 4.0, 16.0)),
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
+
+The first are compared where there is no time for all, so they stand in the order in which they gain most: guided light
+paths with connections for indirect light, several light samples for evenly lit rooms, splats alone for caustics.
 
 A light ratio above 1 helps only with light that splats alone find. Connections need few light paths, as several eye
 paths may be joined to the same one. Several light samples pay where direct light at the first eye vertex has much of

@@ -148,5 +148,6 @@ def _measured(plan: TransportPlan) -> list[str]:
     """The table, its legend and an empty line each; nothing without a measurement."""
     if not plan.at_equal_cost:
         return []
-    purpose, rows = plan.measurement.purpose, list(plan.at_equal_cost.values())
+    purpose = plan.measurement.purpose
+    rows = sorted(plan.at_equal_cost.values(), key=lambda measured: measured.candidate)
     return [*table(rows, plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]
